@@ -1,0 +1,78 @@
+"""What the demos share: their arguments, Dirichlet conditions by tag, and a table with its JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+from dolfinx import fem
+from petsc4py import PETSc
+
+if TYPE_CHECKING:
+    import uem_dolfinx as uem
+
+MESHES = Path(__file__).resolve().parent.parent / "meshes"
+comm = MPI.COMM_WORLD
+
+
+def ratio(text: str) -> float:
+    """Number, or ratio as in 1:3 and 1/3."""
+    return float(Fraction(text.replace(":", "/")))
+
+
+def arguments(description: str | None, **options: Any) -> argparse.Namespace:
+    """Parse the command line.
+
+    Args:
+        description: docstring of the demo; its first line is shown.
+        options: the demo's own options, by name: the default, or a tuple of choices whose first is the default.
+    """
+    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
+    parser.add_argument("--json", metavar="FILE", help="write the figures measured")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw a picture")
+    parser.add_argument("--output", metavar="DIR", help="write fields for ParaView and a CSV history")
+    parser.add_argument("--verbose", action="store_true", help="show every Newton iteration")
+    for name, value in options.items():
+        if isinstance(value, tuple):
+            kind: Any = {"choices": value, "default": value[0]}
+        else:
+            kind = {"type": ratio if isinstance(value, float) else type(value), "default": value}
+        parser.add_argument("--" + name.replace("_", "-"), help=f"default: {kind['default']}", **kind)
+    logging.basicConfig(format="%(message)s")
+    return parser.parse_args()
+
+
+def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) -> fem.DirichletBC:
+    """Prescribe one component of the displacement on the facets of a tag."""
+    dofs = fem.locate_dofs_topological(V.sub(component), tag.dim, tag.entities)
+    return fem.dirichletbc(PETSc.ScalarType(value), dofs, V.sub(component))
+
+
+def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
+    """Print the figures measured, lists of dictionaries as tables, and write the JSON file, on rank 0."""
+    if comm.rank != 0:
+        return
+    for key, value in results.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            widths = [max(10, len(k) + 2) for k in value[0]]
+            print(f"\n{key}:\n" + "".join(f"{k:>{w}}" for k, w in zip(value[0], widths)))
+            for row in value:
+                print("".join(f"{show(v):>{w}}" for v, w in zip(row.values(), widths)))
+        elif isinstance(value, dict):
+            print(f"{key}: " + ", ".join(f"{k} {show(v)}" for k, v in value.items()))
+        else:
+            print(f"{key:>20}: {show(value)}")
+    if args.json:
+        Path(args.json).parent.mkdir(parents=True, exist_ok=True)
+        Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+def show(value: object) -> str:
+    """Short text of a number."""
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

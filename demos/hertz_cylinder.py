@@ -1,0 +1,125 @@
+"""Hertzian contact of two elastic bodies: a cylinder pressed onto a block, plane strain.
+
+    python3 demos/hertz_cylinder.py --plot hertz.png
+"""
+
+# %% [markdown]
+# # A cylinder on a block
+#
+# A quarter disc of radius R = 3 stands on a block of the same material. Its top is pushed down by 0.006 in five steps; the
+# block's bottom slides on rollers and x = 0 is a plane of symmetry. Half-spaces under the line load P would, after Hertz,
+# touch over the half width a and press each other with
+#
+#     p(x) = p0 sqrt(1 - x^2/a^2),    p0 = sqrt(P E* / (pi R)),    a = 2 P / (pi p0),    1/E* = 2 (1 - nu^2) / E.
+#
+# The bodies are finite, so P comes from the computation, and the pressure is compared with Hertz at that P.
+
+# %%
+import time
+
+import common
+import numpy as np
+import ufl
+from common import comm, dirichlet
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+args = common.arguments(
+    __doc__, h=1 / 120, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=5, quads=0, rtol=1e-8
+)
+
+# %% [markdown]
+# ## The scene
+# Bodies, surfaces and boundary conditions go by the names of their physical groups in the Gmsh file.
+
+# %%
+E, nu, R = 1e6, 0.3, 3.0
+mesh, tags = uem.read_gmsh(
+    common.MESHES / "hertz_cylinder.geo", comm, gdim=2,
+    parameters={"h": args.h, "ratio": args.ratio, "quads": args.quads},
+)  # fmt: skip
+V = compat.function_space(mesh, args.degree, (2,))
+u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+material = uem.LinearElastic(E, nu, kind="plane_strain")
+F = material.residual(u, v) * ufl.dx
+bcs = [
+    dirichlet(V, tags["symmetry"], 0, 0.0),
+    dirichlet(V, tags["block_bottom"], 1, 0.0),
+    dirichlet(V, tags["disc_top"], 1, -0.006),
+]
+contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], normals=args.normals)
+
+# %% [markdown]
+# ## The solution
+# Every contactor that presses is united to the block's surface, `du = P dq + c`, and Newton's method runs on the united body.
+
+# %%
+start = time.perf_counter()
+problem = uem.UnitedProblem(
+    F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hertz_", rtol=args.rtol, verbose=args.verbose
+)
+writer = uem.ResultsWriter(f"{args.output}/hertz_cylinder", problem) if args.output else None
+steps = []
+for step in uem.load_steps(problem, args.steps):
+    steps.append(step)
+    if writer:
+        writer.write(step)
+if writer:
+    writer.close()
+seconds = time.perf_counter() - start
+
+# %% [markdown]
+# ## The figures
+# Both halves together carry P. The half width is the length of surface that belongs to active contactors, which is exact to
+# half a cell. The order of convergence is observed on the last three residuals.
+
+# %%
+P = 2 * contact.resultant().force[1]
+E_star = E / (2 * (1 - nu**2))
+p0 = np.sqrt(P * E_star / (np.pi * R))
+arc = compat.surface_measure(mesh, tags["disc_arc"].entities)
+balance = contact.balance()
+r = [iteration.residual for iteration in steps[-1].iterations[-3:]]
+results = {
+    "P": float(P),
+    "a": compat.assemble_scalar(compat.form(contact.active * arc), comm),
+    "a_hertz": float(2 * P / (np.pi * p0)),
+    "p0_hertz": float(p0),
+    "p_max": contact.max_pressure(),
+    "p_max / p0_hertz": contact.max_pressure() / float(p0),
+    "newton_iterations": sum(step.newton_iterations for step in steps),
+    "steps": len(steps),
+    "max_gap": contact.max_gap(),
+    "model_size": float(np.hypot(6, 9)),
+    "force_imbalance": max(balance.force, balance.moment),
+    "order": float(np.log(r[2] / r[1]) / np.log(r[1] / r[0])),
+    "active": contact.n_active,
+    "dofs": 2 * V.dofmap.index_map.size_global,
+    "seconds": seconds,
+}
+common.report(args, results)
+
+# %% [markdown]
+# ## The picture
+# Lines of equal shear stress, as photoelasticity shows them: the largest is 0.30 p0, at the depth 0.79 a.
+
+# %%
+if args.plot:
+    s = material.stress(u)
+    shear = ufl.sqrt((s[0, 0] - s[1, 1]) ** 2 / 4 + s[0, 1] ** 2) / p0
+    a = results["a_hertz"]
+    with uem.figure(args.plot, comm, panels=2) as (left, right):
+        uem.plot_scene(
+            problem, left, field=shear, label="largest shear stress / $p_0$", levels=np.linspace(0.0, 0.3, 13),
+            window=(-2.2 * a, 2.2 * a, -2.4 * a, 1.6 * a), mirror=True,
+        )  # fmt: skip
+        uem.plot_pressure(
+            contact, right, mirror=True, reference=lambda x: p0 * np.sqrt(np.maximum(1 - (x / a) ** 2, 0)),
+            reference_label="Hertz",
+        )  # fmt: skip
+
+# %%
+if args.h <= 1 / 120:
+    assert abs(results["p_max / p0_hertz"] - 1) < 0.01

@@ -1,0 +1,49 @@
+// Quarter of a half sphere (radius R, centre (0, 0, R)) on the quarter [0, W]^2 x [-W, 0] of a block.
+//
+// h scales the whole mesh: it is the size of the cells in the contact zone, and cells grow with the distance from there.
+SetFactory("OpenCASCADE");
+DefineConstant[
+  h = 0.01,      // size in the contact zone
+  ratio = 1,     // size of the block's cells over that of the sphere's; the finer body has h
+  R = 1,         // radius of the sphere
+  W = 2,         // width and height of the block
+  zone = 0.05,   // the contact zone reaches this far from the tip
+  growth = 30    // cells at distance r are growth * h * r large
+];
+h_block = h * (ratio > 1 ? ratio : 1);
+h_sphere = h / (ratio < 1 ? ratio : 1);
+
+// the poles of the sphere's parametrisation lie on the y axis, away from the contact
+Sphere(1) = {0, 0, 0, R};
+Rotate {{1, 0, 0}, {0, 0, 0}, Pi / 2} { Volume{1}; }
+Translate {0, 0, R} { Volume{1}; }
+Box(2) = {0, 0, 0, R, R, R};
+BooleanIntersection(3) = { Volume{1}; Delete; }{ Volume{2}; Delete; };
+Box(4) = {0, 0, -W, W, W, W};
+
+e = 1e-3 * R;
+plane_x() = Surface In BoundingBox {-e, -e, -W - e, e, W + e, R + e};
+plane_y() = Surface In BoundingBox {-e, -e, -W - e, W + e, e, R + e};
+sphere_top() = Surface In BoundingBox {-e, -e, R - e, R + e, R + e, R + e};
+block_top() = Surface In BoundingBox {-e, -e, -e, W + e, W + e, e};
+block_bottom() = Surface In BoundingBox {-e, -e, -W - e, W + e, W + e, -W + e};
+cap() = Boundary{ Volume{3}; };
+cap() -= plane_x();
+cap() -= plane_y();
+cap() -= sphere_top();
+
+Physical Volume("sphere") = {3};
+Physical Volume("block") = {4};
+Physical Surface("sphere_cap") = {cap()};
+Physical Surface("sphere_top") = {sphere_top()};
+Physical Surface("block_top") = {block_top()};
+Physical Surface("block_bottom") = {block_bottom()};
+Physical Surface("symmetry_x") = {plane_x()};
+Physical Surface("symmetry_y") = {plane_y()};
+
+Field[1] = MathEval;
+Field[1].F = Sprintf("%g + (%g) * 0.5 * (1 + z / (Abs(z) + 1e-9)) + %g * Max(0, Sqrt(x*x + y*y + z*z) - %g)",
+                     h_block, h_sphere - h_block, growth * h, zone);
+Background Field = 1;
+Mesh.MeshSizeFromPoints = 0;
+Mesh.MeshSizeExtendFromBoundary = 0;

@@ -1,0 +1,568 @@
+"""The one place that knows DOLFINx versions: 0.5 (Debian 12), 0.9 (Debian 13) and 0.11 (PyPI wheel, Debian sid).
+
+Everything later on the way, from the mesh to the files, speaks to DOLFINx through these functions wherever the
+versions differ; what is the same in all of them is called directly.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
+
+import numpy as np
+from petsc4py import PETSc
+
+import basix
+import dolfinx.fem.petsc
+import ufl
+from dolfinx import cpp, fem, io, la, mesh
+
+from .errors import MissingBackendError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+DOLFINX_VERSION: tuple[int, int] = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])  # type: ignore[assignment]
+
+# ---------------------------------------------------------------------------------------------- backends
+
+
+def has_hypre() -> bool:
+    """Whether PETSc was built with hypre (the PyPI wheel is not)."""
+    return bool(PETSc.Sys.hasExternalPackage("hypre"))
+
+
+def has_mumps() -> bool:
+    """Whether PETSc was built with MUMPS."""
+    return bool(PETSc.Sys.hasExternalPackage("mumps"))
+
+
+def has_vtx() -> bool:
+    """Whether DOLFINx can write VTX files (needs ADIOS2, which Debian 12 leaves out)."""
+    return hasattr(io, "VTXWriter")
+
+
+# ---------------------------------------------------------------------------------------------- meshes
+
+
+def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.float64], cell: str, degree: int) -> Any:
+    """Distribute cells in Gmsh's node order over the ranks (collective).
+
+    Args:
+        comm: communicator of the mesh.
+        cells: nodes of this rank's cells in Gmsh's order, shape ``(n_cells, n_nodes_per_cell)``, global input index.
+        x: coordinates of this rank's part of the input nodes, shape ``(n_nodes, gdim)``.
+        cell: name of the cell, e.g. ``"tetrahedron"``.
+        degree: degree of the geometry.
+
+    Returns:
+        The mesh, of geometric dimension ``x.shape[1]``.
+    """
+    gdim = x.shape[1]
+    order = cpp.io.perm_gmsh(getattr(mesh.CellType, cell), cells.shape[1])
+    cells = np.ascontiguousarray(cells[:, order], dtype=np.int64)
+    x = np.ascontiguousarray(x, dtype=np.float64)
+    if DOLFINX_VERSION < (0, 7):
+        scalar = ufl.FiniteElement("Lagrange", ufl.Cell(cell, geometric_dimension=gdim), degree, variant="equispaced")
+        return mesh.create_mesh(comm, cells, x, ufl.Mesh(ufl.VectorElement(scalar)))
+    from basix.ufl import element as basix_element
+
+    element = basix_element("Lagrange", cell, degree, basix.LagrangeVariant.equispaced, shape=(gdim,))
+    return mesh.create_mesh(comm, cells=cells, x=x, e=ufl.Mesh(element))
+
+
+def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]:
+    """Turn a Gmsh model living on rank 0 into a mesh with DOLFINx's own reader (collective).
+
+    ``uem_dolfinx.mesh.read_gmsh`` is the reader to use: it also knows names, overlapping groups and errors.
+
+    Args:
+        model: ``gmsh.model`` on rank 0, anything elsewhere.
+        comm: communicator of the mesh.
+        gdim: geometric dimension.
+
+    Returns:
+        The mesh, its cell tags and its facet tags.
+    """
+    if DOLFINX_VERSION < (0, 10):
+        import dolfinx.io.gmshio
+
+        return dolfinx.io.gmshio.model_to_mesh(model, comm, 0, gdim=gdim)
+    import dolfinx.io.gmsh
+
+    data = dolfinx.io.gmsh.model_to_mesh(model, comm, 0, gdim=gdim)
+    empty = np.empty(0, dtype=np.int32)
+    facet_tags = data.facet_tags
+    if facet_tags is None:
+        facet_tags = mesh_tags(data.mesh, data.mesh.topology.dim - 1, empty, empty)
+    return data.mesh, data.cell_tags, facet_tags
+
+
+def cell_name(domain: Any) -> str:
+    """Name of the cells, e.g. ``"triangle"``.
+
+    Args:
+        domain: the mesh.
+
+    Returns:
+        UFL's name of the cell.
+    """
+    name = domain.ufl_cell().cellname
+    return str(name() if callable(name) else name)
+
+
+def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
+    """Geometry nodes of every cell.
+
+    Args:
+        domain: the mesh.
+
+    Returns:
+        Local node indices in DOLFINx's order (vertices first), shape ``(n_cells incl. ghosts, n_nodes_per_cell)``.
+    """
+    geometry = domain.geometry
+    dofmap = geometry.dofmaps[0] if DOLFINX_VERSION >= (0, 11) else geometry.dofmap
+    return _cell_table(domain, dofmap)
+
+
+def vertex_nodes(domain: Any) -> npt.NDArray[np.int32]:
+    """Geometry node of every vertex.
+
+    Args:
+        domain: the mesh.
+
+    Returns:
+        Local node index, shape ``(n_vertices incl. ghosts,)``.
+    """
+    topology = domain.topology
+    vertex_map = topology.index_map(0)
+    topology.create_connectivity(topology.dim, 0)
+    vertices = _cell_table(domain, topology.connectivity(topology.dim, 0))
+    nodes = np.zeros(vertex_map.size_local + vertex_map.num_ghosts, dtype=np.int32)
+    nodes[vertices] = geometry_dofs(domain)[:, : vertices.shape[1]]
+    return nodes
+
+
+def mesh_tags(domain: Any, dim: int, entities: npt.ArrayLike, values: npt.ArrayLike) -> Any:
+    """Create MeshTags from entities in any order.
+
+    Args:
+        domain: the mesh.
+        dim: dimension of the entities.
+        entities: local indices, shape ``(n,)``; of equal ones the first counts.
+        values: one integer for all, or one for each, shape ``(n,)``.
+
+    Returns:
+        The MeshTags.
+    """
+    indices = np.asarray(entities, dtype=np.int32).reshape(-1)
+    numbers = np.broadcast_to(np.asarray(values, dtype=np.int32), indices.shape)
+    unique, first = np.unique(indices, return_index=True)
+    return mesh.meshtags(domain, dim, unique, np.ascontiguousarray(numbers[first]))
+
+
+def surface_measure(domain: Any, facets: npt.ArrayLike, metadata: Mapping[str, Any] | None = None) -> Any:
+    """Boundary measure ``ds`` over the given facets only.
+
+    Args:
+        domain: the mesh.
+        facets: local indices of exterior facets, shape ``(n,)``; each rank integrates over those it owns.
+        metadata: form compiler data, e.g. ``{"quadrature_degree": 2}``.
+
+    Returns:
+        The UFL measure.
+    """
+    domain.topology.create_connectivity(domain.topology.dim - 1, domain.topology.dim)
+    tags = mesh_tags(domain, domain.topology.dim - 1, facets, 1)
+    return ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
+
+
+# ---------------------------------------------------------------------------------------------- spaces and functions
+
+
+def function_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
+    """Continuous Lagrange space.
+
+    Args:
+        domain: the mesh.
+        degree: polynomial degree.
+        shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
+
+    Returns:
+        The function space.
+    """
+    return _space(domain, "Lagrange", degree, tuple(shape))
+
+
+def dg0_space(domain: Any, shape: Sequence[int] = ()) -> Any:
+    """Space of functions constant in every cell.
+
+    Args:
+        domain: the mesh.
+        shape: shape of the value.
+
+    Returns:
+        The function space.
+    """
+    return _space(domain, "DG", 0, tuple(shape))
+
+
+def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
+    if hasattr(fem, "functionspace"):
+        return fem.functionspace(domain, (family, degree, shape) if shape else (family, degree))
+    if shape == ():
+        return fem.FunctionSpace(domain, (family, degree))
+    if len(shape) == 1:
+        return fem.VectorFunctionSpace(domain, (family, degree), dim=shape[0])
+    return fem.TensorFunctionSpace(domain, (family, degree), shape=shape)
+
+
+def cell_dofs(V: Any) -> npt.NDArray[np.int32]:
+    """Blocked d.o.f. of every cell.
+
+    Args:
+        V: the function space.
+
+    Returns:
+        Local blocked indices, shape ``(n_cells incl. ghosts, n_block_dofs_per_cell)``.
+    """
+    return _cell_table(V.mesh, V.dofmap.list)
+
+
+def _cell_table(domain: Any, rows: Any) -> npt.NDArray[np.int32]:
+    """Rows of equal length, one for each cell, from an array or an adjacency list."""
+    if isinstance(rows, np.ndarray):
+        return rows
+    cells = domain.topology.index_map(domain.topology.dim)
+    n_cells = cells.size_local + cells.num_ghosts
+    array = np.asarray(rows.array, dtype=np.int32)
+    return array.reshape(n_cells, -1) if n_cells else array.reshape(0, 1)
+
+
+def lagrange_degree(V: Any) -> int | None:
+    """Degree of a continuous Lagrange space.
+
+    Args:
+        V: a scalar, vector or tensor function space.
+
+    Returns:
+        The polynomial degree, or None if the space is anything else.
+    """
+    element = V.ufl_element()
+    if callable(getattr(element, "family", None)):
+        return int(element.degree()) if element.family() in ("Lagrange", "CG", "Q", "P") else None
+    try:
+        lagrange = element.element_family == basix.ElementFamily.P and not element.discontinuous
+    except (AttributeError, NotImplementedError):
+        return None
+    return int(element.degree) if lagrange else None
+
+
+def create_lagrange_element(cell: str, degree: int) -> Any:
+    """Scalar Lagrange element of Basix, with the nodes that :func:`function_space` uses.
+
+    Args:
+        cell: ``"interval"``, ``"triangle"``, ...
+        degree: polynomial degree.
+
+    Returns:
+        The Basix element; ``tabulate(n, points)`` has shape ``(n_derivatives, n_points, n_nodes, 1)``.
+    """
+    return basix.create_element(
+        basix.ElementFamily.P, getattr(basix.CellType, cell), degree, basix.LagrangeVariant.gll_warped
+    )
+
+
+def reference_topology(cell: str) -> list[list[list[int]]]:
+    """Vertices of every sub-entity of a reference cell.
+
+    Args:
+        cell: ``"interval"``, ``"triangle"``, ...
+
+    Returns:
+        ``topology[dim][i]``: the vertices of sub-entity ``i`` of dimension ``dim``.
+    """
+    return [[list(entity) for entity in entities] for entities in basix.topology(getattr(basix.CellType, cell))]
+
+
+def sum_ghosts(u: Any) -> None:
+    """Add the ghost entries of a Function to their owners and send the sums back (collective).
+
+    Args:
+        u: the Function.
+    """
+    vector = petsc_vector(u)
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    vector.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+
+
+def petsc_vector(u: Any) -> PETSc.Vec:
+    """PETSc vector of a Function.
+
+    Args:
+        u: the Function.
+
+    Returns:
+        A ghosted vector that shares its memory with ``u.x.array``.
+    """
+    return u.x.petsc_vec if hasattr(u.x, "petsc_vec") else u.vector
+
+
+def interpolate_expression(u: Any, expression: Any) -> None:
+    """Interpolate a UFL expression into a Function and update its ghosts (collective).
+
+    Args:
+        u: Function of a Lagrange or DG0 space; overwritten.
+        expression: UFL expression of the same shape.
+    """
+    V = u.function_space
+    one = fem.Constant(V.mesh, 1.0)
+    if not ufl.domain.extract_domains(expression):
+        expression = ufl.as_ufl(expression) * one
+    points = V.element.interpolation_points
+    if callable(points):
+        points = points()
+    compiled = fem.Expression(expression, points)
+    if DOLFINX_VERSION >= (0, 6) and hasattr(compiled, "_cpp_object"):
+        u.interpolate(compiled)
+    else:
+        u._cpp_object.interpolate(compiled._cpp_object, _all_cells(V.mesh))
+    u.x.scatter_forward()
+
+
+def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
+    cells = domain.topology.index_map(domain.topology.dim)
+    return np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+
+
+# ---------------------------------------------------------------------------------------------- forms, matrices, vectors
+
+
+def form(integrals: Any) -> Any:
+    """Compile a UFL form, or a nested sequence of them, for real arithmetic.
+
+    Args:
+        integrals: the UFL form.
+
+    Returns:
+        The DOLFINx form.
+    """
+    return fem.form(integrals, dtype=np.float64)
+
+
+def create_matrix(a: Any) -> PETSc.Mat:
+    """Matrix with the layout, the block size and the sparsity of a compiled bilinear form.
+
+    Args:
+        a: the compiled form.
+
+    Returns:
+        A matrix without values.
+    """
+    return fem.petsc.create_matrix(a)
+
+
+def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
+    """Assemble a compiled bilinear form into a matrix, without boundary conditions (collective).
+
+    Args:
+        A: from :func:`create_matrix`; zeroed first, fully assembled afterwards.
+        a: the compiled form.
+    """
+    A.zeroEntries()
+    fem.petsc.assemble_matrix(A, a, [])
+    A.assemble()
+
+
+def create_vector(V: Any) -> PETSc.Vec:
+    """Ghosted zero vector with the layout of a function space.
+
+    Args:
+        V: the function space.
+
+    Returns:
+        The vector.
+    """
+    if DOLFINX_VERSION >= (0, 10):
+        b = fem.petsc.create_vector(V)
+    else:
+        b = la.create_petsc_vector(V.dofmap.index_map, V.dofmap.index_map_bs)
+    with b.localForm() as local:
+        local.set(0.0)
+    return b
+
+
+def assemble_vector(b: PETSc.Vec, L: Any) -> None:
+    """Assemble a compiled linear form into a vector (collective).
+
+    Args:
+        b: ghosted vector; zeroed first. Ghost contributions are added to their owners; the ghost entries themselves
+            are left unspecified.
+        L: the compiled form.
+    """
+    with b.localForm() as local:
+        local.set(0.0)
+    fem.petsc.assemble_vector(b, L)
+    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
+    """Value of a compiled functional (collective).
+
+    Args:
+        M: the compiled form.
+        comm: communicator of the mesh.
+
+    Returns:
+        The sum over all ranks, known to all of them.
+    """
+    return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))
+
+
+def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
+    """D.o.f. that a Dirichlet condition constrains.
+
+    Args:
+        bc: from ``dolfinx.fem.dirichletbc``, on a blocked space, a sub-space or a collapsed one.
+
+    Returns:
+        Local unrolled indices in the parent space, ascending, ghosts last, shape ``(n,)``, and the number owned.
+    """
+    dofs, n_owned = bc.dof_indices()
+    return np.array(dofs, dtype=np.int32), int(n_owned)
+
+
+def set_bc_values(x: PETSc.Vec | npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
+    """Write the values of Dirichlet conditions at their d.o.f., ghosts included, and nowhere else.
+
+    Args:
+        x: ghosted vector, or local array with ghosts, shape ``(n_local incl. ghosts,)``.
+        bcs: the conditions.
+    """
+    if isinstance(x, PETSc.Vec):
+        with x.localForm() as local:
+            set_bc_values(local.array_w, bcs)
+    elif DOLFINX_VERSION < (0, 9):
+        cpp.fem.set_bc(x, list(bcs), 1.0)
+    else:
+        for bc in bcs:
+            bc.set(x, None, 1.0)
+
+
+# ---------------------------------------------------------------------------------------------- files
+
+
+def open_xdmf(comm: MPI.Comm, path: str | Path, domain: Any) -> Any:
+    """Open an XDMF file and write the mesh (collective).
+
+    Args:
+        comm: communicator of the mesh.
+        path: name of the file; its folder exists.
+        domain: the mesh.
+
+    Returns:
+        The file, a context manager; ``write_function(u, t)`` takes P1 (geometry degree) and DG0 Functions, each
+        with a ``name`` of its own.
+    """
+    file = io.XDMFFile(comm, str(path), "w")
+    file.write_mesh(domain)
+    return file
+
+
+def write_xdmf_tags(file: Any, tags: Any, domain: Any) -> None:
+    """Write MeshTags to an open XDMF file (collective).
+
+    Args:
+        file: from :func:`open_xdmf`.
+        tags: the MeshTags.
+        domain: their mesh.
+    """
+    domain.topology.create_connectivity(tags.dim, domain.topology.dim)
+    if DOLFINX_VERSION < (0, 7):
+        file.write_meshtags(tags)
+    else:
+        file.write_meshtags(tags, domain.geometry)
+
+
+def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
+    """Open a VTX writer (collective).
+
+    Args:
+        comm: communicator of the mesh.
+        path: name of the ``.bp`` folder.
+        functions: Functions of one element.
+
+    Returns:
+        The writer, a context manager with ``write(t)``.
+
+    Raises:
+        MissingBackendError: this DOLFINx was built without ADIOS2.
+    """
+    if not has_vtx():
+        raise MissingBackendError(
+            f"VTX output of {path} needs ADIOS2, which DOLFINx {dolfinx.__version__} was built without; write XDMF instead."
+        )
+    return io.VTXWriter(comm, str(path), list(functions))
+
+
+# ---------------------------------------------------------------------------------------------- Gmsh
+
+
+def import_gmsh() -> Any:
+    """Import Gmsh's Python module.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingBackendError: it cannot be imported.
+    """
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:
+        raise MissingBackendError(
+            f"Reading a Gmsh model needs Gmsh's Python module ({error}): install the package python3-gmsh, "
+            "or the PyPI package gmsh."
+        ) from error
+    return gmsh
+
+
+def gmsh_is_initialized(gmsh: Any) -> bool:
+    """Whether ``gmsh.initialize`` was called and not yet finalised.
+
+    Args:
+        gmsh: the module.
+
+    Returns:
+        The answer. Gmsh 4.8 has no function for it: initialised, it has at least one model; otherwise it lists none
+        or raises, and complains, which is kept off the terminal.
+    """
+    if hasattr(gmsh, "isInitialized"):
+        return bool(gmsh.isInitialized())
+    with _silence():
+        try:
+            return len(gmsh.model.list()) > 0
+        except Exception:  # noqa: BLE001  Gmsh raises bare Exceptions
+            return False
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Send what C code writes to the terminal to nowhere."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    saved = [(fd, os.dup(fd)) for fd in (1, 2)]
+    try:
+        for fd, _ in saved:
+            os.dup2(null, fd)
+        yield
+    finally:
+        for fd, copy in saved:
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(null)

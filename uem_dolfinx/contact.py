@@ -1,0 +1,227 @@
+"""Contact: what the user declares about two surfaces, and what can be read from it after a step.
+
+It turns tags into a contact pair before the first step and a pair's state into fields and resultants after every one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.search import MeshTarget, Target
+from uem_dolfinx.surfaces import TargetFacets, check_distinct, check_tag, surface_nodes, tributary_areas
+from uem_dolfinx.uniting import ContactPair
+
+if TYPE_CHECKING:
+    from uem_dolfinx.mesh import Tag
+    from uem_dolfinx.system import BodySystem
+
+Array = npt.NDArray[np.float64]
+
+#: Default bound on the initial penetration, as part of the model's size.
+MAX_PENETRATION = 0.05
+
+
+@dataclass(frozen=True)
+class Resultant:
+    """Force ``(gdim,)`` and moment about the origin, ``(1,)`` in 2D and ``(3,)`` in 3D."""
+
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Relative imbalance of the forces and of the moments of a pair."""
+
+    force: float
+    moment: float
+
+
+def _moments(x: Array, f: Array) -> Array:
+    """Moments about the origin of forces ``f (n, gdim)`` at ``x``, ``(n, 1)`` in 2D and ``(n, 3)`` in 3D."""
+    if x.shape[1] == 2:
+        return (x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0])[:, None]
+    return np.cross(x, f)
+
+
+class Contact:
+    """A contactor surface that may touch a target.
+
+    Args:
+        contactor: facets whose nodes are the contactors.
+        target: facets of the other body, or a rigid surface.
+        sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
+        normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
+        max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
+        name: for messages and files; None takes the names of the tags.
+
+    Raises:
+        ValueError: for an unknown word.
+    """
+
+    def __init__(
+        self,
+        contactor: Tag,
+        target: Tag | Target,
+        *,
+        sliding: str = "finite",
+        normals: str = "facet",
+        max_penetration: float | None = None,
+        name: str | None = None,
+    ):
+        for value, known in ((sliding, ("finite", "small", "fixed")), (normals, ("facet", "averaged"))):
+            if value not in known:
+                raise ValueError(f"'{value}' is not known here: expected one of {', '.join(known)}")
+        self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
+        self.max_penetration = max_penetration
+        target_name = getattr(target, "name", type(target).__name__)
+        self.name = name or f"{contactor.name} on {target_name}"
+        self._pair: ContactPair | None = None
+        self._fields: dict[str, fem.Function] = {}
+
+    def attach(self, system: BodySystem) -> ContactPair:
+        """Build the pair of this contact in a problem (collective).
+
+        Raises:
+            TagError: if a tag is empty or not of facets.
+            SpaceError: if a tag belongs to another mesh.
+            SurfaceError: if contactor and target share nodes.
+            OrientationError: if a target facet lies inside a body.
+        """
+        config = self.config = system.config
+        check_tag(config, self.contactor, "contactor")
+        nodes = surface_nodes(config, self.contactor)
+        target = self.target
+        if not hasattr(target, "project"):
+            check_tag(config, target, "target")
+            facets = TargetFacets(config, target)
+            check_distinct(config, nodes, facets, (self.contactor.name, target.name))
+            target = MeshTarget(facets, averaged=self.normals == "averaged")
+        self._pair = ContactPair(
+            config,
+            nodes,
+            target,
+            free=system.free[nodes],
+            name=self.name,
+            sliding=self.sliding,
+            max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
+        )
+        self._system = system
+        return self._pair
+
+    @property
+    def pair(self) -> ContactPair:
+        """The pair behind this contact."""
+        if self._pair is None:
+            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+        return self._pair
+
+    # -- results -------------------------------------------------------------------------------------------------------
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks (collective)."""
+        return self.pair.n_active
+
+    def max_gap(self) -> float:
+        """Largest gap of an active contactor, a length (collective)."""
+        return self.pair.largest_gap()
+
+    @cached_property
+    def _areas(self) -> Array:
+        """Tributary reference area of each contactor ``(n_contactors,)`` (collective)."""
+        return tributary_areas(self.config, self.contactor)[self.pair.nodes]
+
+    @property
+    def pressures(self) -> Array:
+        """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)``."""
+        areas = self._areas
+        return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
+
+    def max_pressure(self) -> float:
+        """Largest contact pressure, a force per area (collective)."""
+        return float(max(self.config.comm.allgather(self.pressures.max(initial=0.0))))
+
+    @property
+    def pressure(self) -> fem.Function:
+        """Contact pressure as a scalar field, zero off the contactor (collective)."""
+        return self._field("pressure", self.pressures)
+
+    @property
+    def gap(self) -> fem.Function:
+        """Gap as a scalar field, a length; zero off the contactor (collective)."""
+        return self._field("gap", self.pair.projection.gap)
+
+    @property
+    def active(self) -> fem.Function:
+        """1 at active contactors, 0 elsewhere (collective)."""
+        return self._field("active", self.pair.trial.active)
+
+    @property
+    def force(self) -> fem.Function:
+        """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
+        if "force" not in self._fields:
+            self._fields["force"] = fem.Function(self.config.V, name=_identifier(f"contact_force_{self.name}"))
+        f, g, pair = self._fields["force"], self.config.gdim, self.pair
+        f.x.array[:] = 0.0
+        total = compat.petsc_vector(f)
+        p, i = pair.projection, np.flatnonzero(pair.trial.active)
+        nodes = np.concatenate([self.config.to_global(pair.nodes[i])[:, None], p.nodes[i]], axis=1)
+        share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
+        rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        total.setValues(rows, (share[..., None] * pair.trial.force[i, None, :]).ravel(), addv=PETSc.InsertMode.ADD)
+        total.assemble()
+        f.x.scatter_forward()
+        return f
+
+    def resultant(self) -> Resultant:
+        """Force and moment that the contact exerts on the contactor's body (collective)."""
+        x, f = self.pair.points, self.pair.trial.force
+        parts = self.config.comm.allgather((f.sum(axis=0), _moments(x, f).sum(axis=0)))
+        return Resultant(np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0))
+
+    def balance(self) -> Balance | None:
+        """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
+
+        The contactors' forces come from the residual, the target's from handing them on to its nodes.
+
+        Returns:
+            Imbalances relative to the sums of absolute nodal forces and moments; None for a rigid target, which has no nodes.
+        """
+        if self.pair.target.n_nodes == 0:
+            return None
+        n, g = self.config.n_owned, self.config.gdim
+        f = self.force.x.array.reshape(-1, g)[:n]
+        x = self.config.x[:n]
+        m = _moments(x, f)
+        sums = [f.sum(axis=0), m.sum(axis=0), np.linalg.norm(f, axis=1).sum(), (np.linalg.norm(f, axis=1) * np.linalg.norm(x, axis=1)).sum()]
+        force, moment, all_f, all_m = (sum(part) for part in zip(*self.config.comm.allgather(sums)))
+        return Balance(
+            float(np.linalg.norm(force) / all_f) if all_f > 0 else 0.0,
+            float(np.linalg.norm(moment) / all_m) if all_m > 0 else 0.0,
+        )
+
+    def _field(self, what: str, values: npt.ArrayLike) -> fem.Function:
+        if what not in self._fields:
+            S = compat.function_space(self.config.mesh, self.config.degree)
+            self._fields[what] = fem.Function(S, name=_identifier(f"contact_{what}_{self.name}"))
+        f = self._fields[what]
+        f.x.array[:] = 0.0
+        f.x.array[self.pair.nodes] = values
+        f.x.scatter_forward()
+        return f
+
+
+def _identifier(text: str) -> str:
+    """Name of a Function that the form compiler can use in code."""
+    return re.sub(r"\W+", "_", text)

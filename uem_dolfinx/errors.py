@@ -1,0 +1,101 @@
+"""Named exceptions, and the agreement between ranks that makes one rank's error everybody's.
+
+First on the data's way because every later step may have to refuse its input.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mpi4py import MPI
+
+
+class UEMError(Exception):
+    """Root of every error this package raises on purpose."""
+
+
+class TagError(UEMError, KeyError):
+    """A physical group is unknown, empty or of the wrong dimension."""
+
+    __str__ = Exception.__str__
+
+
+class MeshError(UEMError, ValueError):
+    """A mesh cannot be read or made."""
+
+
+class MissingFileError(MeshError, FileNotFoundError):
+    """A file to be read does not exist."""
+
+    __str__ = Exception.__str__
+
+
+class SpaceError(UEMError, ValueError):
+    """The function space, the mesh and the tags do not belong together."""
+
+
+class SurfaceError(UEMError, ValueError):
+    """A contact surface cannot be what it is asked to be."""
+
+
+class OrientationError(SurfaceError):
+    """The outward normal of a target is not defined."""
+
+
+class PenetrationError(SurfaceError):
+    """The initial penetration is larger than the stated bound."""
+
+
+class ConflictError(UEMError, ValueError):
+    """A Dirichlet condition and a uniting equation, or two uniting equations, ask different things of one node."""
+
+
+class NotFiniteError(UEMError, ArithmeticError):
+    """The residual, the tangent or the increment holds NaN or infinity."""
+
+
+class InvertedElementError(UEMError, ArithmeticError):
+    """The displacement turns a cell inside out."""
+
+
+class MissingBackendError(UEMError, ImportError):
+    """An optional library (gmsh, matplotlib, hypre, MUMPS, ...) was asked for and is not here."""
+
+
+class LinearSolveError(UEMError, RuntimeError):
+    """PETSc reports that the linear solver failed."""
+
+
+class ConvergenceError(UEMError, RuntimeError):
+    """The united Newton loop did not converge; the committed state has been restored.
+
+    Attributes:
+        history: the iterations made, in order (see ``uem_dolfinx.newton.Iteration``).
+    """
+
+    def __init__(self, message: str, history: Sequence[object] = ()):
+        super().__init__(message)
+        self.history = list(history)
+
+
+def agree(comm: MPI.Comm, error: UEMError | None) -> None:
+    """Raise on every rank the error of the first rank that has one (collective).
+
+    Ranks that each look at their own part of the mesh must not raise alone: the others would wait for ever
+    in the next collective call.
+
+    Args:
+        comm: the communicator whose ranks have to agree.
+        error: what this rank found wrong, or None.
+
+    Raises:
+        UEMError: the same error on all ranks, if any rank had one.
+    """
+    if comm.size > 1:
+        errors = comm.allgather(error)
+        error = next((e for e in errors if e is not None), None)
+    if error is not None:
+        raise error

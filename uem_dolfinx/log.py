@@ -1,0 +1,66 @@
+"""The one logger of the package, its timers and its progress bar.
+
+Every later step reports through it: on rank 0 only, silent until the application configures logging, and with
+timings under ``~UEM:`` in DOLFINx's own table.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+from mpi4py import MPI
+
+from dolfinx.common import Timer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+T = TypeVar("T")
+
+
+def _is_rank_zero(record: logging.LogRecord) -> bool:
+    """Let a record pass on rank 0 of the world only."""
+    return MPI.COMM_WORLD.rank == 0
+
+
+logger = logging.getLogger("uem_dolfinx")
+"""Rank 0's logger; handlers and levels are the application's business."""
+logger.addFilter(_is_rank_zero)
+
+
+@contextmanager
+def timed(stage: str) -> Iterator[None]:
+    """Time a stage of the method; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
+
+    Args:
+        stage: what is done inside, e.g. ``"search"``.
+    """
+    timer = Timer(f"~UEM: {stage}")
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.stop()
+
+
+def progress(items: Iterable[T], description: str = "", total: int | None = None) -> Iterable[T]:
+    """Iterate with a progress bar where someone can see one.
+
+    Args:
+        items: what to iterate over.
+        description: text in front of the bar.
+        total: number of items, where ``items`` does not know it.
+
+    Returns:
+        ``items`` behind a tqdm bar on rank 0 when standard error is a terminal and tqdm is installed, else ``items``.
+    """
+    if MPI.COMM_WORLD.rank != 0 or not sys.stderr.isatty():
+        return items
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return items
+    return tqdm(items, desc=description, total=total, file=sys.stderr)

@@ -1,0 +1,214 @@
+"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, unite, solve, until equilibrium and contact hold.
+
+Seventh step on the data's way. The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
+from uem_dolfinx.log import logger
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+    from uem_dolfinx.restriction import Restriction
+
+#: Shortest step of the line search.
+SHORTEST_STEP = 1.0 / 64
+#: The line search accepts a step that leaves less than this part of the work of the residual.
+ENOUGH_DECREASE = 0.9
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of the history.
+
+    Attributes:
+        residual: norm of ``P'r`` over the forces at work.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks.
+        changed: whether contactors were activated or released.
+        linear_iterations: of the solve that followed; 0 if the step had converged.
+        step_length: of the line search in the step that led here.
+    """
+
+    residual: float
+    gap: float
+    active: int
+    changed: bool
+    linear_iterations: int
+    step_length: float
+
+
+@dataclass(frozen=True)
+class United:
+    """A state of the united system as the loop sees it.
+
+    Attributes:
+        restriction: P and c.
+        residual: ``P'F``, the out-of-balance forces.
+        norm: its norm.
+        scale: norm of the forces at work.
+        rounding: norm below which a force is rounding.
+        gap: largest gap of an active contactor over the model's size.
+        active: number of active contactors.
+        changed: whether the active set changed.
+        closed: whether gaps and Dirichlet conditions are met.
+    """
+
+    restriction: Restriction
+    residual: PETSc.Vec
+    norm: float
+    scale: float
+    rounding: float
+    gap: float
+    active: int
+    changed: bool
+    closed: bool
+
+
+class UnitedSystem(Protocol):
+    """What the loop needs of the problem; every method is collective."""
+
+    def place(self, returning: bool) -> None:
+        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+        ...
+
+    def assemble_residual(self) -> bool:
+        """Residual at the present displacement; whether it is finite."""
+        ...
+
+    def unite(self, cautious: bool) -> United:
+        """Contact forces, activation and release, and the uniting equations that follow."""
+        ...
+
+    def active_set(self) -> int:
+        """Fingerprint of the active set, the same on all ranks."""
+        ...
+
+    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+        """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
+        ...
+
+    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
+        """dq and the number of linear iterations."""
+        ...
+
+    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+        """``du = P dq + c``."""
+        ...
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the present displacement."""
+        ...
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set the displacement to ``start + length du``."""
+        ...
+
+    def inverted(self) -> str | None:
+        """Where a cell is inside out, if one is."""
+        ...
+
+    def work(self, state: United, dq: PETSc.Vec) -> float:
+        """Work of the present residual on an increment, ``dq . P'F``, with the P of ``state``."""
+        ...
+
+
+def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool) -> list[Iteration]:
+    """Iterate until ``P'r`` vanishes against the forces at work and every contact condition holds.
+
+    Args:
+        system: the problem.
+        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        max_iterations: bound on the number of linear solves.
+        line_search: shorten steps that invert cells or increase the work of the residual.
+        verbose: print a line per iteration.
+
+    Returns:
+        The history; its last entry is the converged state.
+
+    Raises:
+        ConvergenceError: after ``max_iterations``, with the history.
+        NotFiniteError: if the residual is NaN or infinite at the start of the step.
+        InvertedElementError: if even the shortest step turns a cell inside out.
+    """
+    history: list[Iteration] = []
+    seen: set[int] = set()
+    cautious, start, length = False, 0.0, 1.0
+    system.place(returning=False)
+    if not system.assemble_residual():
+        raise NotFiniteError(
+            "the residual is not finite at the start of the step: "
+            "check loads, material parameters and the initial displacement for NaN and division by zero"
+        )
+    for k in range(max_iterations + 1):
+        state = system.unite(cautious)
+        start = start if k else state.norm
+        forces = max(state.scale, start)
+        converged = not state.changed and state.closed and state.norm <= max(rtol * forces, state.rounding)
+        if converged or k == max_iterations:
+            history.append(Iteration(_ratio(state.norm, forces), state.gap, state.active, state.changed, 0, length))
+            _report(history, verbose)
+            if converged:
+                return history
+            break
+        fingerprint = system.active_set()
+        cautious |= state.changed and fingerprint in seen
+        seen.add(fingerprint)
+        rhs = system.linearise(state, first=k == 0)
+        driving = rhs.norm()
+        dq, iterations = system.solve(rhs)
+        residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
+        history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
+        _report(history, verbose)
+        length = _advance(system, state, rhs, dq, line_search)
+    last = history[-1]
+    raise ConvergenceError(
+        f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
+        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps, or raise max_iterations",
+        history,
+    )
+
+
+def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
+    """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
+    du, start = system.move(state, dq), system.displacement()
+    before = abs(dq.dot(rhs))
+    enough = max(ENOUGH_DECREASE * before, state.rounding * dq.norm())
+    length = 1.0
+    while True:
+        last = not line_search or length <= SHORTEST_STEP
+        system.displace(start, du, length)
+        where = system.inverted()
+        if where is None:
+            system.place(returning=length == 1.0)
+            finite = system.assemble_residual()
+            if finite and (last or abs(system.work(state, dq)) <= enough):
+                return length
+            if last:
+                raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+        elif last:
+            raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+        length *= 0.5
+
+
+def _ratio(norm: float, scale: float) -> float:
+    return norm / scale if scale > 0 else 0.0
+
+
+def _report(history: list[Iteration], verbose: bool) -> None:
+    i = history[-1]
+    line = (
+        f"  {len(history) - 1:3d}  residual {i.residual:.3e}  gap {i.gap:.1e}  active {i.active:5d}{'*' if i.changed else ' '}  "
+        f"linear {i.linear_iterations:3d}  step {i.step_length:g}"
+    )
+    if verbose:
+        logger.warning(line)
+    else:
+        logger.debug(line)

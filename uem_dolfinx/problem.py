@@ -1,0 +1,230 @@
+"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, solved step by step.
+
+Eighth step on the data's way, and the only file that knows all the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, LinearSolveError, NotFiniteError, UEMError
+from uem_dolfinx.log import logger
+from uem_dolfinx.newton import Iteration, solve_united
+from uem_dolfinx.solver import UnitedSolver
+from uem_dolfinx.surfaces import Configuration
+from uem_dolfinx.system import BodySystem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    import ufl
+
+    from uem_dolfinx.contact import Contact
+
+#: A load step may be cut to this part of its nominal length.
+SHORTEST_LOAD_STEP = 1.0 / 1024
+#: A step that needs no more iterations than this is easy: the next one may be longer again.
+EASY = 6
+
+
+class UnitedProblem:
+    """Statics of bodies in contact by the United Elements Method.
+
+    Solves ``F(u; v) = 0`` with the contactors of every contact united to their targets:
+
+        du = P dq + c,    P'KP dq = P'(r - K c),    r = -F,    K = dF/du      [UEM, 6.6]
+
+    Args:
+        F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``.
+        u: displacement, a Function of a vector Lagrange space; holds the solution.
+        bcs: Dirichlet conditions.
+        contacts: contacts between bodies or with rigid surfaces; none is fine.
+        petsc_options_prefix: prefix of the linear solver's options.
+        petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size.
+        load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped, or
+            a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only.
+        newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
+        consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
+        line_search: shorten steps that invert cells or do not reduce the residual's work.
+        check_inversion: look for cells turned inside out in every iteration; None does so unless K is constant.
+        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        max_iterations: bound on the linear solves of one step.
+        verbose: log one line per iteration.
+
+    Raises:
+        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, or F does not depend on it.
+        TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
+        MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
+    """
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        *,
+        bcs: Sequence[fem.DirichletBC] = (),
+        contacts: Sequence[Contact] = (),
+        petsc_options_prefix: str = "uem_",
+        petsc_options: dict[str, Any] | None = None,
+        load: fem.Constant | Callable[[float], None] | None = None,
+        newton: str = "full",
+        consistent_tangent: bool = True,
+        line_search: bool = True,
+        check_inversion: bool | None = None,
+        rtol: float = 1e-8,
+        max_iterations: int = 50,
+        verbose: bool = False,
+    ):
+        if newton not in ("full", "modified"):
+            raise ValueError(f"newton = '{newton}': expected 'full' or 'modified'")
+        self.u, self.load = u, load
+        self.line_search, self.rtol, self.max_iterations, self.verbose = line_search, rtol, max_iterations, verbose
+        self.config = Configuration(u)
+        self.comm = self.config.comm
+        self.contacts = list(contacts)
+        self.system = BodySystem(
+            self.config,
+            F,
+            bcs,
+            UnitedSolver(self.config, petsc_options_prefix, petsc_options),
+            newton=newton,
+            consistent_tangent=consistent_tangent,
+            check_inversion=check_inversion,
+        )
+        self.system.pairs = [contact.attach(self.system) for contact in self.contacts]
+        for pair in self.system.pairs:
+            pair.project()
+            pair.check_initial()
+            pair.touch()
+        self._committed = np.array(u.x.array)
+        self._last = np.array(u.x.array)
+        self._last_fraction: float | None = None
+
+    # -- one step ----------------------------------------------------------------------------------------------------
+
+    def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+        """Bring the bodies into equilibrium and commit the state (collective).
+
+        Args:
+            start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
+            fraction: how far the Dirichlet values go, from ``start`` (0) to the values of ``bcs`` (1).
+            ratio: this step's length over the last one's, for extrapolating the active set; 0 does not extrapolate.
+
+        Returns:
+            The history of iterations.
+
+        Raises:
+            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError: after the committed
+                state has been restored.
+        """
+        start = self._committed if start is None else start
+        wanted = np.array(start)
+        compat.set_bc_values(wanted, self.system.bcs)
+        self.system.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
+        try:
+            if ratio > 0.0:
+                self._predict(ratio)
+            history = solve_united(
+                self.system,
+                rtol=self.rtol,
+                max_iterations=self.max_iterations,
+                line_search=self.line_search,
+                verbose=self.verbose,
+            )
+        except UEMError:
+            self.restore()
+            raise
+        self.commit()
+        return history
+
+    def commit(self) -> None:
+        """Keep the present displacement and contact state."""
+        self._last, self._committed = self._committed, np.array(self.u.x.array)
+        for pair in self.system.pairs:
+            pair.commit()
+            pair.project()
+
+    def restore(self) -> None:
+        """Return to the committed displacement and contact state."""
+        self.u.x.array[:] = self._committed
+        for pair in self.system.pairs:
+            pair.restore()
+            pair.project()
+
+    def _predict(self, ratio: float) -> None:
+        """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
+        self.u.x.array[:] = self._committed + ratio * (self._committed - self._last)
+        for pair in self.system.pairs:
+            pair.project()
+            pair.predict(ratio)
+        self.u.x.array[:] = self._committed
+
+
+@dataclass(frozen=True)
+class LoadStep:
+    """A converged load step.
+
+    Attributes:
+        number: counted from 1.
+        factor: load factor reached, 1 at the end.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+    """
+
+    number: int
+    factor: float
+    iterations: list[Iteration]
+    cuts: int
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of linear solves."""
+        return len(self.iterations) - 1
+
+
+def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
+    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length.
+
+    Args:
+        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
+        steps: nominal number of equal steps.
+
+    Yields:
+        Every converged step.
+
+    Raises:
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+    """
+    nominal = 1.0 / steps
+    length, done, last, number, cuts = nominal, 0.0, 0.0, 0, 0
+    start = np.array(problem.u.x.array)
+    while done < 1.0:
+        factor = min(done + length, 1.0)
+        if 1.0 - factor < 1e-9:
+            factor = 1.0
+        fraction = factor
+        if callable(problem.load) and not isinstance(problem.load, fem.Constant):
+            problem.load(factor)
+            fraction = 1.0
+        elif problem.load is not None:
+            problem.load.value = factor
+        try:
+            iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
+        except (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError) as error:
+            cuts += 1
+            length *= 0.5
+            if length < SHORTEST_LOAD_STEP * nominal:
+                raise
+            logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
+            continue
+        last, done, number = factor - done, factor, number + 1
+        yield LoadStep(number, factor, iterations, cuts)
+        cuts = 0
+        if len(iterations) - 1 <= EASY:
+            length = min(2.0 * length, nominal)

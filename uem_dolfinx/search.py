@@ -1,0 +1,302 @@
+"""Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
+
+Third step on the data's way. A point travels only to the ranks whose part of the target can be nearest, and only its answer
+travels back, so no rank ever sees a whole surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from uem_dolfinx.shapes import FacetShape, Tabulated, closest_point, unit_normals
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from uem_dolfinx.surfaces import FacetData, TargetFacets
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: Reference distance from a facet's side below which a foot counts as lying on it.
+ON_SIDE = 1e-10
+
+
+class Projection(Protocol):
+    """Where points stand relative to a target: the one thing the uniting equations ask of it.
+
+    Attributes:
+        gap: signed distance ``(n,)``, positive outside.
+        normal: unit normals out of the target ``(n, gdim)``.
+        nodes: global block numbers of the target's nodes ``(n, nn)``; ``nn = 0`` for a rigid target.
+        weights: shape functions at the foot ``(n, nn)``.
+        facet: number of the facet over all ranks ``(n,)``.
+        beyond: how far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``.
+    """
+
+    gap: Array
+    normal: Array
+    nodes: Ints
+    weights: Array
+    facet: Ints
+    beyond: Array
+
+    def hessians(self, which: Ints) -> Array:
+        """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
+        ...
+
+    def take(self, which: Ints) -> Projection:
+        """The projections of some of the points."""
+        ...
+
+
+class Target(Protocol):
+    """Anything that points can be projected onto, meshed or rigid."""
+
+    n_nodes: int
+
+    def project(self, points: Array) -> Projection:
+        """Closest points in the current configuration (collective)."""
+        ...
+
+    def follow(self, points: Array, old: Projection) -> Projection:
+        """Gaps with the feet, normals and weights of an earlier projection (small sliding, collective)."""
+        ...
+
+
+@dataclass(frozen=True)
+class FacetProjection:
+    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the foot.
+
+    Attributes:
+        xi: reference coordinates of the foot ``(n, fdim)``.
+        foot: closest points ``(n, gdim)``.
+        averaged: interpolated nodal normals ``(n, gdim)``.
+        x: positions of the facet's nodes ``(n, nn, gdim)``.
+        dN: derivatives of the weights ``(n, nn, fdim)``.
+        ddN: second derivatives ``(n, nn, fdim, fdim)``.
+        bend: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero where the normal is the facet's.
+    """
+
+    gap: Array
+    normal: Array
+    nodes: Ints
+    weights: Array
+    facet: Ints
+    beyond: Array
+    xi: Array
+    foot: Array
+    averaged: Array
+    x: Array
+    dN: Array
+    ddN: Array
+    bend: Array
+
+    def take(self, which: Ints) -> FacetProjection:
+        return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def hessians(self, which: Ints) -> Array:
+        """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
+
+        With the moving tangents ``t_a``, ``D_a`` the derivative of the foot's coordinate and ``N_a`` that of the facet's
+        slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
+        on a straight 2D facet this is the formula of the method's description.
+        """
+        n, g, w, dN, x = (getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "x"))
+        k, nn = w.shape
+        gdim, fdim = n.shape[1], dN.shape[2]
+        t = np.einsum("kaf,kag->kfg", dN, x)
+        m = np.einsum("kfg,keg->kfe", t, t)
+        b = np.einsum("kg,kag,kafe->kfe", n, x, self.ddN[which])
+        slope = np.einsum("kfg,keg->kfe", t, self.bend[which])
+        b -= 0.5 * (slope + slope.transpose(0, 2, 1))
+        # rows over (contactor, nodes) x gdim
+        Na = np.zeros((k, fdim, 1 + nn, gdim))
+        Na[:, :, 1:] = np.einsum("kaf,kg->kfag", dN, n)
+        Ta = np.empty_like(Na)
+        Ta[:, :, 0] = t
+        Ta[:, :, 1:] = -np.einsum("ka,kfg->kfag", w, t) + g[:, None, None, None] * Na[:, :, 1:]
+        Na, Ta = Na.reshape(k, fdim, (1 + nn) * gdim), Ta.reshape(k, fdim, (1 + nn) * gdim)
+        D = np.linalg.solve(m - g[:, None, None] * b, Ta)
+        H = -np.einsum("kfi,kfj->kij", D, Na)
+        H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
+        L = Na + np.einsum("kfe,kei->kfi", b, D)
+        return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+
+
+class MeshTarget:
+    """Target whose facets are spread over the ranks.
+
+    Args:
+        facets: the target's facets.
+        averaged: use nodal normals interpolated over the facet instead of the facet's own.
+    """
+
+    def __init__(self, facets: TargetFacets, averaged: bool = False):
+        self.facets, self.averaged = facets, averaged
+        self.shape: FacetShape = facets.shape
+        self.comm: MPI.Comm = facets.config.comm
+        self.n_nodes = facets.dofs.shape[1]
+        counts = self.comm.allgather(len(facets.dofs))
+        self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    def project(self, points: Array) -> FacetProjection:
+        """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
+        data = self.facets.current()
+        owners = self._possible_owners(points, data)
+        return self._ask(points, [np.flatnonzero(o) for o in owners], data)
+
+    def project_on(self, points: Array, facet: Ints) -> FacetProjection:
+        """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
+        return self._ask(points, self._owners(facet), self.facets.current(), facet)
+
+    def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
+        """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
+        new = self._ask(points, self._owners(old.facet), self.facets.current(), old.facet, old.xi)
+        gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
+        return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
+
+    def outward(self, projection: FacetProjection) -> Array:
+        """The facets' own outward normals at the feet, also where ``normal`` is an averaged one ``(n, gdim)``."""
+        own = _unit_normals_of(projection)
+        return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
+
+    def _owners(self, facet: Ints) -> list[Ints]:
+        """Per rank, which of the facets it holds."""
+        owner = np.searchsorted(self.first, facet, side="right") - 1
+        return [np.flatnonzero(owner == r) for r in range(self.comm.size)]
+
+    def _possible_owners(self, points: Array, data: FacetData) -> list[Bools]:
+        """Per rank, which points may have their closest point there.
+
+        A box is ruled out when its near side is farther than the far side of some other box.
+        """
+        if self.comm.size == 1:
+            return [np.ones(len(points), dtype=bool)]
+        nodes = data.x.reshape(-1, points.shape[1])
+        box = np.stack([nodes.min(axis=0), nodes.max(axis=0)]) if len(nodes) else None
+        boxes = self.comm.allgather(box)
+        near, far = np.full((2, self.comm.size, len(points)), np.inf)
+        for r, b in enumerate(boxes):
+            if b is not None:
+                slack = 0.0 if self.shape.degree == 1 else 0.25 * np.linalg.norm(b[1] - b[0])
+                outside = np.maximum(np.maximum(b[0] - points, points - b[1]), 0.0)
+                near[r] = np.linalg.norm(outside, axis=1) - slack
+                far[r] = np.linalg.norm(np.maximum(np.abs(points - b[0]), np.abs(points - b[1])), axis=1) + slack
+        return list(near <= far.min(axis=0))
+
+    def _ask(
+        self, points: Array, requests: list[Ints], data: FacetData, facet: Ints | None = None, xi: Array | None = None
+    ) -> FacetProjection:
+        """Send each rank its points (with the facet, or facet and foot, if given), keep the nearest answer."""
+        comm = self.comm
+        known = [a for a in (points, facet, xi) if a is not None]
+        local = [[a[i] for a in known] for i in requests]
+        asked = comm.alltoall(local) if comm.size > 1 else local
+        p, *rest = (np.concatenate(a) for a in zip(*asked))
+        if rest:
+            rest[0] = rest[0] - self.first[comm.rank]
+        answer, distance = self._project_here(p, data, *rest)
+        if comm.size == 1:
+            return answer
+        ends = np.cumsum([0, *(len(a[0]) for a in asked)])
+        parts = comm.alltoall([_pack(answer, distance, slice(a, b)) for a, b in zip(ends[:-1], ends[1:])])
+        which = np.concatenate(requests)
+        d = np.concatenate([part[0] for part in parts])
+        # nearest first; a tie goes to the lower rank, whose answer on the shared side is the same
+        order = np.lexsort((np.arange(len(d)), d, which))
+        _, first = np.unique(which[order], return_index=True)
+        best = order[first]
+        return FacetProjection(*(np.concatenate([part[1][k] for part in parts])[best] for k in range(len(parts[0][1]))))
+
+    def _project_here(
+        self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
+    ) -> tuple[FacetProjection, Array]:
+        """Project onto this rank's facets: projections and distances."""
+        if facet is None:
+            pairs, candidates = candidate_pairs(self.shape, data.x, points)
+            xi, d2 = closest_point(self.shape, data.x[candidates], points[pairs])
+            # the nearest facet; among those tied at a shared side, the one with the lowest number
+            order = np.lexsort((candidates, d2, pairs))
+            _, first = np.unique(pairs[order], return_index=True)
+            best = order[first]
+            facet, xi = candidates[best], xi[best]
+        elif xi is None:
+            xi, _ = closest_point(self.shape, data.x[facet], points)
+        answer = self._evaluate(points, facet, xi, data)
+        return answer, np.linalg.norm(points - answer.foot, axis=1)
+
+    def _evaluate(self, points: Array, facet: Ints, xi: Array, data: FacetData) -> FacetProjection:
+        """Gap, normal and geometry at the feet ``xi`` on this rank's facets."""
+        tab = self.shape.tabulate(xi)
+        x = data.x[facet]
+        foot = np.einsum("na,nag->ng", tab.N, x)
+        facet_normal = unit_normals(tab, x) * self.facets.sign[facet, None]
+        raw = np.einsum("na,nag->ng", tab.N, data.nodal_normals[facet])
+        length = np.linalg.norm(raw, axis=1, keepdims=True)
+        averaged_normal = raw / np.where(length > 0, length, 1.0)
+        on_side = self.shape.side_distances(xi) < ON_SIDE
+        is_open = self.facets.open_sides[facet]
+        # exactly on a shared side either facet's normal would be an arbitrary choice
+        use_average = np.full(len(points), True) if self.averaged else (on_side & ~is_open).any(axis=1)
+        use_average &= length[:, 0] > 0
+        normal = np.where(use_average[:, None], averaged_normal, facet_normal)
+        bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / np.where(length > 0, length, 1.0)[:, :, None]
+        bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
+        bend[~use_average] = 0.0
+        gap = np.einsum("ng,ng->n", normal, points - foot)
+        beyond = points - foot - gap[:, None] * normal
+        beyond[~(on_side & is_open).any(axis=1)] = 0.0
+        return FacetProjection(
+            gap, normal, data.nodes[facet], tab.N, facet + self.first[self.comm.rank], beyond,
+            xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend,
+        )
+
+
+def _unit_normals_of(p: FacetProjection) -> Array:
+    return unit_normals(Tabulated(p.weights, p.dN, p.ddN), p.x)
+
+
+def _pack(answer: FacetProjection, distance: Array, part: slice) -> tuple[Array, list[npt.NDArray[np.generic]]]:
+    return distance[part], [getattr(answer, f.name)[part] for f in fields(answer)]
+
+
+def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
+    """All pairs (point, facet) that can be closest, from trees over the facets' middles, one per size class.
+
+    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
+    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere.
+
+    Args:
+        shape: kind of the facets.
+        x: facet nodes ``(m, nn, gdim)``.
+        points: ``(n, gdim)``.
+
+    Returns:
+        Indices of points and of facets, both ``(k,)``; every point occurs at least once if there are facets.
+    """
+    if len(points) == 0 or len(x) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
+    middle = np.einsum("na,nag->ng", tab.N, x)
+    radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1) * (1.0 if shape.degree == 1 else 1.5)
+    bound, _ = cKDTree(middle).query(points)
+    bound = bound * (1 + 1e-12)
+    size_class = np.floor(np.log2(radius / radius.max()))
+    pairs, facets = [], []
+    for c in np.unique(size_class):
+        members = np.flatnonzero(size_class == c)
+        reach = bound + radius[members].max()
+        hits = cKDTree(middle[members]).query_ball_point(points, reach, return_sorted=False)
+        counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
+        pairs.append(np.repeat(np.arange(len(points)), counts))
+        facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
+    i, f = np.concatenate(pairs), np.concatenate(facets)
+    keep = np.linalg.norm(points[i] - middle[f], axis=1) <= bound[i] + radius[f]
+    return i[keep], f[keep]

@@ -1,0 +1,183 @@
+"""Shape functions of contact facets, and the exact closest point of a facet to a point.
+
+Everything is vectorised over pairs (facet, point); a facet is an interval, a triangle or a quadrilateral of
+Lagrange degree 1 or 2, so one code serves straight, bilinear and curved facets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.compat import create_lagrange_element, reference_topology
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tabulated:
+    """Shape functions and derivatives at one point of each facet.
+
+    Attributes:
+        N: values ``(n, nn)``.
+        dN: first derivatives ``(n, nn, fdim)``.
+        ddN: second derivatives ``(n, nn, fdim, fdim)``.
+    """
+
+    N: Array
+    dN: Array
+    ddN: Array
+
+
+class FacetShape:
+    """Lagrange facet of one kind.
+
+    Args:
+        cell: ``"point"``, ``"interval"``, ``"triangle"`` or ``"quadrilateral"``.
+        degree: polynomial degree.
+    """
+
+    def __init__(self, cell: str, degree: int):
+        self.cell, self.degree = cell, degree
+        self.dim = {"point": 0, "interval": 1, "triangle": 2, "quadrilateral": 2}[cell]
+        self.topology = reference_topology(cell) if self.dim else [[[0]]]
+        self._element = create_lagrange_element(cell, degree) if self.dim else None
+        # Newton is exact at once where the map is affine
+        self.affine = degree == 1 and cell in ("point", "interval", "triangle")
+
+    def tabulate(self, xi: Array) -> Tabulated:
+        """Shape functions at ``xi (n, fdim)``."""
+        n, d = len(xi), self.dim
+        if self._element is None:
+            return Tabulated(np.ones((n, 1)), np.zeros((n, 1, 0)), np.zeros((n, 1, 0, 0)))
+        if n == 0:
+            nn = self._element.dim
+            return Tabulated(np.zeros((0, nn)), np.zeros((0, nn, d)), np.zeros((0, nn, d, d)))
+        t = self._element.tabulate(2, np.ascontiguousarray(xi))[..., 0]
+        ddN = np.empty((n, t.shape[2], d, d))
+        if d == 1:
+            ddN[..., 0, 0] = t[2]
+        else:
+            ddN[..., 0, 0], ddN[..., 1, 1] = t[3], t[5]
+            ddN[..., 0, 1] = ddN[..., 1, 0] = t[4]
+        return Tabulated(t[0], np.moveaxis(t[1 : 1 + d], 0, -1), ddN)
+
+    @property
+    def nodes(self) -> Array:
+        """Reference positions of the nodes ``(nn, fdim)``."""
+        return np.zeros((1, 0)) if self._element is None else np.asarray(self._element.points)
+
+    @property
+    def middle(self) -> Array:
+        """Reference midpoint ``(fdim,)``."""
+        return np.full(self.dim, 1 / 3 if self.cell == "triangle" else 0.5)
+
+    def contains(self, xi: Array) -> npt.NDArray[np.bool_]:
+        """Which ``xi (n, fdim)`` lie in the closed reference facet."""
+        inside = (xi >= 0).all(axis=1)
+        return inside & ((xi.sum(axis=1) <= 1) if self.cell == "triangle" else (xi <= 1).all(axis=1))
+
+    def side_distances(self, xi: Array) -> Array:
+        """How far ``xi (n, fdim)`` is inside each side, in reference units ``(n, n_sides)``."""
+        if self.dim == 1:
+            return np.column_stack([xi, 1 - xi])
+        if self.cell == "triangle":
+            return np.column_stack([1 - xi.sum(axis=1), xi])
+        return np.column_stack([xi[:, 1], xi[:, 0], 1 - xi[:, 0], 1 - xi[:, 1]])
+
+    def edges(self) -> list[tuple[FacetShape, npt.NDArray[np.int32], Array, Array]]:
+        """Boundary of the facet: per side its shape, its nodes in the facet, and the map ``xi = o + s @ D``."""
+        if self.dim == 0:
+            return []
+        corners = _reference_vertices(self.cell)
+        sides = []
+        for i, vertices in enumerate(self.topology[self.dim - 1]):
+            shape = facet_shape("point" if self.dim == 1 else "interval", self.degree)
+            inner = [] if self.dim == 1 or self.degree == 1 else [len(self.topology[0]) + i]
+            o = corners[vertices[0]]
+            D = corners[vertices[1:]] - o if self.dim == 2 else np.zeros((0, self.dim))
+            sides.append((shape, np.array([*vertices, *inner], dtype=np.int32), o, D))
+        return sides
+
+
+@lru_cache(maxsize=None)
+def facet_shape(cell: str, degree: int) -> FacetShape:
+    """The one ``FacetShape`` of this kind."""
+    return FacetShape(cell, degree)
+
+
+def _reference_vertices(cell: str) -> Array:
+    return {
+        "interval": np.array([[0.0], [1.0]]),
+        "triangle": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
+        "quadrilateral": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]),
+    }[cell]
+
+
+def tangents(tab: Tabulated, x: Array) -> Array:
+    """Covariant tangents ``(n, fdim, gdim)`` of facets with nodes ``x (n, nn, gdim)``."""
+    return np.einsum("naf,nag->nfg", tab.dN, x)
+
+
+def unit_normals(tab: Tabulated, x: Array) -> Array:
+    """Unit normals ``(n, gdim)`` in the sense of the facet's own parametrisation."""
+    t = tangents(tab, x)
+    n = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -> tuple[Array, Array]:
+    """Exact closest point of facet i to point i.
+
+    The stationary point inside the facet is compared with the closest points of its sides (recursively, down to
+    the vertices); the nearest wins.
+
+    Args:
+        shape: kind of all the facets.
+        x: facet nodes ``(n, nn, gdim)``.
+        p: points ``(n, gdim)``.
+        iterations: bound on the Newton iterations of a curved facet.
+
+    Returns:
+        Reference coordinates ``xi (n, fdim)`` and squared distances ``(n,)``.
+    """
+    if shape.dim == 0:
+        return np.zeros((len(p), 0)), np.einsum("ng,ng->n", p - x[:, 0], p - x[:, 0])
+    xi, d2 = _stationary_point(shape, x, p, iterations)
+    for side, nodes, o, D in shape.edges():
+        s, s2 = closest_point(side, x[:, nodes], p, iterations)
+        # a side wins only when it is truly nearer: an inner point keeps its full parametrisation
+        nearer = s2 < d2
+        xi[nearer] = (o + s @ D)[nearer]
+        d2 = np.where(nearer, s2, d2)
+    return xi, d2
+
+
+def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
+    """Newton on ``(p - y) . y,alpha = 0``; infinitely far where it ends outside the facet."""
+    xi = np.tile(shape.middle, (len(p), 1))
+    d2 = np.full(len(p), np.inf)
+    todo = np.arange(len(p))
+    for _ in range(1 if shape.affine else iterations):
+        if not len(todo):
+            break
+        tab = shape.tabulate(xi[todo])
+        r = p[todo] - np.einsum("na,nag->ng", tab.N, x[todo])
+        t = tangents(tab, x[todo])
+        m = np.einsum("nfg,neg->nfe", t, t)
+        if not shape.affine:
+            curved = m - np.einsum("ng,nag,nafe->nfe", r, x[todo], tab.ddN)
+            convex = np.linalg.eigvalsh(curved)[:, 0] > 0.1 * np.linalg.eigvalsh(m)[:, 0]
+            m = np.where(convex[:, None, None], curved, m)
+        step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
+        xi[todo] += np.clip(step, -1.0, 1.0) if not shape.affine else step
+        far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1) if not shape.affine else np.zeros(len(todo), bool)
+        todo = todo[(np.abs(step).max(axis=1) > 1e-15) & ~far]
+    inside = shape.contains(xi)
+    tab = shape.tabulate(xi[inside])
+    r = p[inside] - np.einsum("na,nag->ng", tab.N, x[inside])
+    d2[inside] = np.einsum("ng,ng->n", r, r)
+    return xi, d2

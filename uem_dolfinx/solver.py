@@ -1,0 +1,185 @@
+"""The linear solve of the united system: ``P'KP`` with its pattern reused, near-null space carried to q, KSP and PC by size.
+
+Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_options``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import LinearSolveError, MissingBackendError
+from uem_dolfinx.log import timed
+
+if TYPE_CHECKING:
+    from uem_dolfinx.restriction import Restriction
+    from uem_dolfinx.surfaces import Configuration
+
+Array = npt.NDArray[np.float64]
+
+#: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
+DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+
+
+def default_options(size: int, gdim: int) -> dict[str, Any]:
+    """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG."""
+    if size <= DIRECT_UP_TO[gdim]:
+        options = {"ksp_type": "preonly", "pc_type": "lu"}
+        if compat.has_mumps():
+            options["pc_factor_mat_solver_type"] = "mumps"
+        return options
+    common = {"ksp_type": "cg", "ksp_rtol": 1e-10, "ksp_max_it": 2000}
+    if compat.has_hypre():
+        return common | {
+            "pc_type": "hypre",
+            "pc_hypre_type": "boomeramg",
+            "pc_hypre_boomeramg_strong_threshold": 0.5 if gdim == 3 else 0.25,
+            "pc_hypre_boomeramg_nodal_coarsen": 4,
+            "pc_hypre_boomeramg_vec_interp_variant": 2,
+        }
+    return common | {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
+
+
+def check_options(options: dict[str, Any]) -> None:
+    """Refuse options that ask for a library PETSc was built without.
+
+    Raises:
+        MissingBackendError: naming the option.
+    """
+    for key, value in options.items():
+        for name, there in (("hypre", compat.has_hypre), ("mumps", compat.has_mumps)):
+            if str(value).lower() == name and not there():
+                raise MissingBackendError(
+                    f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
+                    + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
+                )
+
+
+class UnitedSolver:
+    """KSP for ``P'KP dq = P'(r - K c)``.
+
+    Args:
+        config: configuration of the displacement.
+        prefix: PETSc options prefix.
+        options: PETSc options without prefix; None chooses by size.
+    """
+
+    def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
+        self.config = config
+        size = config.gdim * config.index_map.size_global
+        self.options = default_options(size, config.gdim) if options is None else dict(options)
+        check_options(self.options)
+        self.ksp = PETSc.KSP().create(config.comm)
+        self.ksp.setOptionsPrefix(prefix)
+        database = PETSc.Options()
+        self.ksp.setErrorIfNotConverged(False)
+        for key, value in self.options.items():
+            database[prefix + key] = value
+        self.ksp.setFromOptions()
+        for key in self.options:
+            del database[prefix + key]
+        self._key: object = None
+        self._P: PETSc.Mat | None = None
+        self.A: PETSc.Mat | None = None
+        self._modes: list[Array] | None = None
+
+    @property
+    def needs_near_null_space(self) -> bool:
+        """Whether the preconditioner can use the rigid-body modes."""
+        return self.ksp.getPC().getType() in ("gamg", "ml", "hypre", "bddc")
+
+    def set_operator(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
+        """Build ``P'(K + curvature)P`` and give it to the KSP (collective).
+
+        Args:
+            restriction: of the current uniting equations.
+            K: tangent matrix without boundary conditions.
+            curvature: second derivatives of the gaps times contact forces, or None.
+        """
+        key = (K.handle, restriction.n_equations > 0, self.config.comm.allgather(restriction.fingerprint(values=False)))
+        reuse = key == self._key and self.A is not None
+        with timed("united matrix P'KP"):
+            if restriction.M is None:
+                # without uniting equations P only crosses out the prescribed components
+                if reuse:
+                    K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                else:
+                    self.A = K.copy()
+                mask = restriction.T.getDiagonal()
+                self.A.diagonalScale(mask, mask)
+            elif reuse:
+                restriction.P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                K.PtAP(self._P, result=self.A)
+            else:
+                self._P = restriction.P
+                self.A = K.PtAP(self._P)
+            if curvature is not None:
+                P = restriction.T if restriction.M is None else self._P
+                self.A.axpy(1.0, curvature.PtAP(P), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+            diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
+            idle = restriction.idle.ravel()
+            diagonal.array[idle] = stiffness.array_r[idle]
+            self.A.setDiagonal(diagonal)
+        self._key = key
+        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if self.needs_near_null_space:
+            self.A.setBlockSize(self.config.gdim)
+            self.A.setNearNullSpace(self._near_null_space(restriction))
+        self.ksp.setOperators(self.A)
+
+    def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
+        """Rigid-body modes in the unknowns q: at a contactor their tangential components only."""
+        vectors: list[PETSc.Vec] = []
+        for mode in rigid_body_modes(self.config):
+            full = restriction.T.createVecLeft()
+            full.array[:] = mode.ravel()
+            q = restriction.reduce(full)
+            for other in vectors:
+                q.axpy(-q.dot(other), other)
+            if q.norm() > 0:
+                q.normalize()
+                vectors.append(q)
+        return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
+
+    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
+        """Solve for dq (collective).
+
+        Returns:
+            dq and the number of linear iterations.
+
+        Raises:
+            LinearSolveError: with PETSc's reason.
+        """
+        dq = rhs.duplicate()
+        with timed("linear solve"):
+            try:
+                self.ksp.solve(rhs, dq)
+            except PETSc.Error as error:
+                raise LinearSolveError(
+                    f"PETSc error {error.ierr} in the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()}: "
+                    "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
+                ) from error
+        reason = self.ksp.getConvergedReason()
+        if reason < 0 or not np.isfinite(dq.norm()):
+            raise LinearSolveError(
+                f"the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()} failed with KSP reason {reason} after "
+                f"{self.ksp.getIterationNumber()} iterations: a body may be free to move as a rigid body, the tangent may be "
+                "indefinite (use a direct solver), or ksp_max_it too small"
+            )
+        return dq, int(self.ksp.getIterationNumber())
+
+
+def rigid_body_modes(config: Configuration) -> list[Array]:
+    """Translations and linearised rotations of the current configuration, each ``(n_owned, gdim)``."""
+    g, x = config.gdim, config.x[: config.n_owned]
+    modes = [np.tile(e, (len(x), 1)) for e in np.eye(g)]
+    for i in range(g):
+        for j in range(i + 1, g):
+            m = np.zeros_like(x)
+            m[:, i], m[:, j] = -x[:, j], x[:, i]
+            modes.append(m)
+    return modes

@@ -1,0 +1,266 @@
+"""Contact surfaces of a function space: the contactor's nodes and the target's facets, in the current configuration.
+
+Second step on the data's way: tags become nodes, facets, outward normals and tributary areas, each rank for its own part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import OrientationError, SpaceError, SurfaceError, TagError, agree
+from uem_dolfinx.shapes import FacetShape, facet_shape, unit_normals
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from uem_dolfinx.mesh import Tag
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
+
+
+class Configuration:
+    """Nodes of a vector Lagrange space and where they are now: ``x = X + u``.
+
+    Args:
+        u: displacement, in a blocked Lagrange space with one component per coordinate.
+
+    Raises:
+        SpaceError: if ``u`` is not such a displacement.
+    """
+
+    def __init__(self, u: fem.Function):
+        V = u.function_space
+        self.u, self.V, self.mesh = u, V, V.mesh
+        self.comm = V.mesh.comm
+        self.gdim: int = V.mesh.geometry.dim
+        self.tdim: int = V.mesh.topology.dim
+        self.degree = compat.lagrange_degree(V)
+        if self.tdim != self.gdim:
+            raise SpaceError(f"a body of dimension {self.tdim} in {self.gdim}D space has no inside: use a mesh with gdim = {self.tdim}")
+        if V.dofmap.index_map_bs != self.gdim or self.degree is None:
+            raise SpaceError(
+                f"the displacement has {V.dofmap.index_map_bs} component(s) in {self.gdim}D: use a vector Lagrange space of size {self.gdim}"
+            )
+        if self.degree > 2:
+            raise SpaceError(f"contact surfaces of degree {self.degree} are not supported: use degree 1 or 2")
+        self.index_map = V.dofmap.index_map
+        self.n_owned: int = self.index_map.size_local
+        self.n_local: int = self.n_owned + self.index_map.num_ghosts
+        self.X: Array = np.array(V.tabulate_dof_coordinates()[: self.n_local, : self.gdim])
+
+    @property
+    def displacement(self) -> Array:
+        """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (a view)."""
+        return self.u.x.array.reshape(-1, self.gdim)
+
+    @property
+    def x(self) -> Array:
+        """Current positions of the local nodes ``(n_local, gdim)``, ghosts included."""
+        return self.X + self.displacement
+
+    def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Global block numbers of local nodes."""
+        flat = np.ascontiguousarray(nodes, dtype=np.int32).ravel()
+        return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with."""
+        lo = -np.max(-self.X, axis=0, initial=-np.inf)
+        hi = np.max(self.X, axis=0, initial=-np.inf)
+        bounds = np.max(self.comm.allgather(np.concatenate([-lo, hi])), axis=0)
+        return float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
+
+    def describe(self, node: int) -> str:
+        """Where a local node is, for error messages."""
+        return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"
+
+
+def check_tag(config: Configuration, tag: Tag, role: str) -> None:
+    """Refuse tags that are not facets of this mesh (collective)."""
+    error: Exception | None = None
+    if tag.mesh is not config.mesh:
+        error = SpaceError(f"{role} '{tag.name}' belongs to another mesh than the displacement: read both from one mesh")
+    elif tag.dim != config.tdim - 1:
+        error = TagError(f"{role} '{tag.name}' has dimension {tag.dim}: expected facets, dimension {config.tdim - 1}")
+    agree(config.comm, error)
+    if config.comm.allreduce(len(tag.entities)) == 0:
+        raise TagError(f"{role} '{tag.name}' holds no facets: check the physical group in the gmsh model")
+
+
+def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:
+    """Owned nodes on the closure of a tag's facets, sorted (collective)."""
+    nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
+    return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
+
+
+def tributary_areas(config: Configuration, tag: Tag) -> Array:
+    """Integral of each shape function over the reference surface, per local node ``(n_local,)`` (collective)."""
+    S = compat.function_space(config.mesh, config.degree)
+    v = ufl.TestFunction(S)
+    b = compat.create_vector(S)
+    compat.assemble_vector(b, compat.form(v * compat.surface_measure(config.mesh, tag.entities)))
+    areas = np.array(b.array_r)
+    b.destroy()
+    return areas
+
+
+@dataclass(frozen=True)
+class FacetData:
+    """Target facets of one rank in the current configuration.
+
+    Attributes:
+        x: node positions ``(m, nn, gdim)``.
+        nodes: global block numbers ``(m, nn)``.
+        nodal_normals: averaged outward normals at the nodes ``(m, nn, gdim)``.
+    """
+
+    x: Array
+    nodes: Ints
+    nodal_normals: Array
+
+
+class TargetFacets:
+    """Facets of a target surface that this rank holds, oriented outwards.
+
+    Args:
+        config: configuration of the displacement.
+        tag: the target's facets.
+
+    Raises:
+        OrientationError: if a facet lies between two cells, so that outward has no meaning.
+    """
+
+    def __init__(self, config: Configuration, tag: Tag):
+        self.config, self.tag = config, tag
+        mesh, tdim = config.mesh, config.tdim
+        fdim = tdim - 1
+        mesh.topology.create_connectivity(fdim, tdim)
+        mesh.topology.create_connectivity(tdim, fdim)
+        f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
+        n_cells = mesh.topology.index_map(tdim).size_local
+        sides = [(c, int(np.flatnonzero(c2f.links(c) == f)[0])) for f in tag.entities for c in f2c.links(f) if c < n_cells]
+        self.cells, local = np.array(sides, dtype=np.int32).reshape(-1, 2).T
+        self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
+        cell_dofs = compat.cell_dofs(config.V)
+        table = _facet_closure(config, self.shape)
+        self.dofs = cell_dofs[self.cells[:, None], table[local]]
+        self.nodes = config.to_global(self.dofs)
+        self._refuse_inner()
+        self._orient(cell_dofs)
+        self.open_sides = self._open_sides()
+
+    def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
+        """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
+        config, X = self.config, self.config.X
+        middle = np.tile(self.shape.middle, (len(self.dofs), 1))
+        tab = self.shape.tabulate(middle)
+        x = X[self.dofs]
+        inward = X[cell_dofs[self.cells]].mean(axis=1) - np.einsum("na,nag->ng", tab.N, x)
+        self.sign = np.where(np.einsum("ng,ng->n", unit_normals(tab, x), inward) > 0, -1.0, 1.0)
+
+    def _refuse_inner(self) -> None:
+        """Raise on facets that lie between two cells, wherever those cells live."""
+        corners = len(self.shape.topology[0])
+        inner = np.flatnonzero(count_keys(self.config.comm, np.sort(self.nodes[:, :corners], axis=1)) > 1)
+        error = None
+        if len(inner):
+            where = np.round(self.config.X[self.dofs[inner[0], :corners]].mean(axis=0), 6)
+            error = OrientationError(
+                f"target '{self.tag.name}' has a facet between two cells at {where}, where outward has no meaning: "
+                "a target must lie on the outside of a body, so mesh the bodies apart"
+            )
+        agree(self.config.comm, error)
+
+    def _open_sides(self) -> npt.NDArray[np.bool_]:
+        """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
+        corners = 1 if self.shape.dim == 1 else 2
+        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
+        keys = np.stack(sides, axis=1).reshape(-1, corners)
+        return (count_keys(self.config.comm, keys) == 1).reshape(len(self.nodes), len(sides))
+
+    @cached_property
+    def _normal_field(self) -> fem.Function:
+        return fem.Function(self.config.V)
+
+    def current(self) -> FacetData:
+        """Facets where they are now (collective: the nodal normals are summed over ranks)."""
+        config, gdim = self.config, self.config.gdim
+        x = config.x[self.dofs]
+        # every node sees its facet under the angle-free area weight
+        field = self._normal_field
+        field.x.array[:] = 0.0
+        nodal = field.x.array.reshape(-1, gdim)
+        for a in range(self.dofs.shape[1]):
+            np.add.at(nodal, self.dofs[:, a], self._area_vector(x, a))
+        compat.sum_ghosts(field)
+        normals = nodal[self.dofs]
+        length = np.linalg.norm(normals, axis=2, keepdims=True)
+        return FacetData(x, self.nodes, normals / np.where(length > 0, length, 1.0))
+
+    def _area_vector(self, x: Array, node: int) -> Array:
+        """Outward normal of each facet at one of its nodes, weighted by the facet's size ``(m, gdim)``."""
+        xi = np.tile(self.shape.nodes[node], (len(x), 1))
+        tab = self.shape.tabulate(xi)
+        t = np.einsum("naf,nag->nfg", tab.dN, x)
+        n = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+        return self.sign[:, None] * n
+
+
+def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
+    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective; rows meet on a home rank)."""
+    home = keys[:, 0] % comm.size
+    received = comm.alltoall([keys[home == r] for r in range(comm.size)])
+    _, inverse, counts = np.unique(np.concatenate(received), axis=0, return_inverse=True, return_counts=True)
+    ends = np.cumsum([len(k) for k in received])[:-1]
+    answers = comm.alltoall(np.split(counts[inverse.ravel()], ends))
+    total = np.empty(len(keys), dtype=np.int64)
+    for r in range(comm.size):
+        total[home == r] = answers[r]
+    return total
+
+
+def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.int32]:
+    """Cell dofs of each local facet, in the numbering of the facet's own element ``(n_facets, nn)``."""
+    layout = config.V.dofmap.dof_layout
+    topology = compat.reference_topology(compat.cell_name(config.mesh))
+    rows = []
+    for vertices in topology[config.tdim - 1]:
+        row: list[int] = []
+        for dim, entities in enumerate(shape.topology):
+            for local in entities:
+                wanted = sorted(vertices[v] for v in local)
+                i = [sorted(e) for e in topology[dim]].index(wanted)
+                row += list(layout.entity_dofs(dim, i))
+        rows.append(row)
+    return np.array(rows, dtype=np.int32)
+
+
+def check_distinct(config: Configuration, contactor: npt.NDArray[np.int32], target: TargetFacets, names: tuple[str, str]) -> None:
+    """Refuse a contactor that is part of its own target (collective).
+
+    Raises:
+        SurfaceError: naming the first shared node.
+    """
+    on_target = fem.Function(compat.function_space(config.mesh, config.degree))
+    on_target.x.array[target.dofs.ravel()] = 1.0
+    compat.sum_ghosts(on_target)
+    shared = contactor[on_target.x.array[contactor] > 0]
+    error = None
+    if len(shared):
+        error = SurfaceError(
+            f"contactor '{names[0]}' and target '{names[1]}' share the node at {config.describe(int(shared[0]))}: "
+            "give each body its own nodes and its own surface"
+        )
+    agree(config.comm, error)

@@ -1,0 +1,313 @@
+"""The united system of a UFL residual: residual, tangent, contact pairs and P brought together for the Newton loop.
+
+Seventh step on the data's way; it implements ``newton.UnitedSystem`` and leaves load steps and commits to the problem.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.log import timed
+from uem_dolfinx.newton import United
+from uem_dolfinx.restriction import Restriction
+from uem_dolfinx.uniting import UnitingEquations
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from uem_dolfinx.solver import UnitedSolver
+    from uem_dolfinx.surfaces import Configuration
+    from uem_dolfinx.uniting import ContactPair
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+#: Multiple of the rounding of K u that the residual may be left with.
+ROUNDING = 4.0 * np.finfo(float).eps
+#: Part of the model's size that an active contactor's gap may be left with.
+CLOSED = 1e-13
+
+
+class Tangent:
+    """K = dF/du, assembled when it has changed.
+
+    Args:
+        F: UFL residual.
+        u: displacement.
+
+    Raises:
+        SpaceError: if F does not depend on u.
+    """
+
+    def __init__(self, F: ufl.Form, u: fem.Function):
+        J = ufl.algorithms.expand_derivatives(ufl.derivative(F, u))
+        if J.empty():
+            raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
+        #: Whether K is the same for every u.
+        self.linear: bool = u not in J.coefficients()
+        self._inputs = [c for c in (*J.coefficients(), *J.constants()) if c is not u]
+        self._values: list[Array] | None = None
+        with timed("compile forms"):
+            self._form = compat.form(J)
+        self.K: PETSc.Mat = compat.create_matrix(self._form)
+        #: Grows with every assembly.
+        self.number = 0
+
+    def update(self) -> None:
+        """Assemble K unless nothing it depends on has changed (collective)."""
+        values = [np.array(c.x.array if isinstance(c, fem.Function) else c.value) for c in self._inputs]
+        same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
+        comm = self.K.comm.tompi4py()
+        if self.linear and comm.allreduce(int(same)) == comm.size:
+            return
+        with timed("assemble tangent"):
+            compat.assemble_matrix(self.K, self._form)
+        self._values = values
+        self.number += 1
+
+
+class BodySystem:
+    """Implements ``newton.UnitedSystem`` for bodies in statics.
+
+    Args:
+        config: configuration of the displacement.
+        F: UFL residual.
+        bcs: Dirichlet conditions.
+        solver: of the united system.
+        newton: ``"full"`` or ``"modified"``.
+        consistent_tangent: whether the curvature of the contact is added to K.
+        check_inversion: whether to look for cells turned inside out.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        F: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        solver: UnitedSolver,
+        *,
+        newton: str,
+        consistent_tangent: bool,
+        check_inversion: bool | None,
+    ):
+        self.config, self.comm, self.u, self.bcs, self.solver = config, config.comm, config.u, list(bcs), solver
+        self.newton, self.consistent_tangent = newton, consistent_tangent
+        self.tangent = Tangent(F, self.u)
+        with timed("compile forms"):
+            self._F = compat.form(F)
+        self._b = compat.create_vector(config.V)
+        self._u = compat.petsc_vector(self.u)
+        self.pairs: list[ContactPair] = []
+        self.free = self._free_components()
+        #: Displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
+        self.wanted: Array = np.array(config.displacement)
+        self._factored: object = None
+        self._stiffness: PETSc.Vec | None = None
+        check = not self.tangent.linear if check_inversion is None else check_inversion
+        self._detector = self._inversion_detector() if check else None
+
+    def _free_components(self) -> Bools:
+        """Components without Dirichlet condition ``(n_local, gdim)``."""
+        free = np.ones(self.config.n_local * self.config.gdim, dtype=bool)
+        for bc in self.bcs:
+            free[compat.bc_dofs(bc)[0]] = False
+        return free.reshape(-1, self.config.gdim)
+
+    # -- place -------------------------------------------------------------------------------------------------------
+
+    def place(self, returning: bool) -> None:
+        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+        if not self.pairs:
+            return
+        with timed("search and projection"):
+            for pair in self.pairs:
+                pair.project()
+            if returning:
+                for pair in self.pairs:
+                    pair.return_to_target()
+                self.u.x.scatter_forward()
+
+    # -- residual and uniting equations ------------------------------------------------------------------------------
+
+    def assemble_residual(self) -> bool:
+        """Residual ``F(u)`` at the present displacement; whether it is finite on all ranks."""
+        with timed("assemble residual"):
+            compat.assemble_vector(self._b, self._F)
+        return bool(np.isfinite(self._b.norm()))
+
+    @property
+    def residual(self) -> PETSc.Vec:
+        """Owned part of the assembled residual, internal minus external forces."""
+        F = self._du_like()
+        F.array[:] = self._b.array_r
+        return F
+
+    def _du_like(self) -> PETSc.Vec:
+        return PETSc.Vec().createMPI(self._b.getSizes(), bsize=self.config.gdim, comm=self.comm)
+
+    def unite(self, cautious: bool) -> United:
+        """Contact forces, activation and release, and the uniting equations that follow."""
+        F, rounding = self.residual, self._rounding()
+        with timed("uniting equations"):
+            restriction = self._restrict()
+            y = restriction.pass_on(F)
+            self._read_forces(restriction, y)
+            # every pair decides, whatever the others did
+            decisions = [pair.decide(rounding, cautious) for pair in self.pairs]
+            changed = any(decisions)
+            if changed:
+                for pair in self.pairs:
+                    pair.refresh_corners()
+                restriction = self._restrict()
+                y = restriction.pass_on(F)
+            residual = restriction.reduce(y)
+        gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
+        active = sum(pair.n_active for pair in self.pairs)
+        short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
+        largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
+        short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
+        closed = gap <= CLOSED * self.config.size and short <= 4 * np.finfo(float).eps * largest
+        return United(restriction, residual, residual.norm(), F.norm(), rounding, gap, active, changed, bool(closed))
+
+    def _restrict(self) -> Restriction:
+        n = self.config.n_owned
+        equations = UnitingEquations.join([pair.equations() for pair in self.pairs], self.config.gdim)
+        prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
+        return Restriction(self.config, equations, self.free[:n], prescribed)
+
+    def _read_forces(self, restriction: Restriction, y: PETSc.Vec) -> None:
+        lam, start = restriction.multipliers(y), 0
+        for pair in self.pairs:
+            count = len(pair.equations())
+            pair.read_forces(lam[start : start + count])
+            start += count
+
+    def _rounding(self) -> float:
+        """Norm of the forces that rounding of the displacement alone can make."""
+        if self._stiffness is None:
+            return 0.0
+        u = self._du_like()
+        u.array[:] = self._u.array_r * self._stiffness.array_r
+        return float(ROUNDING * u.norm())
+
+    def active_set(self) -> int:
+        """Fingerprint of the active set, the same on all ranks."""
+        here = zlib.crc32(b"".join(pair.trial.active.tobytes() + pair.trial.held.tobytes() for pair in self.pairs))
+        return hash(tuple(self.comm.allgather(here)))
+
+    # -- linear system -----------------------------------------------------------------------------------------------
+
+    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+        """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
+        if first or self.newton == "full":
+            self.tangent.update()
+            self._stiffness = self.tangent.K.getDiagonal()
+        K, restriction = self.tangent.K, state.restriction
+        curvature = self._curvature() if self.consistent_tangent else None
+        # what the united matrix was made of; a modified Newton loop lets small changes of P pass
+        exact = 0 if curvature is not None else restriction.fingerprint(values=self.newton == "full")
+        made_of = self.comm.allgather((self.tangent.number, exact, restriction.fingerprint(values=False)))
+        moving = curvature is not None and self.newton == "full"
+        if moving or made_of != self._factored:
+            self.solver.set_operator(restriction, K, curvature)
+        self._factored = made_of
+        c = restriction.c
+        load = K * c
+        if curvature is not None:
+            load.axpy(1.0, curvature * c)
+        load.axpy(1.0, self.residual)
+        rhs = restriction.reduce(restriction.pass_on(load))
+        rhs.scale(-1.0)
+        return rhs
+
+    def _curvature(self) -> PETSc.Mat | None:
+        """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
+        parts = [pair.curvature() for pair in self.pairs if pair.sliding == "finite"]
+        if not self.comm.allreduce(sum(len(nodes) for nodes, _ in parts)):
+            return None
+        g = self.config.gdim
+        # how many blocks meet at each node bounds the length of its rows
+        counts = self._du_like()
+        for nodes, _ in parts:
+            width = nodes.shape[1]
+            flat = nodes[nodes >= 0].astype(PETSc.IntType)
+            index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
+            counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
+        counts.assemble()
+        n = counts.getLocalSize()
+        rows = np.minimum(counts.array_r, counts.getSize())
+        G = PETSc.Mat().createAIJ(
+            (self._b.getSizes(), self._b.getSizes()),
+            bsize=g,
+            nnz=(np.minimum(rows, n).astype(PETSc.IntType), np.minimum(rows, counts.getSize() - n).astype(PETSc.IntType)),
+            comm=self.comm,
+        )
+        G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+        for nodes, blocks in parts:
+            for row, block in zip(nodes.astype(PETSc.IntType), blocks):
+                G.setValuesBlocked(row, row, block, addv=PETSc.InsertMode.ADD)
+        G.assemble()
+        return G
+
+    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
+        """dq and the number of linear iterations."""
+        return self.solver.solve(rhs)
+
+    # -- displacement ------------------------------------------------------------------------------------------------
+
+    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+        """``du = P dq + c``."""
+        du = state.restriction.expand(dq)
+        du.axpy(1.0, state.restriction.c)
+        return du
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the present displacement."""
+        start = self._du_like()
+        start.array[:] = self._u.array_r
+        return start
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set the displacement to ``start + length du``; after a full step the Dirichlet values are met to the last bit."""
+        self._u.array[:] = start.array_r + length * du.array_r
+        if length == 1.0:
+            n = self.config.n_owned
+            self.config.displacement[:n][~self.free[:n]] = self.wanted[:n][~self.free[:n]]
+        self.u.x.scatter_forward()
+
+    def work(self, state: United, dq: PETSc.Vec) -> float:
+        """Work of the present residual on an increment, ``dq . P'F``, with the P of ``state``."""
+        return float(dq.dot(state.restriction.reduce(state.restriction.pass_on(self.residual))))
+
+    def _inversion_detector(self) -> tuple[ufl.core.expr.Expr, object]:
+        """Volume of the cells turned inside out, as a form."""
+        J = ufl.det(ufl.Identity(self.config.gdim) + ufl.grad(self.u))
+        one = fem.Constant(self.config.mesh, 1.0)
+        with timed("compile forms"):
+            return J, compat.form(ufl.conditional(ufl.le(J, 0.0), one, 0.0 * one) * ufl.dx(domain=self.config.mesh))
+
+    def inverted(self) -> str | None:
+        """Where a cell is inside out, if one is (collective)."""
+        if self._detector is None:
+            return None
+        J, form = self._detector
+        if compat.assemble_scalar(form, self.comm) == 0.0:
+            return None
+        determinant = fem.Function(compat.dg0_space(self.config.mesh))
+        compat.interpolate_expression(determinant, J)
+        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
+        dofs = compat.cell_dofs(self.config.V)
+        here = (np.inf, "")
+        if len(values):
+            cell = int(values.argmin())
+            here = (float(values[cell]), str(np.round(self.config.X[dofs[cell]].mean(axis=0), 6)))
+        return min(self.comm.allgather(here))[1]
