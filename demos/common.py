@@ -60,10 +60,9 @@ def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
         return
     for key, value in results.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            widths = [max(10, len(k) + 2) for k in value[0]]
-            print(f"\n{key}:\n" + "".join(f"{k:>{w}}" for k, w in zip(value[0], widths)))
-            for row in value:
-                print("".join(f"{show(v):>{w}}" for v, w in zip(row.values(), widths)))
+            table = [[key, *value[0]]] + [["", *map(show, row.values())] for row in value]
+            widths = [max(map(len, column)) + 2 for column in zip(*table)]
+            print("\n".join("".join(f"{text:>{w}}" for text, w in zip(line, widths)) for line in table))
         elif isinstance(value, dict):
             print(f"{key}: " + ", ".join(f"{k} {show(v)}" for k, v in value.items()))
         else:

@@ -96,11 +96,7 @@ class UnitedProblem:
             consistent_tangent=consistent_tangent,
             check_inversion=check_inversion,
         )
-        self.system.pairs = [contact.attach(self.system) for contact in self.contacts]
-        for pair in self.system.pairs:
-            pair.project()
-            pair.check_initial()
-            pair.touch()
+        self.system.add_pairs([contact.attach(self.system) for contact in self.contacts])
         self._committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
         self._last_fraction: float | None = None

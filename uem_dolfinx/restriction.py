@@ -16,6 +16,7 @@ increments. The powers of M end after as many terms as bodies are stacked upon e
 from __future__ import annotations
 
 import zlib
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.uniting import UnitingEquations
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 #: An equation whose direction has less than this part left in the free components of its node is a conflict.
@@ -45,37 +47,51 @@ class Restriction:
         equations: uniting equations of the nodes this rank owns.
         free: components without Dirichlet condition, of the owned nodes ``(n_owned, gdim)``.
         prescribed: increments that the Dirichlet conditions ask for ``(n_owned, gdim)``, zero where free.
+        stacked: whether a node that is followed may itself be eliminated.
 
     Raises:
         ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle.
     """
 
-    def __init__(self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array):
+    def __init__(
+        self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True
+    ):
         self.config, self.equations, self.free = config, equations, free
         self.comm = config.comm
         g, n = config.gdim, config.n_owned
-        self.first_row = g * int(config.index_map.local_range[0])
-        self.blocks, self.lift = self._eliminate()
-        self.idle: Bools = ~(self.blocks != 0).any(axis=1)
+        self._sizes = ((g * n, g * config.index_map.size_global),) * 2
+        self._first = g * int(config.index_map.local_range[0])
+        self.n_equations, self._n_rows = (
+            int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)]))
+        )
+        #: Eliminated nodes, and those that only hold their place in the sparsity of P.
+        self.nodes: npt.NDArray[np.int32] = np.unique(equations.node)
+        self.frames, self.lift = self._eliminate()
+        #: Columns of P that are in use ``(n_owned, gdim)``.
+        self.used: Bools = free.copy()
+        self.used[self.nodes] = (self.frames != 0).any(axis=1)
         closure = np.array(prescribed)
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
-        self.n_equations = int(self.comm.allreduce(len(equations)))
-        N = g * n
-        self._sizes = ((N, g * config.index_map.size_global), (N, g * config.index_map.size_global))
-        self.d = PETSc.Vec().createWithArray(closure.ravel(), size=self._sizes[0], bsize=g, comm=self.comm)
-        self.T = self._rotation()
-        self.M = self._coupling() if self.n_equations else None
-        self._refuse_cycle()
+        self.d = self._vector(closure)
+        self.M = self._coupling() if self._n_rows else None
+        #: Number of terms with M in the series of P and c.
+        self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
-    # -- elimination in each node's frame --------------------------------------------------------------------------
+    def _vector(self, values: Array) -> PETSc.Vec:
+        v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.config.gdim, comm=self.comm)
+        v.array[:] = values.ravel()
+        return v
+
+    # -- elimination in each node's frame ------------------------------------------------------------------------------
 
     def _eliminate(self) -> tuple[Array, Array]:
-        """Blocks of T per owned node ``(n_owned, g, g)``, and how each equation acts on its node ``(m, g)``."""
+        """Blocks of T at ``nodes (k, g, g)``, and how each equation acts on its node ``(m, g)``."""
         g, eq = self.config.gdim, self.equations
-        blocks = self.free[:, None, :] * np.eye(g)
+        frames = self.free[self.nodes, None, :] * np.eye(g)
         lift = np.zeros_like(eq.direction)
-        order = np.argsort(eq.node, kind="stable")
+        which = np.flatnonzero(eq.active)
+        order = which[np.argsort(eq.node[which], kind="stable")]
         nodes, first, counts = np.unique(eq.node[order], return_index=True, return_counts=True)
         error = None
         for k in np.unique(counts):
@@ -87,73 +103,56 @@ class Restriction:
                 continue
             pinv = np.linalg.pinv(A)
             lift[rows] = pinv.transpose(0, 2, 1)
-            blocks[at] = _frames(A, pinv, self.free[at])
+            frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
         agree(self.comm, error)
-        return blocks, lift
+        return frames, lift
 
     def _conflict(self, nodes: npt.NDArray[np.int32], A: Array) -> ConflictError:
         bad = 0 if A.shape[1] > A.shape[2] else int(np.argmin(np.linalg.svd(A, compute_uv=False)[:, -1]))
         fixed = [c for c, f in zip("xyz", self.free[nodes[bad]]) if not f]
         return ConflictError(
-            f"the contactor at {self.config.describe(int(nodes[bad]))} has {A.shape[1]} uniting equation(s) but its displacement in "
-            f"{', '.join(fixed) or 'no direction'} is prescribed, so nothing is left to eliminate: release the Dirichlet condition "
-            "there, or make the other surface the contactor"
+            f"the contactor at {self.config.describe(int(nodes[bad]))} has {A.shape[1]} uniting equation(s) but its displacement "
+            f"in {', '.join(fixed) or 'no direction'} is prescribed, so nothing is left to eliminate: release the Dirichlet "
+            "condition there, or make the other surface the contactor"
         )
-
-    # -- matrices ----------------------------------------------------------------------------------------------------
-
-    def _rotation(self) -> PETSc.Mat:
-        """T: block diagonal; zeros are stored, so that ``P'KP`` holds the diagonal of idle columns."""
-        g, n = self.config.gdim, self.config.n_owned
-        full = np.zeros(n, dtype=bool)
-        full[self.equations.node] = True
-        # plain nodes need their diagonal only
-        counts = np.where(np.repeat(full, g), g, 1)
-        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-        row_node = np.repeat(np.arange(n * g) // g, counts)
-        within = np.arange(indptr[-1]) - np.repeat(indptr[:-1], counts)
-        component = np.repeat(np.arange(n * g) % g, counts)
-        column = np.where(full[row_node], within, component)
-        values = self.blocks[row_node, component, column]
-        T = PETSc.Mat().createAIJ(
-            self._sizes, bsize=g, csr=(indptr, (self.first_row + row_node * g + column).astype(PETSc.IntType), values), comm=self.comm
-        )
-        return T
 
     def _coupling(self) -> PETSc.Mat:
         """M: rows of the eliminated nodes, columns of the nodes they follow."""
-        g, n, eq = self.config.gdim, self.config.n_owned, self.equations
-        order = np.argsort(eq.node, kind="stable")
-        i, a = np.nonzero(eq.targets[order] >= 0)
-        i = order[i]
-        values = self.lift[i][:, :, None] * (eq.weights[i, a][:, None] * eq.direction[i])[:, None, :]
-        rows = (eq.node[i][:, None, None] * g + np.arange(g)[None, :, None] + np.zeros((1, 1, g), int)).ravel()
-        columns = (eq.targets[i, a][:, None, None] * g + np.arange(g)[None, None, :] + np.zeros((1, g, 1), int)).ravel()
-        rows, columns, values = _sum_duplicates(rows, columns, values.ravel())
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n * g))]).astype(PETSc.IntType)
+        n = self.config.gdim * self.config.n_owned
+        rows, columns, values = self._coupling_entries
+        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(
-            self._sizes, bsize=g, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
+            self._sizes, bsize=self.config.gdim, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
         )
 
-    def _refuse_cycle(self) -> None:
-        """Follow the equations from node to node until they end; note how long the longest chain is."""
-        self.chain = 0
-        if self.M is None:
-            return
-        at = self.M.createVecRight()
-        at.set(1.0)
-        M = self.M.copy()
-        indptr, columns, values = M.getValuesCSR()
-        M.setValuesCSR(indptr, columns, np.ones_like(values))
-        M.assemble()
-        while self.chain <= LONGEST_CHAIN:
-            at = M * at
+    @cached_property
+    def _coupling_entries(self) -> tuple[Ints, Ints, Array]:
+        """Local rows, global columns and values of M, zeros stored so that the sparsity does not depend on directions."""
+        g, eq = self.config.gdim, self.equations
+        i, a = np.nonzero(eq.targets >= 0)
+        values = self.lift[i][:, :, None] * (eq.weights[i, a][:, None] * eq.direction[i])[:, None, :]
+        rows = np.broadcast_to((eq.node[i, None] * g + np.arange(g))[:, :, None], values.shape)
+        columns = np.broadcast_to((eq.targets[i, a, None] * g + np.arange(g))[:, None, :], values.shape)
+        return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
+
+    def _longest_chain(self) -> int:
+        """How many equations follow one another from node to node.
+
+        Raises:
+            ConflictError: if they never end.
+        """
+        assert self.M is not None
+        path = self.M.copy()
+        indptr, columns, values = path.getValuesCSR()
+        path.setValuesCSR(indptr, columns, (values != 0).astype(float))
+        path.assemble()
+        at = self._vector(np.ones((self.config.n_owned, self.config.gdim)))
+        for length in range(LONGEST_CHAIN + 1):
+            at = path * at
             if at.norm(PETSc.NormType.INFINITY) == 0.0:
-                M.destroy()
-                return
+                return length
             # only whether a path exists matters
             at.array[:] = at.array_r > 0
-            self.chain += 1
         rows = np.flatnonzero(at.array_r)
         error = None
         if len(rows):
@@ -162,35 +161,65 @@ class Restriction:
                 "two surfaces are contactor and target of each other; drop one of the two contacts"
             )
         agree(self.comm, error)
+        return LONGEST_CHAIN
 
-    @property
+    # -- P as a matrix -------------------------------------------------------------------------------------------------
+
+    @cached_property
     def P(self) -> PETSc.Mat:
-        """The restriction matrix P (computed once)."""
-        if not hasattr(self, "_P"):
-            self._P = self.T.copy()
-            X = self.T
-            for _ in range(self.chain):
-                assert self.M is not None
-                X = self.M.matMult(X)
-                self._P.axpy(1.0, X, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        return self._P
+        """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
+        if self.chain <= 1:
+            P = self._rows_of_P()
+            # a followed component that is prescribed is no unknown
+            P.diagonalScale(None, self._vector(self.used.astype(float)))
+            return P
+        T = X = self._rows_of_P(coupled=False)
+        P = T.copy()
+        for _ in range(self.chain):
+            X = self.M.matMult(X)
+            P.axpy(1.0, X, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        return P
 
-    # -- the maps of the united system ---------------------------------------------------------------------------------
+    def _rows_of_P(self, coupled: bool = True) -> PETSc.Mat:
+        """T, with the entries of M in the rows of the eliminated nodes if coupled."""
+        g, n = self.config.gdim, self.config.n_owned
+        k = np.arange(g)
+        block = np.broadcast_to((self.nodes[:, None] * g + k)[:, :, None], self.frames.shape).ravel().astype(np.int64)
+        parts = [(block, self._first + block.reshape(-1, g, g).transpose(0, 2, 1).ravel(), self.frames.ravel())]
+        if coupled and self._n_rows:
+            parts.append(self._coupling_entries)
+        rows, columns, values = _sum_duplicates(*(np.concatenate(p) for p in zip(*parts)))
+        plain = np.ones((n, g), dtype=bool)
+        plain[self.nodes] = False
+        counts = np.where(plain.ravel(), 1, np.bincount(rows, minlength=n * g))
+        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
+        all_columns = np.empty(indptr[-1], dtype=PETSc.IntType)
+        all_values = np.empty(indptr[-1])
+        alone = np.flatnonzero(plain.ravel())
+        all_columns[indptr[alone]], all_values[indptr[alone]] = self._first + alone, self.free.ravel()[alone]
+        united = np.repeat(~plain.ravel(), counts)
+        all_columns[united], all_values[united] = columns, values
+        return PETSc.Mat().createAIJ(self._sizes, bsize=g, csr=(indptr, all_columns, all_values), comm=self.comm)
+
+    # -- P as a map ----------------------------------------------------------------------------------------------------
 
     @property
     def c(self) -> PETSc.Vec:
         """Increment that closes the gaps and carries the prescribed displacements."""
-        c, part = self.d.copy(), self.d
-        for _ in range(self.chain):
-            part = self.M * part
-            c.axpy(1.0, part)
-        return c
+        return self._series(self.d)
+
+    def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """``P dq``, without c."""
+        q = dq.array_r.reshape(-1, self.config.gdim)
+        du = q * self.free
+        du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
+        return self._series(self._vector(du))
 
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
         """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F``."""
         y, part = F.copy(), F
         for _ in range(self.chain):
-            moved = self.M.createVecRight()
+            moved = y.duplicate()
             self.M.multTranspose(part, moved)
             part = moved
             y.axpy(1.0, part)
@@ -198,30 +227,30 @@ class Restriction:
 
     def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
         """``T' y``; with y from ``pass_on`` this is ``P'F``."""
-        q = self.T.createVecRight()
-        self.T.multTranspose(y, q)
-        return q
-
-    def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
-        """``P dq``, without c."""
-        du = self.T * dq
-        part = du
-        for _ in range(self.chain):
-            part = self.M * part
-            du.axpy(1.0, part)
-        return du
+        full = y.array_r.reshape(-1, self.config.gdim)
+        q = full * self.free
+        q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
+        return self._vector(q)
 
     def multipliers(self, y: PETSc.Vec) -> Array:
         """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed."""
         nodal = y.array_r.reshape(-1, self.config.gdim)
         return np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
 
+    def _series(self, v: PETSc.Vec) -> PETSc.Vec:
+        """``(1 + M + M^2 + ...) v``."""
+        total, part = v.copy(), v
+        for _ in range(self.chain):
+            part = self.M * part
+            total.axpy(1.0, part)
+        return total
+
     def fingerprint(self, *, values: bool) -> int:
         """Hash of this rank's part of P: of its sparsity, or of its values too."""
         eq = self.equations
-        parts = [eq.node.tobytes(), eq.targets.tobytes()]
+        parts = [eq.node.tobytes(), eq.targets.tobytes(), bytes([self.chain])]
         if values:
-            parts += [eq.direction.tobytes(), eq.weights.tobytes()]
+            parts += [eq.direction.tobytes(), eq.weights.tobytes(), eq.active.tobytes()]
         return zlib.crc32(b"".join(parts))
 
 
@@ -272,7 +301,7 @@ def _reflection(axis: Array) -> tuple[Array, npt.NDArray[np.int64]]:
     return np.eye(axis.shape[1]) - 2.0 * v[:, :, None] * v[:, None, :] / vv, main
 
 
-def _sum_duplicates(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], values: Array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+def _sum_duplicates(rows: Ints, columns: Ints, values: Array) -> tuple[Ints, Ints, Array]:
     """Coordinate triplets sorted by row and column, equal places added."""
     order = np.lexsort((columns, rows))
     rows, columns, values = rows[order], columns[order], values[order]

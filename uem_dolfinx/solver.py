@@ -100,7 +100,7 @@ class UnitedSolver:
             K: tangent matrix without boundary conditions.
             curvature: second derivatives of the gaps times contact forces, or None.
         """
-        key = (K.handle, restriction.n_equations > 0, self.config.comm.allgather(restriction.fingerprint(values=False)))
+        key = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
         reuse = key == self._key and self.A is not None
         with timed("united matrix P'KP"):
             if restriction.M is None:
@@ -109,8 +109,8 @@ class UnitedSolver:
                     K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 else:
                     self.A = K.copy()
-                mask = restriction.T.getDiagonal()
-                self.A.diagonalScale(mask, mask)
+                used = restriction.reduce(restriction.expand(_ones_like(K)))
+                self.A.diagonalScale(used, used)
             elif reuse:
                 restriction.P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 K.PtAP(self._P, result=self.A)
@@ -118,10 +118,9 @@ class UnitedSolver:
                 self._P = restriction.P
                 self.A = K.PtAP(self._P)
             if curvature is not None:
-                P = restriction.T if restriction.M is None else self._P
-                self.A.axpy(1.0, curvature.PtAP(P), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+                self.A.axpy(1.0, curvature.PtAP(self._P), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
             diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
-            idle = restriction.idle.ravel()
+            idle = ~restriction.used.ravel()
             diagonal.array[idle] = stiffness.array_r[idle]
             self.A.setDiagonal(diagonal)
         self._key = key
@@ -135,7 +134,7 @@ class UnitedSolver:
         """Rigid-body modes in the unknowns q: at a contactor their tangential components only."""
         vectors: list[PETSc.Vec] = []
         for mode in rigid_body_modes(self.config):
-            full = restriction.T.createVecLeft()
+            full = self.A.createVecLeft()
             full.array[:] = mode.ravel()
             q = restriction.reduce(full)
             for other in vectors:
@@ -171,6 +170,12 @@ class UnitedSolver:
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
         return dq, int(self.ksp.getIterationNumber())
+
+
+def _ones_like(K: PETSc.Mat) -> PETSc.Vec:
+    v = K.createVecRight()
+    v.set(1.0)
+    return v
 
 
 def rigid_body_modes(config: Configuration) -> list[Array]:

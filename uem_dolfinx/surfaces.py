@@ -247,16 +247,22 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.i
     return np.array(rows, dtype=np.int32)
 
 
+def followed_nodes(config: Configuration, targets: list[TargetFacets]) -> npt.NDArray[np.bool_]:
+    """Which local nodes lie on any of the targets ``(n_local,)`` (collective)."""
+    mark = fem.Function(config.V)
+    for target in targets:
+        mark.x.array.reshape(-1, config.gdim)[target.dofs.ravel()] = 1.0
+    compat.sum_ghosts(mark)
+    return mark.x.array.reshape(-1, config.gdim)[:, 0] > 0
+
+
 def check_distinct(config: Configuration, contactor: npt.NDArray[np.int32], target: TargetFacets, names: tuple[str, str]) -> None:
     """Refuse a contactor that is part of its own target (collective).
 
     Raises:
         SurfaceError: naming the first shared node.
     """
-    on_target = fem.Function(compat.function_space(config.mesh, config.degree))
-    on_target.x.array[target.dofs.ravel()] = 1.0
-    compat.sum_ghosts(on_target)
-    shared = contactor[on_target.x.array[contactor] > 0]
+    shared = contactor[followed_nodes(config, [target])[contactor]]
     error = None
     if len(shared):
         error = SurfaceError(

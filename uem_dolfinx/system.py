@@ -19,6 +19,8 @@ from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
+from uem_dolfinx.search import MeshTarget
+from uem_dolfinx.surfaces import followed_nodes
 from uem_dolfinx.uniting import UnitingEquations
 
 if TYPE_CHECKING:
@@ -107,6 +109,8 @@ class BodySystem:
         self._b = compat.create_vector(config.V)
         self._u = compat.petsc_vector(self.u)
         self.pairs: list[ContactPair] = []
+        #: Whether a contactor of one pair may be a target node of another.
+        self.stacked = False
         self.free = self._free_components()
         #: Displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
         self.wanted: Array = np.array(config.displacement)
@@ -114,6 +118,17 @@ class BodySystem:
         self._stiffness: PETSc.Vec | None = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._detector = self._inversion_detector() if check else None
+
+    def add_pairs(self, pairs: Sequence[ContactPair]) -> None:
+        """Take in the contact pairs (collective)."""
+        self.pairs = list(pairs)
+        targets = [pair.target.facets for pair in pairs if isinstance(pair.target, MeshTarget)]
+        followed = followed_nodes(self.config, targets) if targets else np.zeros(self.config.n_local, bool)
+        self.stacked = any(self.comm.allgather(any(followed[pair.nodes].any() for pair in pairs)))
+        for pair in pairs:
+            pair.project()
+            pair.check_initial()
+            pair.touch()
 
     def _free_components(self) -> Bools:
         """Components without Dirichlet condition ``(n_local, gdim)``."""
@@ -182,21 +197,24 @@ class BodySystem:
         n = self.config.n_owned
         equations = UnitingEquations.join([pair.equations() for pair in self.pairs], self.config.gdim)
         prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
-        return Restriction(self.config, equations, self.free[:n], prescribed)
+        return Restriction(self.config, equations, self.free[:n], prescribed, self.stacked)
 
     def _read_forces(self, restriction: Restriction, y: PETSc.Vec) -> None:
         lam, start = restriction.multipliers(y), 0
         for pair in self.pairs:
-            count = len(pair.equations())
-            pair.read_forces(lam[start : start + count])
-            start += count
+            pair.read_forces(lam[start : start + pair.n_equations])
+            start += pair.n_equations
 
     def _rounding(self) -> float:
-        """Norm of the forces that rounding of the displacement alone can make."""
+        """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make."""
         if self._stiffness is None:
             return 0.0
+        rounded = np.abs(self.config.displacement[: self.config.n_owned])
+        for pair in self.pairs:
+            i = pair.nodes[pair.trial.active]
+            rounded[i] += np.abs(self.config.x[i])
         u = self._du_like()
-        u.array[:] = self._u.array_r * self._stiffness.array_r
+        u.array[:] = rounded.ravel() * self._stiffness.array_r
         return float(ROUNDING * u.norm())
 
     def active_set(self) -> int:

@@ -29,6 +29,8 @@ SLID_OFF = 1e-6
 GAP_ROUNDING = 1e-13
 #: A body touches at the start when its gap is below this part of the model's size.
 TOUCHING = 1e-9
+#: Contactors nearer than this many facets keep a row in the sparsity of P.
+NEAR = 1.0
 #: Normal return moves a contactor by this part of its facet at most.
 LONGEST_RETURN = 0.25
 #: Facets whose slopes differ by less are one plane.
@@ -47,6 +49,8 @@ class UnitingEquations:
         targets: global block numbers of the nodes it follows ``(m, nn)``, -1 for none.
         weights: ``(m, nn)``.
         gap: lengths ``(m,)``.
+        active: whether the equation holds ``(m,)``; one that does not only keeps its place in the sparsity of P, so that
+            contactors can be activated and released without new symbolic work.
     """
 
     node: npt.NDArray[np.int32]
@@ -54,6 +58,7 @@ class UnitingEquations:
     targets: Ints
     weights: Array
     gap: Array
+    active: Bools
 
     def __len__(self) -> int:
         return len(self.node)
@@ -63,8 +68,9 @@ class UnitingEquations:
         """All equations of several pairs, padded to the same number of target nodes."""
         if not parts:
             return UnitingEquations(
-                np.zeros(0, np.int32), np.zeros((0, gdim)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0)
-            )
+                np.zeros(0, np.int32), np.zeros((0, gdim)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
+                np.zeros(0, bool),
+            )  # fmt: skip
         width = max(p.targets.shape[1] for p in parts)
 
         def pad(a: npt.NDArray[np.generic], fill: float) -> npt.NDArray[np.generic]:
@@ -76,6 +82,7 @@ class UnitingEquations:
             np.concatenate([pad(p.targets, -1) for p in parts]),
             np.concatenate([pad(p.weights, 0.0) for p in parts]),
             np.concatenate([p.gap for p in parts]),
+            np.concatenate([p.active for p in parts]),
         )
 
 
@@ -165,6 +172,10 @@ class ContactPair:
         )
         self.trial = self.last_commit = self.committed
         self.projection: Projection
+        #: Number of equations of the last call of ``equations``.
+        self.n_equations = 0
+        self._united: Ints = none
+        self._reserved: Bools = np.zeros(n, dtype=bool)
         self._anchor: Projection | None = None
         self._corners: Corners | None = None
 
@@ -401,29 +412,38 @@ class ContactPair:
     # -- what the united system gets ---------------------------------------------------------------------------------
 
     def equations(self) -> UnitingEquations:
-        """Uniting equations of the active contactors at the current projection; two for one held in a corner."""
-        i = np.flatnonzero(self.trial.active)
-        p = self.projection
-        first = UnitingEquations(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], p.gap[i])
+        """Uniting equations of the contactors that are or may become active; two for one held in a corner."""
+        i = self._united = np.flatnonzero(self._near())
+        p, active = self.projection, self.trial.active
+        first = UnitingEquations(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], p.gap[i], active[i])
+        self.n_equations = len(first)
         c = self._corners
-        if c is None or not self.trial.active[c.which].any():
+        if c is None:
             return first
-        j = np.flatnonzero(self.trial.active[c.which])
-        w = c.which[j]
-        gap = np.einsum("kg,kg->k", c.axes[j, 1], self.points[w] - c.foot[j])
-        second = UnitingEquations(self.nodes[w], c.axes[j, 1], c.nodes[j], c.weights[j], gap)
+        self.n_equations += len(c.which)
+        gap = np.einsum("kg,kg->k", c.axes[:, 1], self.points[c.which] - c.foot)
+        second = UnitingEquations(self.nodes[c.which], c.axes[:, 1], c.nodes, c.weights, gap, active[c.which])
         return UnitingEquations.join([first, second], self.config.gdim)
 
+    def _near(self) -> Bools:
+        """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks."""
+        p = self.projection
+        if not isinstance(p, FacetProjection):
+            return np.ones(len(self.nodes), dtype=bool)
+        if (self.trial.active & ~self._reserved).any():
+            near = p.gap < NEAR * np.linalg.norm(p.x[:, 0] - p.x[:, 1], axis=1)
+            self._reserved = self.trial.active | (near & ~self.off)
+        return self._reserved
+
     def read_forces(self, lam: Array) -> None:
-        """Take the contact forces of the active contactors, in the order of ``equations``."""
-        i = np.flatnonzero(self.trial.active)
+        """Take the contact forces, in the order of ``equations``."""
+        i = self._united
         full = np.zeros(len(self.nodes))
         full[i] = lam[: len(i)]
         force = full[:, None] * self.projection.normal
         c = self._corners
         if c is not None:
-            j = np.flatnonzero(self.trial.active[c.which])
-            force[c.which[j]] += lam[len(i) :, None] * c.axes[j, 1]
+            force[c.which] += lam[len(i) :, None] * c.axes[:, 1]
         self.trial = replace(self.trial, lam=full, force=force)
 
     def curvature(self) -> tuple[Ints, Array]:
