@@ -132,6 +132,8 @@ class UnitedProblem:
                 line_search=self.line_search,
                 verbose=self.verbose,
             )
+            for pair in self.system.pairs:
+                pair.check_prescribed()
         except UEMError:
             self.restore()
             raise

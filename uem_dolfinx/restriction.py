@@ -56,7 +56,7 @@ class Restriction:
     def __init__(
         self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True
     ):
-        self.config, self.equations, self.free = config, equations, free
+        self.config, self.equations, self.free, self.stacked = config, equations, free, stacked
         self.comm = config.comm
         g, n = config.gdim, config.n_owned
         self._sizes = ((g * n, g * config.index_map.size_global),) * 2
@@ -168,7 +168,7 @@ class Restriction:
     @cached_property
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
-        if self.chain <= 1:
+        if self.chain == 0 or not self.stacked:
             P = self._rows_of_P()
             # a followed component that is prescribed is no unknown
             P.diagonalScale(None, self._vector(self.used.astype(float)))

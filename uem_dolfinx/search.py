@@ -108,26 +108,34 @@ class FacetProjection:
         slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
         on a straight 2D facet this is the formula of the method's description.
         """
-        n, g, w, dN, x = (getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "x"))
-        k, nn = w.shape
-        gdim, fdim = n.shape[1], dN.shape[2]
-        t = np.einsum("kaf,kag->kfg", dN, x)
-        m = np.einsum("kfg,keg->kfe", t, t)
-        b = np.einsum("kg,kag,kafe->kfe", n, x, self.ddN[which])
-        slope = np.einsum("kfg,keg->kfe", t, self.bend[which])
-        b -= 0.5 * (slope + slope.transpose(0, 2, 1))
-        # rows over (contactor, nodes) x gdim
-        Na = np.zeros((k, fdim, 1 + nn, gdim))
-        Na[:, :, 1:] = np.einsum("kaf,kg->kfag", dN, n)
-        Ta = np.empty_like(Na)
-        Ta[:, :, 0] = t
-        Ta[:, :, 1:] = -np.einsum("ka,kfg->kfag", w, t) + g[:, None, None, None] * Na[:, :, 1:]
-        Na, Ta = Na.reshape(k, fdim, (1 + nn) * gdim), Ta.reshape(k, fdim, (1 + nn) * gdim)
-        D = np.linalg.solve(m - g[:, None, None] * b, Ta)
-        H = -np.einsum("kfi,kfj->kij", D, Na)
-        H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
-        L = Na + np.einsum("kfe,kei->kfi", b, D)
-        return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+        fields = (getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "bend"))
+        return gap_hessians(*fields)
+
+
+def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array) -> Array:
+    """Second derivatives of the gap ``(k, (1 + nn) g, (1 + nn) g)``; arguments as the fields of ``FacetProjection``.
+
+    A side of a facet is served too: ``dN`` then has one column, and ``n`` is any direction across the side.
+    """
+    k, nn, fdim = dN.shape
+    gdim = n.shape[1]
+    size = (1 + nn) * gdim
+    t = np.einsum("kaf,kag->kfg", dN, x)
+    m = np.einsum("kfg,keg->kfe", t, t)
+    slope = np.einsum("kfg,keg->kfe", t, bend)
+    b = np.einsum("kg,kag,kafe->kfe", n, x, ddN) - 0.5 * (slope + slope.transpose(0, 2, 1))
+    # rows over (contactor, nodes) x gdim
+    N = np.zeros((k, fdim, 1 + nn, gdim))
+    N[:, :, 1:] = np.einsum("kaf,kg->kfag", dN, n)
+    T = g[:, None, None, None] * N
+    T[:, :, 0] = t
+    T[:, :, 1:] -= np.einsum("ka,kfg->kfag", w, t)
+    N, T = N.reshape(k, fdim, size), T.reshape(k, fdim, size)
+    D = np.linalg.solve(m - g[:, None, None] * b, T)
+    H = -np.einsum("kfi,kfj->kij", D, N)
+    H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
+    L = N + np.einsum("kfe,kei->kfi", b, D)
+    return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
 
 
 class MeshTarget:

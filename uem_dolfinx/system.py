@@ -146,9 +146,10 @@ class BodySystem:
         with timed("search and projection"):
             for pair in self.pairs:
                 pair.project()
-            if returning:
+            if returning and self._stiffness is not None:
+                stiffness = self._local_stiffness()
                 for pair in self.pairs:
-                    pair.return_to_target()
+                    pair.return_to_target(stiffness)
                 self.u.x.scatter_forward()
 
     # -- residual and uniting equations ------------------------------------------------------------------------------
@@ -216,6 +217,10 @@ class BodySystem:
         u = self._du_like()
         u.array[:] = rounded.ravel() * self._stiffness.array_r
         return float(ROUNDING * u.norm())
+
+    def _local_stiffness(self) -> Array:
+        """Diagonal of K at the owned nodes ``(n_owned, gdim)``."""
+        return self._stiffness.array_r.reshape(-1, self.config.gdim)
 
     def active_set(self) -> int:
         """Fingerprint of the active set, the same on all ranks."""

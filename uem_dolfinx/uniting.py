@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.errors import PenetrationError, agree
-from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
+from uem_dolfinx.errors import ConflictError, PenetrationError, agree
+from uem_dolfinx.restriction import MOSTLY_PRESCRIBED
+from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target, gap_hessians
 from uem_dolfinx.shapes import closest_point
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ GAP_ROUNDING = 1e-13
 TOUCHING = 1e-9
 #: Contactors nearer than this many facets keep a row in the sparsity of P.
 NEAR = 1.0
-#: Normal return moves a contactor by this part of its facet at most.
-LONGEST_RETURN = 0.25
+#: Normal return may change nodal forces by this part of the largest contact force.
+GENTLE = 0.1
 #: Facets whose slopes differ by less are one plane.
 ON_PLANE = 1e-9
 #: A contactor that changed facets to and fro this often in a step is held by averaged normals for the rest of it.
@@ -121,6 +122,9 @@ class Corners:
         nodes: global nodes of the first facet ``(k, nn)``.
         weights: shape functions at the closest point of the shared side ``(k, nn)``.
         foot: that point ``(k, gdim)``.
+        x: positions of the nodes ``(k, nn, gdim)``.
+        dN: derivatives of the weights along the side ``(k, nn, fdim - 1)``.
+        ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
     """
 
     which: Ints
@@ -130,6 +134,9 @@ class Corners:
     nodes: Ints
     weights: Array
     foot: Array
+    x: Array
+    dN: Array
+    ddN: Array
 
     @property
     def axes(self) -> Array:
@@ -237,31 +244,36 @@ class ContactPair:
         points = self.points[which]
         first = self.target.project_on(points, self.trial.facet[which])
         second = self.target.project_on(points, other[which])
-        k = len(which)
-        weights, foot, shared = np.zeros_like(first.weights), np.zeros_like(points), np.zeros(k, bool)
+        k, nn = first.weights.shape
+        d = self.target.shape.dim - 1
+        weights, foot, shared = np.zeros((k, nn)), np.zeros_like(points), np.zeros(k, bool)
+        dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
         common = (first.nodes[:, :, None] == second.nodes[:, None, :]).any(axis=2)
         for side, nodes, _, _ in self.target.shape.edges():
             i = np.flatnonzero(common[:, nodes].all(axis=1) & ~shared)
             x = first.x[i][:, nodes]
             s, _ = closest_point(side, x, points[i])
-            N = side.tabulate(s).N
-            weights[i[:, None], nodes] = N
-            foot[i] = np.einsum("ka,kag->kg", N, x)
+            tab = side.tabulate(s)
+            weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
+            foot[i] = np.einsum("ka,kag->kg", tab.N, x)
             shared[i] = True
         normals = np.stack([self.target.outward(first), self.target.outward(second)], axis=1)
         arm = second.x.mean(axis=1) - foot
         rising = np.einsum("kg,kg->k", arm, normals[:, 0]) / np.linalg.norm(arm, axis=1)
-        return Corners(which, normals, rising, shared, first.nodes, weights, foot)
+        return Corners(which, normals, rising, shared, first.nodes, weights, foot, first.x, dN, ddN)
 
     def refresh_corners(self) -> None:
         """Project again after contactors have entered or left corners (collective)."""
         if self._has_corners:
             self.project()
 
-    def return_to_target(self) -> None:
+    def return_to_target(self, stiffness: Array) -> None:
         """Normal return [UEM, 4.2]: put the active contactors back onto the moved target.
 
-        A return longer than a part of the facet is left to the next linear solve, which moves the whole body with it.
+        A return that would disturb the contact forces is left to the next linear solve, which moves the whole body with it.
+
+        Args:
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
         """
         i = np.flatnonzero(self.trial.active)
         p = self.projection
@@ -273,9 +285,8 @@ class ContactPair:
             gap = np.einsum("kg,kg->k", c.axes[:, 1], self.points[c.which] - c.foot)
             at[c.which] += self.trial.active[c.which, None] * self._along(c.axes[:, 1], gap, self.free[c.which])
             correction = at[i]
-        if isinstance(p, FacetProjection):
-            size = np.linalg.norm(p.x[i, 0] - p.x[i, 1], axis=1)
-            correction[np.linalg.norm(correction, axis=1) > LONGEST_RETURN * size] = 0.0
+        disturbance = np.abs(stiffness[self.nodes[i]] * correction).max(axis=1)
+        correction[disturbance > GENTLE * max(self.config.comm.allgather(self.trial.lam.max(initial=0.0)))] = 0.0
         self.config.displacement[self.nodes[i]] += correction
         gap = np.array(p.gap)
         gap[i] += np.einsum("ng,ng->n", correction, p.normal[i])
@@ -326,10 +337,32 @@ class ContactPair:
 
     # -- activation and release ------------------------------------------------------------------------------------
 
+    @property
+    def movable(self) -> Bools:
+        """Contactors whose Dirichlet conditions leave them some motion along the normal ``(n,)``."""
+        return np.linalg.norm(self.projection.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
+
     def touch(self) -> None:
         """Start with the contactors that touch without force as active."""
         touching = np.abs(self.projection.gap) <= TOUCHING * self.config.size
-        self.trial = replace(self.trial, active=self.trial.active | (touching & ~self.off))
+        self.trial = replace(self.trial, active=self.trial.active | (touching & ~self.off & self.movable))
+
+    def check_prescribed(self) -> None:
+        """Refuse an equilibrium in which a contactor is held inside the target by its Dirichlet conditions (collective).
+
+        Raises:
+            ConflictError: naming the deepest such node of the first rank that has one.
+        """
+        inside = ~self.movable & ~self.off & (self.projection.gap < -TOUCHING * self.config.size)
+        error = None
+        if inside.any():
+            i = int(np.argmin(np.where(inside, self.projection.gap, np.inf)))
+            error = ConflictError(
+                f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i]))} is prescribed to be "
+                f"{-self.projection.gap[i]:.4g} inside the target, where a Dirichlet condition fights the uniting equation: "
+                "release the condition along the normal, or make the other surface the contactor"
+            )
+        agree(self.config.comm, error)
 
     def predict(self, ratio: float) -> None:
         """First active set of a step, extrapolated from the last one; call it projected at the extrapolated displacement.
@@ -338,7 +371,7 @@ class ContactPair:
             ratio: this step's length over the last one's.
         """
         lam = self.committed.lam + ratio * (self.committed.lam - self.last_commit.lam)
-        entering = (self.projection.gap < 0) & ~self.off
+        entering = (self.projection.gap < 0) & ~self.off & self.movable
         self.trial = replace(self.trial, active=np.where(self.committed.active, lam >= 0, entering))
 
     def decide(self, force_rounding: float, cautious: bool) -> bool:
@@ -353,8 +386,8 @@ class ContactPair:
         """
         comm, state, off = self.config.comm, self.trial, self.off
         gap = self.projection.gap
-        release = state.active & ((state.lam < -force_rounding) | off)
-        enter = ~state.active & ~off & (gap < -GAP_ROUNDING * self.config.size)
+        release = state.active & ((state.lam < -force_rounding) | off | ~self.movable)
+        enter = ~state.active & ~off & self.movable & (gap < -GAP_ROUNDING * self.config.size)
         worst = [-np.min(gap[enter], initial=0.0), -np.min(state.lam[release], initial=0.0), float(state.active.any())]
         deepest, tension, touched = np.max(comm.allgather(worst), axis=0)
         if not touched:
@@ -448,10 +481,21 @@ class ContactPair:
 
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
-        bent = self.trial.active & (self.trial.lam > 0) & (self.trial.held < 0)
-        i = np.flatnonzero(bent) if self.sliding == "finite" else np.zeros(0, np.int64)
-        nodes = np.column_stack([self.config.to_global(self.nodes[i]), self.projection.nodes[i]])
-        return nodes, -self.trial.lam[i, None, None] * self.projection.hessians(i)
+        state, p, c = self.trial, self.projection, self._corners
+        i = np.flatnonzero(state.active & (state.lam > 0) & (state.held < 0))
+        if self.sliding != "finite":
+            i = i[:0]
+        own, followed, blocks = self.nodes[i], p.nodes[i], -state.lam[i, None, None] * p.hessians(i)
+        if c is not None and c.dN.shape[2]:
+            # on a side the force may lean either way; it is the force's direction that stays
+            j = np.flatnonzero(state.active[c.which])
+            w = c.which[j]
+            size = np.linalg.norm(state.force[w], axis=1)
+            n = state.force[w] / np.where(size > 0, size, 1.0)[:, None]
+            H = gap_hessians(n, np.zeros(len(j)), c.weights[j], c.dN[j], c.ddN[j], c.x[j], np.zeros((len(j), 1, n.shape[1])))
+            own, followed = np.concatenate([own, self.nodes[w]]), np.concatenate([followed, c.nodes[j]])
+            blocks = np.concatenate([blocks, -size[:, None, None] * H])
+        return np.column_stack([self.config.to_global(own), followed]), blocks
 
     # -- trial and committed -----------------------------------------------------------------------------------------
 

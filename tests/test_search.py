@@ -1,0 +1,364 @@
+"""The vectorised, distributed projection against ten-line loops that look at every facet.
+
+Two tests to read first: ``test_projection_is_the_nearest_of_all_facets`` compares the whole search with the loop, on any number of
+ranks, and ``test_ranks_see_what_one_rank_sees`` compares the distributed search with a serial one.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import at, box, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.search import MeshTarget, candidate_pairs
+from uem_dolfinx.shapes import closest_point, facet_shape, unit_normals
+from uem_dolfinx.surfaces import Configuration, TargetFacets
+
+COMM = MPI.COMM_WORLD
+EPS = np.finfo(float).eps
+
+KINDS = [("interval", 1), ("interval", 2), ("triangle", 1), ("triangle", 2), ("quadrilateral", 1), ("quadrilateral", 2)]
+
+
+# -- one facet -----------------------------------------------------------------------------------------------------------
+
+
+def loop_closest(shape, x, p):
+    """Distance of one point to one facet: dense sampling, then SciPy from the best sample."""
+
+    def d2(xi):
+        return float(((shape.tabulate(np.atleast_2d(xi)).N[0] @ x - p) ** 2).sum())
+
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 31)] * shape.dim), axis=-1).reshape(-1, shape.dim)
+    grid = grid[shape.contains(grid)]
+    start = grid[np.argmin(((shape.tabulate(grid).N @ x - p) ** 2).sum(axis=1))]
+    below = [{"type": "ineq", "fun": lambda xi: 1 - xi.sum()}] if shape.cell == "triangle" else []
+    best = minimize(d2, start, bounds=[(0, 1)] * shape.dim, constraints=below, method="SLSQP", options={"ftol": 1e-16, "maxiter": 100})
+    return min(best.fun, d2(start)) ** 0.5
+
+
+def random_facets(shape, n, rng, bend):
+    """Facets with corners near the reference cell's and middle nodes off the straight sides."""
+    g = shape.dim + 1
+    flat = np.column_stack([shape.nodes, np.zeros(len(shape.nodes))])
+    return flat + bend * rng.uniform(-1, 1, (n, len(flat), g))
+
+
+@pytest.mark.parametrize("cell,degree", KINDS)
+def test_closest_point_of_one_facet(cell, degree):
+    shape, rng = facet_shape(cell, degree), np.random.default_rng(7)
+    x = random_facets(shape, 60, rng, 0.3 if degree == 1 else 0.08)
+    # near the facet, past its sides, and past its corners
+    p = rng.uniform(-0.6, 1.6, (60, shape.dim + 1))
+    p[:, -1] = rng.uniform(-0.4, 0.4, 60)
+    xi, d2 = closest_point(shape, x, p)
+    foot = np.einsum("na,nag->ng", shape.tabulate(xi).N, x)
+    assert shape.contains(xi).all()
+    assert np.allclose(np.linalg.norm(foot - p, axis=1), np.sqrt(d2), atol=1e-13)
+    expected = [loop_closest(shape, x[i], p[i]) for i in range(60)]
+    # SciPy's distance is that of some point of the facet, so it may exceed the exact one only by its own tolerance
+    assert np.abs(np.sqrt(d2) - expected).max() < 1e-7
+
+
+@pytest.mark.parametrize("cell", ["interval", "triangle"])
+def test_straight_facets_by_formula(cell):
+    """Barycentric formulas of a segment and of a triangle's inside."""
+    shape, rng = facet_shape(cell, 1), np.random.default_rng(11)
+    x = random_facets(shape, 300, rng, 0.4)
+    p = rng.uniform(-0.5, 1.5, (300, shape.dim + 1))
+    xi, _ = closest_point(shape, x, p)
+    A, r = x[:, 1:] - x[:, :1], p - x[:, 0]
+    for k in range(300):
+        exact = np.linalg.lstsq(A[k].T, r[k], rcond=None)[0]
+        if cell == "interval":
+            assert np.allclose(xi[k], np.clip(exact, 0, 1), atol=1e-13)
+        elif (exact >= 0).all() and exact.sum() <= 1:
+            assert np.allclose(xi[k], exact, atol=1e-13)
+        else:
+            ends = [(0, 1), (0, 2), (1, 2)]
+            s = [np.clip((p[k] - x[k, a]) @ (x[k, b] - x[k, a]) / ((x[k, b] - x[k, a]) ** 2).sum(), 0, 1) for a, b in ends]
+            feet = [x[k, a] + t * (x[k, b] - x[k, a]) for (a, b), t in zip(ends, s)]
+            nearest = min(feet, key=lambda f: np.linalg.norm(f - p[k]))
+            assert np.allclose(x[k, 0] + xi[k] @ A[k], nearest, atol=1e-13)
+
+
+coordinates = st.floats(-2, 2, allow_nan=False, width=32)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.sampled_from(KINDS), st.integers(0, 10**6), coordinates, coordinates, coordinates)
+def test_no_sampled_point_is_nearer(kind, seed, a, b, c):
+    """Whatever the facet and the point, warped quadrilaterals and far points included."""
+    shape, rng = facet_shape(*kind), np.random.default_rng(seed)
+    x = random_facets(shape, 1, rng, 0.25 if kind[1] == 1 else 0.05)
+    p = np.array([[a, b, c]])[:, : shape.dim + 1]
+    _, d2 = closest_point(shape, x, p)
+    samples = rng.random((400, shape.dim))
+    samples = np.concatenate([samples[shape.contains(samples)], shape.nodes])
+    nearest = np.linalg.norm(shape.tabulate(samples).N @ x[0] - p, axis=1).min()
+    assert np.sqrt(d2[0]) <= nearest + 1e-12
+
+
+@pytest.mark.parametrize("cell,degree", KINDS)
+def test_point_on_a_curved_facet_is_its_own_foot(cell, degree):
+    shape, rng = facet_shape(cell, degree), np.random.default_rng(5)
+    x = random_facets(shape, 200, rng, 0.1)
+    xi = rng.dirichlet(np.ones(shape.dim + 1), 200)[:, : shape.dim]
+    tab = shape.tabulate(xi)
+    on = np.einsum("na,nag->ng", tab.N, x)
+    for height in (0.0, 0.05, -0.05):
+        found, d2 = closest_point(shape, x, on + height * unit_normals(tab, x))
+        assert np.abs(found - xi).max() < 1e-12
+        assert np.abs(np.sqrt(d2) - abs(height)).max() < 1e-14
+
+
+# -- a surface -------------------------------------------------------------------------------------------------------------
+
+
+def bump(x):
+    """Curve the top of a unit box, the more the higher."""
+    y = x.copy()
+    y[:, -1] += 0.2 * x[:, -1] * np.sin(3 * x[:, 0]) * np.cos(2 * x[:, -2 if x.shape[1] == 3 else 0])
+    return y
+
+
+def grade(x):
+    """Concentrate the nodes at x = 0: the longest facet is thousands of times the shortest."""
+    y = x.copy()
+    y[:, 0] = x[:, 0] ** 4
+    return y
+
+
+def surface(cell, comm=COMM, degree=1, n=6, pose=bump, averaged=False):
+    """Top of a box as a target, and its configuration."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    s = scene(comm, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], pose=pose)
+    u = fem.Function(compat.function_space(s.mesh, degree, (g,)))
+    config = Configuration(u)
+    return s, config, MeshTarget(TargetFacets(config, s.tag("top", 0, at(g - 1, 1.0))), averaged=averaged)
+
+
+def all_facets(target):
+    """Node positions, global nodes and outward normals at the middle of every facet of the surface, in the order of their numbers."""
+    f = target.facets
+    x = f.config.x[f.dofs]
+    tab = f.shape.tabulate(np.tile(f.shape.middle, (len(x), 1)))
+    parts = target.comm.allgather((x, f.nodes, unit_normals(tab, x) * f.sign[:, None] if len(x) else np.zeros(x.shape[::2])))
+    return (np.concatenate([p[k] for p in parts]) for k in range(3))
+
+
+def points_about(g, n, seed):
+    """Points above, below and beside the unit box's top; each rank has its own."""
+    rng = np.random.default_rng(seed + 100 * COMM.rank)
+    return rng.uniform(-0.3, 1.3, (n + 3 * COMM.rank, g))
+
+
+SURFACES = [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 1), ("hexahedron", 1), ("tetrahedron", 2), ("hexahedron", 2)]
+
+
+@pytest.mark.parametrize("cell,degree", SURFACES)
+def test_projection_is_the_nearest_of_all_facets(cell, degree):
+    _, config, target = surface(cell, degree=degree, n=4)
+    points = points_about(config.gdim, 40, 1)
+    p = target.project(points)
+    x, nodes, _ = all_facets(target)
+    for i, point in enumerate(points):
+        d2 = np.array([closest_point(target.shape, x[f : f + 1], point[None])[1][0] for f in range(len(x))])
+        assert np.linalg.norm(p.foot[i] - point) == pytest.approx(np.sqrt(d2.min()), abs=1e-14)
+        assert np.sqrt(d2[p.facet[i]]) == pytest.approx(np.sqrt(d2.min()), abs=1e-14)
+        assert np.array_equal(p.nodes[i], nodes[p.facet[i]])
+        assert np.allclose(p.weights[i] @ x[p.facet[i]], p.foot[i], atol=1e-15)
+    assert np.abs(p.weights.sum(axis=1) - 1).max() < 1e-14
+
+
+@pytest.mark.parametrize("cell,degree", SURFACES)
+@pytest.mark.parametrize("averaged", [False, True])
+def test_ranks_see_what_one_rank_sees(cell, degree, averaged):
+    points = points_about(2 if cell in ("triangle", "quadrilateral") else 3, 60, 2)
+    s, config, target = surface(cell, degree=degree, averaged=averaged)
+    alone, alone_config, serial = surface(cell, MPI.COMM_SELF, degree=degree, averaged=averaged)
+    p, q = target.project(points), serial.project(points)
+    for field in ("gap", "normal", "foot", "averaged", "beyond"):
+        assert np.abs(getattr(p, field) - getattr(q, field)).max() < 1e-12, field
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_normals_point_out_and_gaps_have_a_sign(cell):
+    _, config, target = surface(cell)
+    g = config.gdim
+    rng = np.random.default_rng(3)
+    x, _, normals = all_facets(target)
+    middle = np.einsum("a,nag->ng", target.shape.tabulate(target.shape.middle[None]).N[0], x)
+    assert (normals[:, -1] > 0).all()
+    for height in (0.01, 0.0, -0.01):
+        p = target.project(middle + height * normals)
+        assert np.abs(p.gap - height).max() < 1e-13
+        assert np.abs(p.normal - normals).max() < 1e-10
+    assert rng.random() < 1 and g == x.shape[2]
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
+def test_points_on_vertices_and_sides(cell):
+    """Exactly on a shared vertex or side the gap is zero to the last bits and the normal that of all facets around."""
+    _, config, target = surface(cell)
+    x, nodes, normals = all_facets(target)
+    corners = x.reshape(-1, config.gdim)
+    p = target.project(corners)
+    assert np.abs(p.gap).max() <= 4 * EPS
+    assert np.linalg.norm(p.foot - corners, axis=1).max() <= 4 * EPS
+    for k in range(0, len(corners), 7):
+        around = normals[(nodes == nodes.reshape(-1)[k]).any(axis=1)]
+        if len(around) > 1:
+            # within the cone of its neighbours: nearer to their mean than any of them
+            mean = around.mean(axis=0) / np.linalg.norm(around.mean(axis=0))
+            assert p.normal[k] @ mean > min(around @ mean) - 1e-12
+    # equal places have equal answers, whichever facet they came from
+    for k in np.unique(nodes):
+        same = np.flatnonzero(nodes.reshape(-1) == k)
+        assert np.ptp(p.normal[same], axis=0).max() == 0.0
+        assert np.ptp(p.facet[same]) == 0
+    if config.gdim == 3:
+        on = 0.5 * (x[:, 0] + x[:, 1])
+        p = target.project(on)
+        assert np.abs(p.gap).max() <= 4 * EPS
+        assert np.linalg.norm(p.foot - on, axis=1).max() <= 4 * EPS
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_averaged_normals_are_continuous(cell):
+    """Across a facet's side the facet's normal jumps, the averaged one does not; on a sphere it is nearly radial."""
+    _, config, target = surface(cell, averaged=True)
+    _, _, plain = surface(cell)
+    x, _, _ = all_facets(target)
+    g = config.gdim
+    inner = x[:, 0][(np.abs(x[:, 0, 0] - 0.5) < 0.3)]
+    if g == 3:
+        inner = inner[np.abs(inner[:, 1] - 0.5) < 0.3]
+    step = np.eye(g)[0] * 1e-7
+    jump = np.linalg.norm(target.project(inner + step).normal - target.project(inner - step).normal, axis=1)
+    assert jump.max() < 1e-5
+    assert np.linalg.norm(plain.project(inner + step).normal - plain.project(inner - step).normal, axis=1).max() > 1e-2
+
+
+def test_past_an_open_end():
+    """Past the end of a flat surface ``beyond`` is the tangential distance; above it, zero."""
+    _, config, target = surface("triangle", pose=lambda x: x)
+    p = target.project(np.array([[1.3, 1.2], [-0.2, 0.9], [0.4, 1.5]]))
+    assert np.allclose(p.beyond, [[0.3, 0.0], [-0.2, 0.0], [0.0, 0.0]], atol=1e-15)
+    assert np.allclose(p.gap, [0.2, -0.1, 0.5], atol=1e-15)
+    assert np.allclose(p.foot, [[1.0, 1.0], [0.0, 1.0], [0.4, 1.0]], atol=1e-15)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_on_a_named_facet(cell):
+    """``project_on`` stays on the facet it is told, however far that is."""
+    _, config, target = surface(cell)
+    x, nodes, _ = all_facets(target)
+    points = points_about(config.gdim, 20, 4)
+    facet = np.random.default_rng(5 + COMM.rank).integers(0, len(x), len(points))
+    p = target.project_on(points, facet)
+    assert np.array_equal(p.facet, facet)
+    assert np.array_equal(p.nodes, nodes[facet])
+    for i, f in enumerate(facet):
+        _, d2 = closest_point(target.shape, x[f : f + 1], points[i : i + 1])
+        assert np.linalg.norm(p.foot[i] - points[i]) == pytest.approx(np.sqrt(d2[0]), abs=1e-14)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_following_keeps_foot_and_normal(cell):
+    """Small sliding: the old weights of the moved nodes, the old normal."""
+    _, config, target = surface(cell)
+    points = points_about(config.gdim, 20, 6)
+    old = target.project(points)
+    config.displacement[:] = 0.1 * np.sin(5 * config.X)
+    moved = points + 0.03
+    x, _, _ = all_facets(target)
+    p = target.follow(moved, old)
+    foot = np.einsum("na,nag->ng", old.weights, x[old.facet])
+    assert np.abs(p.foot - foot).max() < 1e-15
+    assert np.array_equal(p.normal, old.normal)
+    assert np.abs(p.gap - np.einsum("ng,ng->n", old.normal, moved - foot)).max() < 1e-15
+    assert np.abs(p.weights - old.weights).max() < 1e-15
+
+
+def test_current_configuration():
+    """The search sees where the target is now, not where it was."""
+    _, config, target = surface("hexahedron", pose=lambda x: x)
+    config.displacement[:] = [0.25, 0.0, -0.5]
+    p = target.project(np.array([[0.5, 0.5, 1.0]]))
+    assert np.allclose(p.foot, [[0.5, 0.5, 0.5]], atol=1e-15) and p.gap[0] == pytest.approx(0.5, abs=1e-15)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_graded_surface(cell):
+    """Facets of very different sizes: still the nearest, and not by trying them all."""
+    n = 60 if cell == "triangle" else 16
+    _, config, target = surface(cell, MPI.COMM_SELF, n=n, pose=grade)
+    x, _, _ = all_facets(target)
+    rng = np.random.default_rng(8)
+    points = rng.random((400, config.gdim))
+    points[:, 0] **= 4
+    points[:, -1] = 1 + 0.01 * points[:, -1] * points[:, 0]
+    pairs, facets = candidate_pairs(target.shape, x, points)
+    assert len(pairs) < 0.3 * len(points) * len(x)
+    p = target.project(points)
+    for i in range(0, 400, 9):
+        _, d2 = closest_point(target.shape, x, np.tile(points[i], (len(x), 1)))
+        assert np.linalg.norm(p.foot[i] - points[i]) == pytest.approx(np.sqrt(d2.min()), abs=1e-15)
+        assert d2[facets[pairs == i]].min() == d2.min()
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(st.integers(0, 10**6), st.sampled_from(["triangle", "hexahedron"]))
+def test_any_cloud_on_any_number_of_ranks(seed, cell):
+    """Random clouds, one of them far away, one rank without points."""
+    _, config, target = surface(cell, n=3)
+    g = config.gdim
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(size=(3 * COMM.size, g)) * 10.0 ** rng.integers(-2, 3)
+    mine = cloud[COMM.rank :: COMM.size] if COMM.rank else cloud[:0]
+    p = target.project(mine)
+    x, _, _ = all_facets(target)
+    for i, point in enumerate(mine):
+        _, d2 = closest_point(target.shape, x, np.tile(point, (len(x), 1)))
+        assert np.linalg.norm(p.foot[i] - point) == pytest.approx(np.sqrt(d2.min()), rel=1e-13, abs=1e-14)
+
+
+def test_empty_request():
+    """No rank asks anything."""
+    _, config, target = surface("tetrahedron", n=2)
+    p = target.project(np.zeros((0, 3)))
+    assert p.gap.shape == (0,) and p.nodes.shape == (0, 3)
+    p.hessians(np.zeros(0, np.int64))
+    target.follow(np.zeros((0, 3)), p)
+
+
+# -- rigid surfaces ----------------------------------------------------------------------------------------------------------
+
+
+def test_rigid_surfaces_by_formula():
+    x = np.array([[0.0, 0.0, 3.0], [1.0, 2.0, 2.0], [3.0, 4.0, -1.0]])
+    plane = uem.RigidPlane((0, 0, 1), (0, 0, 5)).project(x)
+    assert np.allclose(plane.gap, [2, 1, -2]) and np.allclose(plane.normal, [0, 0, 1])
+    sphere = uem.RigidSphere((0, 0, 0), 2.0).project(x)
+    assert np.allclose(sphere.gap, [1, 1, np.sqrt(26) - 2]) and np.allclose(sphere.normal, x / np.linalg.norm(x, axis=1)[:, None])
+    hollow = uem.RigidSphere((0, 0, 0), 4.0, inside=True).project(x)
+    assert np.allclose(hollow.gap, [1, 1, 4 - np.sqrt(26)]) and np.allclose(hollow.normal, -sphere.normal)
+    cylinder = uem.RigidCylinder((0, 0, 7), (0, 0, 2), 1.0).project(x[1:])
+    assert np.allclose(cylinder.gap, [np.sqrt(5) - 1, 4]) and np.allclose(cylinder.normal[1], [0.6, 0.8, 0])
+    # the gap of a paraboloid is exact where it is zero, and has the sign of the side everywhere
+    paraboloid = uem.RigidParaboloid((0, 0, 0), (0, 0, 1), 0.5)
+    on = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.6, 0.8, 1.0]])
+    assert np.allclose(paraboloid.project(on).gap, 0, atol=1e-15)
+    assert paraboloid.project(np.array([[0.0, 0.0, -0.1]])).gap[0] == pytest.approx(0.1)
+    near = paraboloid.project(on + 1e-6 * paraboloid.project(on).normal)
+    assert np.allclose(near.gap, 1e-6, rtol=1e-5)
+    assert np.allclose(near.normal[1], np.array([2, 0, -1]) / np.sqrt(5), atol=1e-5)
