@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
+import numpy as np
 from dolfinx import fem
 from petsc4py import PETSc
 
@@ -52,6 +53,13 @@ def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) 
     """Prescribe one component of the displacement on the facets of a tag."""
     dofs = fem.locate_dofs_topological(V.sub(component), tag.dim, tag.entities)
     return fem.dirichletbc(PETSc.ScalarType(value), dofs, V.sub(component))
+
+
+def order(step: uem.LoadStep, rounding: float = 1e-12) -> float:
+    """Order of convergence observed on a step's last three residuals above rounding: 2 is quadratic."""
+    residuals = [iteration.residual for iteration in step.iterations]
+    r = [value for value in residuals if value > rounding][-3:]
+    return float(np.log(r[2] / r[1]) / np.log(r[1] / r[0])) if len(r) == 3 else float("nan")
 
 
 def report(args: argparse.Namespace, results: dict[str, Any]) -> None:

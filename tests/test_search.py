@@ -110,14 +110,17 @@ def test_no_sampled_point_is_nearer(kind, seed, a, b, c):
 @pytest.mark.parametrize("cell,degree", KINDS)
 def test_point_on_a_curved_facet_is_its_own_foot(cell, degree):
     shape, rng = facet_shape(cell, degree), np.random.default_rng(5)
-    x = random_facets(shape, 200, rng, 0.1)
+    x = random_facets(shape, 200, rng, 0.1 if degree == 1 else 0.05)
     xi = rng.dirichlet(np.ones(shape.dim + 1), 200)[:, : shape.dim]
     tab = shape.tabulate(xi)
     on = np.einsum("na,nag->ng", tab.N, x)
     for height in (0.0, 0.05, -0.05):
         found, d2 = closest_point(shape, x, on + height * unit_normals(tab, x))
-        assert np.abs(found - xi).max() < 1e-12
-        assert np.abs(np.sqrt(d2) - abs(height)).max() < 1e-14
+        assert np.sqrt(d2).max() < abs(height) + 1e-14
+        # above a strongly bent facet another of its points may be nearer, on it none
+        same = np.sqrt(d2) > abs(height) - 1e-12
+        assert same.mean() > 0.9 and (same.all() or height)
+        assert np.abs(found - xi)[same].max() < 1e-12
 
 
 # -- a surface -------------------------------------------------------------------------------------------------------------
@@ -183,8 +186,8 @@ def test_projection_is_the_nearest_of_all_facets(cell, degree):
 @pytest.mark.parametrize("averaged", [False, True])
 def test_ranks_see_what_one_rank_sees(cell, degree, averaged):
     points = points_about(2 if cell in ("triangle", "quadrilateral") else 3, 60, 2)
-    s, config, target = surface(cell, degree=degree, averaged=averaged)
-    alone, alone_config, serial = surface(cell, MPI.COMM_SELF, degree=degree, averaged=averaged)
+    _, _, target = surface(cell, degree=degree, averaged=averaged)
+    _, _, serial = surface(cell, MPI.COMM_SELF, degree=degree, averaged=averaged)
     p, q = target.project(points), serial.project(points)
     for field in ("gap", "normal", "foot", "averaged", "beyond"):
         assert np.abs(getattr(p, field) - getattr(q, field)).max() < 1e-12, field
@@ -192,9 +195,7 @@ def test_ranks_see_what_one_rank_sees(cell, degree, averaged):
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_normals_point_out_and_gaps_have_a_sign(cell):
-    _, config, target = surface(cell)
-    g = config.gdim
-    rng = np.random.default_rng(3)
+    _, _, target = surface(cell)
     x, _, normals = all_facets(target)
     middle = np.einsum("a,nag->ng", target.shape.tabulate(target.shape.middle[None]).N[0], x)
     assert (normals[:, -1] > 0).all()
@@ -202,24 +203,27 @@ def test_normals_point_out_and_gaps_have_a_sign(cell):
         p = target.project(middle + height * normals)
         assert np.abs(p.gap - height).max() < 1e-13
         assert np.abs(p.normal - normals).max() < 1e-10
-    assert rng.random() < 1 and g == x.shape[2]
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
 def test_points_on_vertices_and_sides(cell):
     """Exactly on a shared vertex or side the gap is zero to the last bits and the normal that of all facets around."""
     _, config, target = surface(cell)
-    x, nodes, normals = all_facets(target)
+    x, nodes, _ = all_facets(target)
     corners = x.reshape(-1, config.gdim)
     p = target.project(corners)
     assert np.abs(p.gap).max() <= 4 * EPS
     assert np.linalg.norm(p.foot - corners, axis=1).max() <= 4 * EPS
-    for k in range(0, len(corners), 7):
-        around = normals[(nodes == nodes.reshape(-1)[k]).any(axis=1)]
-        if len(around) > 1:
-            # within the cone of its neighbours: nearer to their mean than any of them
-            mean = around.mean(axis=0) / np.linalg.norm(around.mean(axis=0))
-            assert p.normal[k] @ mean > min(around @ mean) - 1e-12
+    # the corners of a facet, each with its two neighbours on the rim
+    rim = {"triangle": [(0, 1), (1, 0)], "tetrahedron": [(0, 1, 2), (1, 2, 0), (2, 0, 1)]}.get(cell, [(0, 1, 2), (1, 3, 0), (2, 0, 3), (3, 2, 1)])
+    for k in np.unique(nodes):
+        total = np.zeros(config.gdim)
+        for f in np.flatnonzero((nodes == k).any(axis=1)):
+            edges = [x[f, i] - x[f, r[0]] for r in rim if nodes[f, r[0]] == k for i in r[1:]]
+            normal = np.array([edges[0][1], -edges[0][0]]) if config.gdim == 2 else np.cross(*edges)
+            total += normal * np.sign(normal[-1])
+        here = np.flatnonzero(nodes.reshape(-1) == k)
+        assert np.abs(p.normal[here] - total / np.linalg.norm(total)).max() < 1e-13
     # equal places have equal answers, whichever facet they came from
     for k in np.unique(nodes):
         same = np.flatnonzero(nodes.reshape(-1) == k)

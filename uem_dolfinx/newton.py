@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Shortest step of the line search.
 SHORTEST_STEP = 1.0 / 64
-#: The line search accepts a step that leaves less than this part of the work of the residual.
+#: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 ENOUGH_DECREASE = 0.9
 
 
@@ -115,8 +115,8 @@ class UnitedSystem(Protocol):
         """Where a cell is inside out, if one is."""
         ...
 
-    def work(self, state: United, dq: PETSc.Vec) -> float:
-        """Work of the present residual on an increment, ``dq . P'F``, with the P of ``state``."""
+    def reduced_residual(self, state: United) -> PETSc.Vec:
+        """``P'F`` of the present residual with the P of ``state``."""
         ...
 
 
@@ -179,8 +179,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
 def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
     """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
     du, start = system.move(state, dq), system.displacement()
-    before = abs(dq.dot(rhs))
-    enough = max(ENOUGH_DECREASE * before, state.rounding * dq.norm())
+    work, norm = abs(dq.dot(rhs)), rhs.norm()
     length = 1.0
     while True:
         last = not line_search or length <= SHORTEST_STEP
@@ -189,8 +188,11 @@ def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec,
         if where is None:
             system.place(returning=length == 1.0)
             finite = system.assemble_residual()
-            if finite and (last or abs(system.work(state, dq)) <= enough):
-                return length
+            if finite:
+                residual = system.reduced_residual(state)
+                less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
+                if last or less_work or residual.norm() <= ENOUGH_DECREASE * norm:
+                    return length
             if last:
                 raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
         elif last:

@@ -232,7 +232,7 @@ def figure(path: str | Path | None, comm: MPI.Comm, panels: int = 1, size: tuple
     yield list(np.atleast_1d(canvas.subplots(1, panels)))
     assert path is not None
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    canvas.savefig(path, dpi=150)
+    canvas.savefig(path, dpi=150, bbox_inches="tight")
 
 
 def plot_scene(
@@ -249,7 +249,7 @@ def plot_scene(
     arrows: bool = True,
     cmap: str = "viridis",
 ) -> None:
-    """Draw a 2D scene where it is now, coloured by a field, contact forces as arrows (collective).
+    """Draw a 2D scene where it is now, coloured by a field, contact forces per area as arrows (collective).
 
     Cells are gathered to rank 0 for drawing, and only there.
 
@@ -263,7 +263,7 @@ def plot_scene(
         window: ``(x_min, x_max, y_min, y_max)`` to show; None shows everything.
         mirror: draw the reflection at ``x = 0`` too, for half models.
         cells: draw the edges of the cells.
-        arrows: draw the contact forces.
+        arrows: draw the contact forces per tributary area, on the contactors.
         cmap: colour map.
 
     Raises:
@@ -295,8 +295,9 @@ def plot_scene(
     values = np.concatenate([v for _, _, v in parts])
     x = np.concatenate(points)
     _draw_scene(picture, x, triangles, outline, values, levels, label, window, mirror, cells, cmap)
-    for at, force, _ in forces:
-        _draw_arrows(picture, at, force, mirror)
+    longest = max((float(p.max(initial=0.0)) for _, _, p in forces), default=0.0)
+    for at, force, pressure in forces:
+        _draw_arrows(picture, at, force, pressure, longest, mirror)
 
 
 def _draw_scene(
@@ -318,10 +319,12 @@ def _draw_scene(
     if not np.ndim(levels):
         seen = values[shown] if shown.any() else values[used]
         levels = MaxNLocator(int(np.asarray(levels))).tick_values(float(seen.min()), float(seen.max()))
+    beyond = (values[shown].min(initial=np.inf) < levels[0]) + 2 * (values[shown].max(initial=-np.inf) > levels[-1])
+    extend = ("neither", "min", "max", "both")[beyond]
     coloured = None
     for side in (1.0, -1.0) if mirror else (1.0,):
         y = x * [side, 1.0]
-        coloured = ax.tricontourf(y[:, 0], y[:, 1], triangles, values, levels=levels, cmap=cmap, extend="both")
+        coloured = ax.tricontourf(y[:, 0], y[:, 1], triangles, values, levels=levels, cmap=cmap, extend=extend)
         if cells:
             ax.add_collection(LineCollection(y[outline], colors="k", linewidths=0.25, alpha=0.35))
     ax.figure.colorbar(coloured, ax=ax, label=label, shrink=0.85)
@@ -332,17 +335,18 @@ def _draw_scene(
     ax.set_ylabel("y")
 
 
-def _draw_arrows(ax: Any, at: Array, force: Array, mirror: bool) -> None:
-    """Contact forces on the contactors, the longest a tenth of the picture."""
+def _draw_arrows(ax: Any, at: Array, force: Array, pressure: Array, longest: float, mirror: bool) -> None:
+    """Contact pressures in the direction of the contact forces, the longest an eighth of the picture."""
     size = np.linalg.norm(force, axis=1)
-    at, force, size = at[size > 0], force[size > 0], size[size > 0]
-    if not len(size):
+    pressed = size > 0
+    if not pressed.any():
         return
+    at, arrow = at[pressed], force[pressed] / size[pressed, None] * pressure[pressed, None]
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    unit = size.max() / (0.12 * min(right - left, top - bottom))
+    unit = longest / (0.125 * min(right - left, top - bottom))
     for side in (1.0, -1.0) if mirror else (1.0,):
         ax.quiver(
-            side * at[:, 0], at[:, 1], side * force[:, 0], force[:, 1], angles="xy", scale_units="xy", scale=unit,
+            side * at[:, 0], at[:, 1], side * arrow[:, 0], arrow[:, 1], angles="xy", scale_units="xy", scale=unit,
             color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
         )  # fmt: skip
 

@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 from uem_dolfinx.shapes import FacetShape, Tabulated, closest_point, unit_normals
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mpi4py import MPI
 
     from uem_dolfinx.surfaces import FacetData, TargetFacets
@@ -100,6 +102,13 @@ class FacetProjection:
 
     def take(self, which: Ints) -> FacetProjection:
         return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def with_rows(self, which: Ints, values: Mapping[str, Array | float]) -> FacetProjection:
+        """Copy with some fields replaced at some points."""
+        updates = {name: np.array(getattr(self, name)) for name in values}
+        for name, value in values.items():
+            updates[name][which] = value
+        return replace(self, **updates)
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).

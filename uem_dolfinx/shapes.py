@@ -158,7 +158,7 @@ def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -
 
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
     """Newton on ``(p - y) . y,alpha = 0``; infinitely far where it ends outside the facet."""
-    xi = np.tile(shape.middle, (len(p), 1))
+    xi = _nearest_sample(shape, x, p)
     d2 = np.full(len(p), np.inf)
     todo = np.arange(len(p))
     for _ in range(1 if shape.affine else iterations):
@@ -173,11 +173,35 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
             convex = np.linalg.eigvalsh(curved)[:, 0] > 0.1 * np.linalg.eigvalsh(m)[:, 0]
             m = np.where(convex[:, None, None], curved, m)
         step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
-        xi[todo] += np.clip(step, -1.0, 1.0) if not shape.affine else step
+        xi[todo] += step if shape.affine else _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))
         far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1) if not shape.affine else np.zeros(len(todo), bool)
         todo = todo[(np.abs(step).max(axis=1) > 1e-15) & ~far]
     inside = shape.contains(xi)
-    tab = shape.tabulate(xi[inside])
-    r = p[inside] - np.einsum("na,nag->ng", tab.N, x[inside])
-    d2[inside] = np.einsum("ng,ng->n", r, r)
+    d2[inside] = _squared_distance(shape, x[inside], p[inside], xi[inside])
     return xi, d2
+
+
+def _nearest_sample(shape: FacetShape, x: Array, p: Array) -> Array:
+    """Where Newton starts: the middle, or the nearest of middle and nodes of a curved facet ``(n, fdim)``."""
+    if shape.degree == 1:
+        return np.tile(shape.middle, (len(p), 1))
+    samples = np.concatenate([shape.middle[None], shape.nodes])
+    y = np.einsum("sa,nag->nsg", shape.tabulate(samples).N, x)
+    return samples[np.linalg.norm(y - p[:, None], axis=2).argmin(axis=1)]
+
+
+def _descending(shape: FacetShape, x: Array, p: Array, xi: Array, step: Array) -> Array:
+    """The steps from ``xi``, halved a few times while they lead away from ``p``."""
+    now = _squared_distance(shape, x, p, xi)
+    for _ in range(4):
+        worse = _squared_distance(shape, x, p, xi + step) > now * (1 + 1e-10) + np.finfo(float).tiny
+        if not worse.any():
+            break
+        step[worse] *= 0.5
+    return step
+
+
+def _squared_distance(shape: FacetShape, x: Array, p: Array, xi: Array) -> Array:
+    """Of points ``p (n, gdim)`` to their facets' points ``xi (n, fdim)``: ``(n,)``."""
+    r = p - np.einsum("na,nag->ng", shape.tabulate(xi).N, x)
+    return np.einsum("ng,ng->n", r, r)

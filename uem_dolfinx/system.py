@@ -224,8 +224,7 @@ class BodySystem:
 
     def active_set(self) -> int:
         """Fingerprint of the active set, the same on all ranks."""
-        here = zlib.crc32(b"".join(pair.trial.active.tobytes() + pair.trial.held.tobytes() for pair in self.pairs))
-        return hash(tuple(self.comm.allgather(here)))
+        return hash(tuple(self.comm.allgather(zlib.crc32(b"".join(pair.trial.united_to for pair in self.pairs)))))
 
     # -- linear system -----------------------------------------------------------------------------------------------
 
@@ -307,9 +306,9 @@ class BodySystem:
             self.config.displacement[:n][~self.free[:n]] = self.wanted[:n][~self.free[:n]]
         self.u.x.scatter_forward()
 
-    def work(self, state: United, dq: PETSc.Vec) -> float:
-        """Work of the present residual on an increment, ``dq . P'F``, with the P of ``state``."""
-        return float(dq.dot(state.restriction.reduce(state.restriction.pass_on(self.residual))))
+    def reduced_residual(self, state: United) -> PETSc.Vec:
+        """``P'F`` of the present residual with the P of ``state``."""
+        return state.restriction.reduce(state.restriction.pass_on(self.residual))
 
     def _inversion_detector(self) -> tuple[ufl.core.expr.Expr, object]:
         """Volume of the cells turned inside out, as a form."""

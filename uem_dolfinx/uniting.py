@@ -6,16 +6,16 @@ that changes only after convergence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.errors import ConflictError, PenetrationError, agree
 from uem_dolfinx.restriction import MOSTLY_PRESCRIBED
-from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target, gap_hessians
-from uem_dolfinx.shapes import closest_point
+from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
 if TYPE_CHECKING:
     from uem_dolfinx.surfaces import Configuration
@@ -34,10 +34,10 @@ TOUCHING = 1e-9
 NEAR = 1.0
 #: Normal return may change nodal forces by this part of the largest contact force.
 GENTLE = 0.1
-#: Facets whose slopes differ by less are one plane.
-ON_PLANE = 1e-9
-#: A contactor that changed facets to and fro this often in a step is held by averaged normals for the rest of it.
-MOST_FLIPS = 4
+#: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
+HOLD_AFTER = 2
+#: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
+MOST_CHANGES = 8
 
 
 @dataclass(frozen=True)
@@ -96,53 +96,22 @@ class PairState:
         lam: contact force along the normal, positive in compression ``(n,)``.
         force: contact force on the contactor ``(n, gdim)``.
         facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
-        before: facet that it was on before ``(n,)``.
-        held: second facet of a contactor that rests in a concave corner of the target, or -1 ``(n,)``.
-        flips: how often in this step it came back to the facet it had left ``(n,)``.
+        held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
+        changes: how often in this step it has changed facets across a bend ``(n,)``.
     """
 
     active: Bools
     lam: Array
     force: Array
     facet: Ints
-    before: Ints
     held: Ints
-    flips: Ints
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Contactors held by the side that two target facets share.
-
-    Attributes:
-        which: their places among the pair's contactors ``(k,)``.
-        normals: of the two facets ``(k, 2, gdim)``.
-        rising: how far the second facet rises above the first one's plane, as a slope ``(k,)``; positive if concave.
-        shared: whether the facets share a side at all ``(k,)``.
-        nodes: global nodes of the first facet ``(k, nn)``.
-        weights: shape functions at the closest point of the shared side ``(k, nn)``.
-        foot: that point ``(k, gdim)``.
-        x: positions of the nodes ``(k, nn, gdim)``.
-        dN: derivatives of the weights along the side ``(k, nn, fdim - 1)``.
-        ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
-    """
-
-    which: Ints
-    normals: Array
-    rising: Array
-    shared: Bools
-    nodes: Ints
-    weights: Array
-    foot: Array
-    x: Array
-    dN: Array
-    ddN: Array
+    changes: Ints
 
     @property
-    def axes(self) -> Array:
-        """Orthonormal basis of the plane of the two normals, their bisector first ``(k, 2, gdim)``."""
-        a = np.stack([self.normals[:, 0] + self.normals[:, 1], self.normals[:, 0] - self.normals[:, 1]], axis=1)
-        return a / np.maximum(np.linalg.norm(a, axis=2, keepdims=True), np.finfo(float).tiny)
+    def united_to(self) -> bytes:
+        """What tells this active set from others: who is active, and the corners that hold contactors."""
+        corner = np.where((self.held >= 0).any(axis=1), self.facet, -1)
+        return self.active.tobytes() + corner.tobytes() + self.held.tobytes()
 
 
 class ContactPair:
@@ -175,7 +144,7 @@ class ContactPair:
         self.free = free
         none = np.full(n, -1, dtype=np.int64)
         self.committed = PairState(
-            np.zeros(n, bool), np.zeros(n), np.zeros((n, config.gdim)), none, none, none, np.zeros(n, np.int64)
+            np.zeros(n, bool), np.zeros(n), np.zeros((n, config.gdim)), none, np.full((n, config.gdim - 1), -1), np.zeros(n, np.int64)
         )
         self.trial = self.last_commit = self.committed
         self.projection: Projection
@@ -184,7 +153,9 @@ class ContactPair:
         self._united: Ints = none
         self._reserved: Bools = np.zeros(n, dtype=bool)
         self._anchor: Projection | None = None
+        self._nearest: Projection
         self._corners: Corners | None = None
+        self._left: Bools = np.zeros(n, dtype=bool)
 
     # -- projection ------------------------------------------------------------------------------------------------
 
@@ -196,7 +167,8 @@ class ContactPair:
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective)."""
         if self.sliding == "finite":
-            self.projection = self._in_corners(self.target.project(self.points))
+            self._nearest = self.target.project(self.points)
+            self.projection = self._in_corners(self._nearest)
         elif self._anchor is None:
             self._anchor = self.projection = self.target.project(self.points)
         else:
@@ -207,65 +179,42 @@ class ContactPair:
         """Whether facet normals jump under the contactors at all."""
         return self.sliding == "finite" and isinstance(self.target, MeshTarget) and not self.target.averaged
 
-    def _in_corners(self, projection: Projection) -> Projection:
-        """Replace the nearest facet by the held corner, or by averaged normals, where a contactor chatters."""
+    def _in_corners(self, nearest: Projection) -> Projection:
+        """Replace the nearest facet by the corner that holds a contactor, or its normal by the averaged one (collective)."""
         if not self._has_corners:
-            return projection
-        assert isinstance(projection, FacetProjection)
-        state = self.trial
-        locked = state.flips >= MOST_FLIPS
-        gap = np.einsum("ng,ng->n", projection.averaged, self.points - projection.foot)
-        normal = np.where(locked[:, None], projection.averaged, projection.normal)
-        projection = replace(projection, normal=normal, gap=np.where(locked, gap, projection.gap))
-        # a corner is left when another facet has become the nearest
-        near = (projection.facet == state.facet) | (projection.facet == state.held)
-        held = np.where((state.held >= 0) & near, state.held, -1)
-        self.trial = replace(state, held=held)
-        self._corners = self._corner(np.flatnonzero(held >= 0), held)
+            return nearest
+        assert isinstance(nearest, FacetProjection)
+        locked = self.trial.changes >= MOST_CHANGES
+        gap = np.einsum("ng,ng->n", nearest.averaged, self.points - nearest.foot)
+        normal = np.where(locked[:, None], nearest.averaged, nearest.normal)
+        projection = replace(nearest, normal=normal, gap=np.where(locked, gap, nearest.gap))
+        held = np.flatnonzero((self.trial.held >= 0).any(axis=1))
+        self._corners = self._corners_of(held, self.trial.held[held])
         if self._corners is None:
             return projection
         c = self._corners
-        updates: dict[str, npt.NDArray[np.generic]] = {}
-        values = {
-            "normal": c.axes[:, 0], "nodes": c.nodes, "weights": c.weights, "foot": c.foot, "facet": state.facet[c.which],
-            "gap": np.einsum("kg,kg->k", c.axes[:, 0], self.points[c.which] - c.foot),
-        }
-        for field, value in values.items():
-            full = np.array(getattr(projection, field))
-            full[c.which] = value
-            updates[field] = full
-        return replace(projection, **updates)
+        at_corner = {"normal": c.axes[:, 0], "gap": c.gaps(self.points[held])[:, 0], "facet": self.trial.facet[held]}
+        return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0})
 
-    def _corner(self, which: Ints, other: Ints) -> Corners | None:
-        """Geometry of the corners between ``facet`` and ``other`` at some contactors; None if no rank has any."""
-        if not self.config.comm.allreduce(len(which)):
-            return None
+    def _corners_of(self, which: Ints, others: Ints) -> Corners | None:
+        """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
         assert isinstance(self.target, MeshTarget)
-        points = self.points[which]
-        first = self.target.project_on(points, self.trial.facet[which])
-        second = self.target.project_on(points, other[which])
-        k, nn = first.weights.shape
-        d = self.target.shape.dim - 1
-        weights, foot, shared = np.zeros((k, nn)), np.zeros_like(points), np.zeros(k, bool)
-        dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
-        common = (first.nodes[:, :, None] == second.nodes[:, None, :]).any(axis=2)
-        for side, nodes, _, _ in self.target.shape.edges():
-            i = np.flatnonzero(common[:, nodes].all(axis=1) & ~shared)
-            x = first.x[i][:, nodes]
-            s, _ = closest_point(side, x, points[i])
-            tab = side.tabulate(s)
-            weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
-            foot[i] = np.einsum("ka,kag->kg", tab.N, x)
-            shared[i] = True
-        normals = np.stack([self.target.outward(first), self.target.outward(second)], axis=1)
-        arm = second.x.mean(axis=1) - foot
-        rising = np.einsum("kg,kg->k", arm, normals[:, 0]) / np.linalg.norm(arm, axis=1)
-        return Corners(which, normals, rising, shared, first.nodes, weights, foot, first.x, dN, ddN)
+        facets = np.column_stack([self.trial.facet[which], others])
+        return find_corners(self.config.comm, self.target, self.points[which], which, facets)
 
     def refresh_corners(self) -> None:
-        """Project again after contactors have entered or left corners (collective)."""
-        if self._has_corners:
-            self.project()
+        """Put contactors that have entered or left a corner where they now belong (collective)."""
+        if not self._has_corners:
+            return
+        assert isinstance(self._nearest, FacetProjection) and isinstance(self.target, MeshTarget)
+        # one that has just left is still as near to the facet it left
+        left = np.flatnonzero(self._left & (self.trial.held < 0).all(axis=1))
+        if self.config.comm.allreduce(len(left)):
+            own = self.target.project_on(self.points[left], self.trial.facet[left])
+            own = replace(own, normal=self.target.outward(own))
+            own = replace(own, gap=np.einsum("ng,ng->n", own.normal, self.points[left] - own.foot))
+            self._nearest = self._nearest.with_rows(left, {f.name: getattr(own, f.name) for f in fields(own)})
+        self.projection = self._in_corners(self._nearest)
 
     def return_to_target(self, stiffness: Array) -> None:
         """Normal return [UEM, 4.2]: put the active contactors back onto the moved target.
@@ -282,8 +231,10 @@ class ContactPair:
             c = self._corners
             at = np.zeros((len(self.nodes), self.config.gdim))
             at[i] = correction
-            gap = np.einsum("kg,kg->k", c.axes[:, 1], self.points[c.which] - c.foot)
-            at[c.which] += self.trial.active[c.which, None] * self._along(c.axes[:, 1], gap, self.free[c.which])
+            gaps = c.gaps(self.points[c.which])
+            for r in range(1, self.config.gdim):
+                here = self.trial.active[c.which] & (r < c.count)
+                at[c.which] += here[:, None] * self._along(c.axes[:, r], gaps[:, r], self.free[c.which])
             correction = at[i]
         disturbance = np.abs(stiffness[self.nodes[i]] * correction).max(axis=1)
         correction[disturbance > GENTLE * max(self.config.comm.allgather(self.trial.lam.max(initial=0.0)))] = 0.0
@@ -401,46 +352,62 @@ class ContactPair:
         changed = bool(enter.any() or release.any())
         if self._has_corners:
             changed |= self._leave_corners()
-            changed |= self._enter_corners()
+            changed |= self._change_facets()
         return bool(comm.allreduce(changed))
 
     def _leave_corners(self) -> bool:
         """Let go of the facet of a corner that would have to pull."""
-        c = self._corners
+        self._left = np.zeros(len(self.nodes), dtype=bool)
+        c, state = self._corners, self.trial
         if c is None or not len(c.which):
             return False
-        i, state = c.which, self.trial
-        pull = np.einsum("kgr,kg->kr", np.linalg.pinv(c.normals), state.force[i])
-        leaving = ~state.active[i] | (pull < 0).any(axis=1)
+        i = c.which
+        pulls = c.pulls(state.force[i])
+        leaving = (pulls < 0).any(axis=1) | ~state.active[i]
+        facets = np.column_stack([state.facet[i], state.held[i]])
+        rows = np.flatnonzero(leaving)
+        facets[rows, np.argmin(pulls[rows], axis=1)] = -1
+        # the facets that stay move up
+        facets = np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)
         facet, held = state.facet.copy(), state.held.copy()
-        to_second = leaving & (pull[:, 0] < pull[:, 1])
-        facet[i[to_second]] = held[i[to_second]]
-        held[i[leaving]] = -1
+        facet[i], held[i] = facets[:, 0], facets[:, 1:]
+        held[~state.active] = -1
+        self._left[i[leaving]] = True
         self.trial = replace(state, facet=facet, held=held)
         return bool(leaving.any())
 
-    def _enter_corners(self) -> bool:
-        """Notice contactors that flip between two facets, and hold those in a concave corner by both (collective)."""
-        state, facet = self.trial, self.projection.facet
-        free = state.held < 0
-        moved = free & (facet != state.facet) & (state.facet >= 0)
-        back = moved & state.active & (facet == state.before)
-        other = state.facet
-        self.trial = state = replace(
-            state, facet=np.where(free, facet, state.facet), before=np.where(moved, state.facet, state.before)
-        )
-        c = self._corner(np.flatnonzero(back), other)
-        if c is None:
-            return False
-        bent = np.abs(c.rising) > ON_PLANE
-        hold = bent & c.shared & (c.rising > 0) & (state.flips[c.which] < MOST_FLIPS)
-        flips, held = state.flips.copy(), state.held.copy()
-        flips[c.which[bent]] += 1
-        # what is no concave corner can only be calmed by a continuous normal
-        flips[c.which[bent & ~hold]] = MOST_FLIPS
-        held[c.which[hold]] = other[c.which[hold]]
-        self.trial = replace(state, flips=flips, held=held)
-        return bool(bent.any())
+    def _change_facets(self) -> bool:
+        """Follow contactors onto new facets; into a concave corner they take the old facet with them (collective)."""
+        state = self.trial
+        nearest = self._nearest.facet
+        known = (state.facet == nearest) | (state.held == nearest[:, None]).any(axis=1) | (state.facet < 0)
+        moved = ~known & state.active & ~self._left & (state.changes < MOST_CHANGES)
+        i = np.flatnonzero(moved)
+        facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
+        settled = ~moved & ~self._left & (held < 0).all(axis=1)
+        facet[settled] = nearest[settled]
+        # first together with all facets that it is on, then with the first of them alone
+        together = np.column_stack([state.held[i], nearest[i]])
+        full = (state.held[i] >= 0).all(axis=1)
+        together = np.take_along_axis(together, np.argsort(together < 0, axis=1, kind="stable"), axis=1)[:, : held.shape[1]]
+        alone = np.full_like(together, -1)
+        alone[:, 0] = nearest[i]
+        taken = np.zeros(len(i), dtype=bool)
+        bent = False
+        for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)):
+            ask = np.flatnonzero(allowed & ~taken)
+            c = self._corners_of(i[ask], others[ask])
+            if c is None:
+                continue
+            hold = c.concave & (state.changes[c.which] >= HOLD_AFTER)
+            held[c.which[hold]] = others[ask[hold]]
+            taken[ask[hold]] = True
+            changes[c.which[~c.flat]] += 1
+            bent |= bool(hold.any())
+        switch = i[~taken]
+        facet[switch], held[switch] = nearest[switch], -1
+        self.trial = replace(state, facet=facet, held=held, changes=changes)
+        return bent
 
     # -- what the united system gets ---------------------------------------------------------------------------------
 
@@ -453,10 +420,13 @@ class ContactPair:
         c = self._corners
         if c is None:
             return first
-        self.n_equations += len(c.which)
-        gap = np.einsum("kg,kg->k", c.axes[:, 1], self.points[c.which] - c.foot)
-        second = UnitingEquations(self.nodes[c.which], c.axes[:, 1], c.nodes, c.weights, gap, active[c.which])
-        return UnitingEquations.join([first, second], self.config.gdim)
+        parts, gaps = [first], c.gaps(self.points[c.which])
+        for r in range(1, self.config.gdim):
+            j = np.flatnonzero(r < c.count)
+            w = c.which[j]
+            parts.append(UnitingEquations(self.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], active[w]))
+        self.n_equations = sum(len(part) for part in parts)
+        return UnitingEquations.join(parts, self.config.gdim)
 
     def _near(self) -> Bools:
         """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks."""
@@ -476,32 +446,30 @@ class ContactPair:
         force = full[:, None] * self.projection.normal
         c = self._corners
         if c is not None:
-            force[c.which] += lam[len(i) :, None] * c.axes[:, 1]
+            start = len(i)
+            for r in range(1, self.config.gdim):
+                j = np.flatnonzero(r < c.count)
+                force[c.which[j]] += lam[start : start + len(j), None] * c.axes[j, r]
+                start += len(j)
         self.trial = replace(self.trial, lam=full, force=force)
 
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
         state, p, c = self.trial, self.projection, self._corners
-        i = np.flatnonzero(state.active & (state.lam > 0) & (state.held < 0))
-        if self.sliding != "finite":
-            i = i[:0]
+        plain = state.active & (state.lam > 0) & (state.held < 0).all(axis=1)
+        i = np.flatnonzero(plain) if self.sliding == "finite" else np.zeros(0, np.int64)
         own, followed, blocks = self.nodes[i], p.nodes[i], -state.lam[i, None, None] * p.hessians(i)
-        if c is not None and c.dN.shape[2]:
-            # on a side the force may lean either way; it is the force's direction that stays
-            j = np.flatnonzero(state.active[c.which])
-            w = c.which[j]
-            size = np.linalg.norm(state.force[w], axis=1)
-            n = state.force[w] / np.where(size > 0, size, 1.0)[:, None]
-            H = gap_hessians(n, np.zeros(len(j)), c.weights[j], c.dN[j], c.ddN[j], c.x[j], np.zeros((len(j), 1, n.shape[1])))
-            own, followed = np.concatenate([own, self.nodes[w]]), np.concatenate([followed, c.nodes[j]])
-            blocks = np.concatenate([blocks, -size[:, None, None] * H])
+        if c is not None:
+            own = np.concatenate([own, self.nodes[c.which]])
+            followed = np.concatenate([followed, c.nodes])
+            blocks = np.concatenate([blocks, -c.hessians(state.force[c.which])])
         return np.column_stack([self.config.to_global(own), followed]), blocks
 
     # -- trial and committed -----------------------------------------------------------------------------------------
 
     def commit(self) -> None:
         """Make the trial state the committed one."""
-        self.last_commit, self.committed = self.committed, replace(self.trial, flips=np.zeros_like(self.trial.flips))
+        self.last_commit, self.committed = self.committed, replace(self.trial, changes=np.zeros_like(self.trial.changes))
         self.trial = self.committed
         self._corners = None
         if self.sliding == "small":

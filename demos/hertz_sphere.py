@@ -1,0 +1,123 @@
+"""Hertzian contact of two elastic bodies in 3D: a half sphere pressed onto a block, CG with algebraic multigrid.
+
+    mpirun -n 2 python3 demos/hertz_sphere.py --plot sphere.png
+"""
+
+# %% [markdown]
+# # A half sphere on a block
+#
+# A half sphere of radius R = 1 is pressed by d into a block of the same material. A quarter of both is modelled with tetrahedra;
+# the flat top of the half sphere moves down by d, the block's bottom stays at its height. Hertz, for half-spaces that approach
+# each other by d, has
+#
+#     a = sqrt(R d),    F = 4/3 E* sqrt(R) d^(3/2),    p0 = 3 F / (2 pi a^2),    1/E* = 2 (1 - nu^2) / E.
+#
+# The displacements around a contact fade like 1/r only, so a finite body is stiffer than a half-space, by a part of the order of
+# a/R. The sphere here is 200 contact radii large, which leaves about 0.3 % of it in the force; the error of the mesh is larger, and
+# falls as the mesh is refined. Graded meshes make such a range of sizes cheap.
+
+# %%
+import time
+
+import common
+import numpy as np
+import ufl
+from common import comm, dirichlet
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+args = common.arguments(
+    __doc__, h=0.0005, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=1, d=2.5e-5, refinements=3
+)
+E, nu, R = 1e6, 0.3, 1.0
+E_star, a = E / (2 * (1 - nu**2)), np.sqrt(R * args.d)
+F_hertz = 4 / 3 * E_star * np.sqrt(R) * args.d**1.5
+OPTIONS = {"ksp_type": "cg", "ksp_rtol": 1e-10, "pc_type": "hypre" if compat.has_hypre() else "gamg"}
+if compat.has_hypre():
+    OPTIONS |= {"pc_hypre_type": "boomeramg", "pc_hypre_boomeramg_strong_threshold": 0.5}
+
+
+# %% [markdown]
+# ## One scene
+# `h` is the size of the cells under the contact; with the distance from there they grow in proportion.
+
+# %%
+def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
+    """Press the bodies together on a mesh of size h: the problem and the figures measured."""
+    mesh, tags = uem.read_gmsh(
+        common.MESHES / "hertz_sphere.geo", comm, gdim=3,
+        parameters={"h": h, "ratio": args.ratio, "R": R, "W": 2 * R, "zone": 1.4 * a, "growth": 0.8 / a},
+    )  # fmt: skip
+    V = compat.function_space(mesh, args.degree, (3,))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    residual = uem.LinearElastic(E, nu).residual(u, v) * ufl.dx
+    bcs = [
+        dirichlet(V, tags["symmetry_x"], 0, 0.0),
+        dirichlet(V, tags["symmetry_y"], 1, 0.0),
+        dirichlet(V, tags["block_bottom"], 2, 0.0),
+        dirichlet(V, tags["sphere_top"], 2, -args.d),
+    ]
+    contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], normals=args.normals)
+    problem = uem.UnitedProblem(
+        residual, u, bcs=bcs, contacts=[contact], petsc_options_prefix="sphere_", petsc_options=OPTIONS, verbose=args.verbose
+    )
+    start = time.perf_counter()
+    steps = list(uem.load_steps(problem, args.steps))
+    seconds = time.perf_counter() - start
+
+    P = float(4 * contact.resultant().force[2])
+    cap, balance = compat.surface_measure(mesh, tags["sphere_cap"].entities), contact.balance()
+    area = 4 * compat.assemble_scalar(compat.form(contact.active * cap), comm)
+    return problem, {
+        "h": h,
+        "P": P,
+        "error": P / F_hertz - 1,
+        "a": float(np.sqrt(area / np.pi)),
+        "p0_hertz": float(1.5 * P / (np.pi * a**2)),
+        "p_max": contact.max_pressure(),
+        "newton_iterations": sum(step.newton_iterations for step in steps),
+        "linear_iterations": sum(i.linear_iterations for step in steps for i in step.iterations),
+        "steps": len(steps),
+        "max_gap": contact.max_gap(),
+        "force_imbalance": max(balance.force, balance.moment),
+        "order": common.order(steps[-1]),
+        "active": contact.n_active,
+        "dofs": 3 * V.dofmap.index_map.size_global,
+        "seconds": seconds,
+    }
+
+
+# %% [markdown]
+# ## Three meshes
+# The last one has the size asked for, every one before it twice the size of the next.
+
+# %%
+rows = []
+for k in reversed(range(args.refinements)):
+    problem, figures = solve(args.h * 2**k)
+    rows.append(figures)
+common.report(args, {"P_hertz": float(F_hertz), "a_hertz": float(a), **rows[-1], "meshes": rows})
+
+# %% [markdown]
+# ## The picture
+
+# %%
+if args.output:
+    with uem.ResultsWriter(f"{args.output}/hertz_sphere", problem) as writer:
+        writer.write(1.0)
+if args.plot:
+    p0 = 1.5 * F_hertz / (np.pi * a**2)
+    with uem.figure(args.plot, comm, panels=2) as (left, right):
+        if left is not None:
+            left.loglog([a / r["h"] for r in rows], [abs(r["error"]) for r in rows], "o-")
+            left.set_xlabel("cells per contact radius")
+            left.set_ylabel("error of the force against Hertz")
+            left.grid(alpha=0.25, which="both")
+        uem.plot_pressure(problem.contacts, right, window=(0.0, 1.3 * a), reference_label="Hertz",
+                          reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)))  # fmt: skip
+
+# %%
+errors = [abs(r["error"]) for r in rows]
+assert all(finer < coarser for coarser, finer in zip(errors, errors[1:])), errors
