@@ -111,10 +111,14 @@ if args.plot:
     p0 = 1.5 * F_hertz / (np.pi * a**2)
     with uem.figure(args.plot, comm, panels=2) as (left, right):
         if left is not None:
-            left.loglog([a / r["h"] for r in rows], [abs(r["error"]) for r in rows], "o-")
+            cells, percent = [a / r["h"] for r in rows], [100 * abs(r["error"]) for r in rows]
+            left.loglog(cells, percent, "o-")
+            left.set_xticks(cells, [f"{n:g}" for n in cells])
+            left.set_yticks(percent, [f"{e:.2g} %" for e in percent])
+            left.minorticks_off()
             left.set_xlabel("cells per contact radius")
             left.set_ylabel("error of the force against Hertz")
-            left.grid(alpha=0.25, which="both")
+            left.grid(alpha=0.25)
         uem.plot_pressure(problem.contacts, right, window=(0.0, 1.3 * a), reference_label="Hertz",
                           reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)))  # fmt: skip
 

@@ -23,4 +23,5 @@ from uem_dolfinx.errors import (
 )
 from uem_dolfinx.mesh import Tag, read_gmsh
 from uem_dolfinx.problem import LoadStep, UnitedProblem, load_steps
+from uem_dolfinx.results import HistoryWriter, ResultsWriter, figure, plot_pressure, plot_scene
 from uem_dolfinx.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface

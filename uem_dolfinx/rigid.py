@@ -74,8 +74,9 @@ class RigidSurface:
         n, g = points.shape
         slope = np.asarray(self.gradient(points), dtype=float).reshape(n, g)
         length = np.linalg.norm(slope, axis=1)
-        normal = slope / length[:, None]
-        gap = np.asarray(self.distance(points), dtype=float).reshape(n) / length
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normal = slope / length[:, None]
+            gap = np.asarray(self.distance(points), dtype=float).reshape(n) / length
         return RigidProjection(
             gap, normal, np.zeros((n, 0), np.int64), np.zeros((n, 0)), np.zeros(n, np.int64), np.zeros((n, g)), points.copy(),
             self._bend(points, normal, length),

@@ -15,7 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
-from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.errors import NotFiniteError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
@@ -125,8 +125,8 @@ class BodySystem:
         targets = [pair.target.facets for pair in pairs if isinstance(pair.target, MeshTarget)]
         followed = followed_nodes(self.config, targets) if targets else np.zeros(self.config.n_local, bool)
         self.stacked = any(self.comm.allgather(any(followed[pair.nodes].any() for pair in pairs)))
+        self.place(returning=False)
         for pair in pairs:
-            pair.project()
             pair.check_initial()
             pair.touch()
 
@@ -143,6 +143,8 @@ class BodySystem:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
         if not self.pairs:
             return
+        if not np.isfinite(self._u.norm()):
+            raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
         with timed("search and projection"):
             for pair in self.pairs:
                 pair.project()

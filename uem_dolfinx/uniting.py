@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.corners import Corners, find_corners
-from uem_dolfinx.errors import ConflictError, PenetrationError, agree
+from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, agree
 from uem_dolfinx.restriction import MOSTLY_PRESCRIBED
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
@@ -173,6 +173,23 @@ class ContactPair:
             self._anchor = self.projection = self.target.project(self.points)
         else:
             self.projection = self.target.follow(self.points, self._anchor)
+        self.check_finite()
+
+    def check_finite(self) -> None:
+        """Refuse a projection that is not finite, which a rigid surface's functions may return (collective).
+
+        Raises:
+            NotFiniteError: naming the first such contactor.
+        """
+        p = self.projection
+        bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
+        error = None
+        if len(bad):
+            error = NotFiniteError(
+                f"{self.name}: gap {p.gap[bad[0]]}, normal {p.normal[bad[0]]} at {self.config.describe(int(self.nodes[bad[0]]))}: "
+                "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
+            )
+        agree(self.config.comm, error)
 
     @property
     def _has_corners(self) -> bool:

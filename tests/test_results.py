@@ -1,0 +1,147 @@
+"""Files and pictures of a solved scene: what is in them, and that every number of ranks writes the same.
+
+Read ``test_history_is_what_the_contacts_say`` and ``test_nodal_average_is_taken_in_each_body`` first.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from mpi4py import MPI
+
+import helpers
+import numpy as np
+import pytest
+import ufl
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, results
+
+comm = MPI.COMM_WORLD
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that all ranks share, gone after the test."""
+    keep = tempfile.TemporaryDirectory() if comm.rank == 0 else None
+    yield Path(comm.bcast(keep.name if keep else None))
+    comm.barrier()
+    if keep:
+        keep.cleanup()
+
+
+def pressed(cell: str, degree: int = 1, names: tuple[str, ...] = ("pair",)) -> uem.UnitedProblem:
+    """Two blocks pushed together by 0.1, with as many copies of their contact as there are names, all but the first asleep."""
+    b = helpers.blocks(comm, cell, degree=degree)
+    contacts = [uem.Contact(b.high, b.low, name=names[0])]
+    contacts += [uem.Contact(b.high, uem.RigidPlane([0.0] * (b.gdim - 1) + [-9.0], np.eye(b.gdim)[-1]), name=n) for n in names[1:]]
+    return uem.UnitedProblem(helpers.linear(b.u, 1.0), b.u, bcs=b.oedometer(0.1), contacts=contacts)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """A CSV file as rank 0 reads it, on every rank."""
+    return comm.bcast(list(csv.DictReader(path.open())) if comm.rank == 0 else None)
+
+
+@pytest.mark.parametrize("cell", helpers.CELLS)
+def test_history_is_what_the_contacts_say(folder: Path, cell: str) -> None:
+    problem = pressed(cell)
+    contact, g = problem.contacts[0], problem.config.gdim
+    with uem.HistoryWriter(folder / "new" / "history.csv", problem) as history:
+        for step in uem.load_steps(problem, 2):
+            history.write(step)
+        history.write(1.0)
+    table = rows(folder / "new" / "history.csv")
+    assert [float(r["factor"]) for r in table] == [0.5, 1.0, 1.0]
+    assert [bool(r["newton_iterations"]) for r in table] == [True, True, False]
+    last, resultant = table[1], contact.resultant()
+    np.testing.assert_allclose([float(last[f"force_{a}"]) for a in "xyz"[:g]], resultant.force, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose([float(last[f"moment_{a}"]) for a in ("z" if g == 2 else "xyz")], resultant.moment, rtol=1e-11, atol=1e-14)
+    assert int(last["active"]) == contact.n_active > 0
+    assert float(last["max_gap"]) < 1e-12
+    # half the settlement, half the force
+    up = f"force_{'xyz'[g - 1]}"
+    assert float(table[0][up]) == pytest.approx(0.5 * float(table[1][up]), rel=1e-8)
+
+
+def test_columns_name_the_contacts_where_there_are_several(folder: Path) -> None:
+    problem = pressed("triangle", names=("left pad", "wall", "wall"))
+    with uem.HistoryWriter(folder / "history.csv", problem) as history:
+        history.write(0.0)
+    assert {"active_left_pad", "force_y_wall_1", "moment_z_wall_2"} <= set(rows(folder / "history.csv")[0])
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_files_for_paraview(folder: Path, cell: str, degree: int) -> None:
+    problem = pressed(cell, degree)
+    strain = ufl.sym(ufl.grad(problem.u))
+    with uem.ResultsWriter(folder / "out" / "blocks", problem, fields={"strain": strain, "trace": ufl.tr(strain)}) as writer:
+        for step in uem.load_steps(problem, 2):
+            writer.write(step)
+    comm.barrier()
+    text = (folder / "out" / "blocks.xdmf").read_text()
+    for name in ("displacement", "contact_pressure", "gap", "active", "contact_force", "strain", "trace"):
+        assert text.count(f'Name="{name}"') >= 1, name
+    assert 'Value="0.5"' in text and 'Value="1"' in text
+    assert len(rows(folder / "out" / "blocks.csv")) == 2
+    for kind in ("vectors", "scalars"):
+        assert (folder / "out" / f"blocks_{kind}.bp").exists() == compat.has_vtx()
+
+
+@pytest.mark.skipif(compat.has_vtx(), reason="this DOLFINx has ADIOS2")
+def test_vtx_where_there_is_none_is_a_named_error(folder: Path) -> None:
+    with pytest.raises(uem.MissingBackendError, match="ADIOS2"):
+        uem.ResultsWriter(folder / "blocks", pressed("triangle"), vtx=True)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_pictures(folder: Path, cell: str) -> None:
+    pytest.importorskip("matplotlib")
+    problem = pressed(cell, names=("pair", "asleep"))
+    for _ in uem.load_steps(problem):
+        pass
+    uem.plot_scene(problem, folder / "scene.png")
+    uem.plot_pressure(problem.contacts, folder / "pressure.png", reference=lambda s: 0 * s + 0.1)
+    with uem.figure(folder / "new" / "both.png", comm, panels=2) as (left, right):
+        assert (left is not None) == (comm.rank == 0)
+        uem.plot_scene(
+            problem, left, field=ufl.div(problem.u), label="dilation", levels=[-0.2, -0.1, 0.0], window=(-1, 1, -0.5, 0.5), mirror=True
+        )
+        uem.plot_pressure(problem.contacts[0], right, mirror=True, along=lambda x: x[:, 0], window=(-1.0, 1.0))
+    comm.barrier()
+    for name in ("scene.png", "pressure.png", "new/both.png"):
+        assert (folder / name).stat().st_size > 5000
+    with uem.figure(None, comm) as (panel,):
+        assert panel is None
+
+
+def test_pictures_leave_the_backend_of_matplotlib_alone(folder: Path) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("svg")
+    uem.plot_pressure(pressed("triangle").contacts, folder / "pressure.png")
+    assert matplotlib.get_backend().lower() == "svg"
+
+
+def test_no_matplotlib_is_a_named_error_on_every_rank(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(uem.MissingBackendError, match="matplotlib"):
+        uem.plot_scene(pressed("triangle"), folder / "scene.png")
+
+
+def test_scenes_in_3d_are_sent_to_paraview() -> None:
+    with pytest.raises(ValueError, match="ParaView"):
+        uem.plot_scene(pressed("hexahedron"), "scene.png")
+
+
+@pytest.mark.parametrize("cell", helpers.CELLS)
+def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
+    b = helpers.blocks(comm, cell)
+    E = helpers.modulus(b.scene, 3.0, 7.0)
+    S = compat.function_space(b.scene.mesh, 1)
+    values, cells = results.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
+    np.testing.assert_allclose(values[cells], np.where(b.scene.body == 0, 3.0, 7.0)[:, None] * np.ones(cells.shape[1]))
