@@ -21,6 +21,7 @@ from uem_dolfinx.errors import (
     TagError,
     UEMError,
 )
+from uem_dolfinx.materials import LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.mesh import Tag, read_gmsh
 from uem_dolfinx.problem import LoadStep, UnitedProblem, load_steps
 from uem_dolfinx.results import HistoryWriter, ResultsWriter, figure, plot_pressure, plot_scene

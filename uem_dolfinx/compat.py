@@ -16,6 +16,7 @@ import numpy as np
 from petsc4py import PETSc
 
 import basix
+import dolfinx.common
 import dolfinx.fem.petsc
 import ufl
 from dolfinx import cpp, fem, io, la, mesh
@@ -509,6 +510,25 @@ def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
             f"VTX output of {path} needs ADIOS2, which DOLFINx {dolfinx.__version__} was built without; write XDMF instead."
         )
     return io.VTXWriter(comm, str(path), list(functions))
+
+
+# ---------------------------------------------------------------------------------------------- timers
+
+
+def timing(task: str) -> float:
+    """Wall time that DOLFINx's timers have counted for a task on this rank so far.
+
+    Args:
+        task: name of the timer.
+
+    Returns:
+        Seconds, 0 for a task that was never timed.
+    """
+    try:
+        elapsed = dolfinx.common.timing(task)[1]
+    except RuntimeError:
+        return 0.0
+    return float(elapsed.total_seconds() if hasattr(elapsed, "total_seconds") else elapsed)
 
 
 # ---------------------------------------------------------------------------------------------- Gmsh

@@ -38,12 +38,8 @@ def timed(stage: str) -> Iterator[None]:
     Args:
         stage: what is done inside, e.g. ``"search"``.
     """
-    timer = Timer(f"~UEM: {stage}")
-    timer.start()
-    try:
+    with Timer(f"~UEM: {stage}"):
         yield
-    finally:
-        timer.stop()
 
 
 def progress(items: Iterable[T], description: str = "", total: int | None = None) -> Iterable[T]:

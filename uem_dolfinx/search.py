@@ -269,7 +269,9 @@ class MeshTarget:
         bend[~use_average] = 0.0
         gap = np.einsum("ng,ng->n", normal, points - foot)
         beyond = points - foot - gap[:, None] * normal
-        beyond[~(on_side & is_open).any(axis=1)] = 0.0
+        # a facet may touch the surface's end with a vertex alone
+        at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
+        beyond[~at_end] = 0.0
         return FacetProjection(
             gap, normal, data.nodes[facet], tab.N, facet + self.first[self.comm.rank], beyond,
             xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend,

@@ -5,6 +5,7 @@ Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_optio
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.log import timed
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from uem_dolfinx.restriction import Restriction
     from uem_dolfinx.surfaces import Configuration
 
@@ -75,17 +78,25 @@ class UnitedSolver:
         check_options(self.options)
         self.ksp = PETSc.KSP().create(config.comm)
         self.ksp.setOptionsPrefix(prefix)
-        database = PETSc.Options()
         self.ksp.setErrorIfNotConverged(False)
-        for key, value in self.options.items():
-            database[prefix + key] = value
-        self.ksp.setFromOptions()
-        for key in self.options:
-            del database[prefix + key]
+        with self._in_database():
+            self.ksp.setFromOptions()
         self._key: object = None
         self._P: PETSc.Mat | None = None
         self.A: PETSc.Mat | None = None
         self._modes: list[Array] | None = None
+
+    @contextmanager
+    def _in_database(self) -> Iterator[None]:
+        """Show PETSc the options; levels of a multigrid read theirs only when they are set up."""
+        database, prefix = PETSc.Options(), self.ksp.getOptionsPrefix()
+        for key, value in self.options.items():
+            database[prefix + key] = value
+        try:
+            yield
+        finally:
+            for key in self.options:
+                del database[prefix + key]
 
     @property
     def needs_near_null_space(self) -> bool:
@@ -154,7 +165,7 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         dq = rhs.duplicate()
-        with timed("linear solve"):
+        with timed("linear solve"), self._in_database():
             try:
                 self.ksp.solve(rhs, dq)
             except PETSc.Error as error:

@@ -57,7 +57,11 @@ class Configuration:
         self.index_map = V.dofmap.index_map
         self.n_owned: int = self.index_map.size_local
         self.n_local: int = self.n_owned + self.index_map.num_ghosts
-        self.X: Array = np.array(V.tabulate_dof_coordinates()[: self.n_local, : self.gdim])
+        # every rank takes a node's position from its owner, to the last bit
+        X = fem.Function(V)
+        X.x.array[:] = V.tabulate_dof_coordinates()[: self.n_local, : self.gdim].ravel()
+        X.x.scatter_forward()
+        self.X: Array = np.array(X.x.array.reshape(-1, self.gdim))
 
     @property
     def displacement(self) -> Array:
@@ -160,6 +164,7 @@ class TargetFacets:
         self._refuse_inner()
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
+        self.open_nodes = self._open_nodes()
 
     def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
@@ -189,6 +194,15 @@ class TargetFacets:
         sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
         keys = np.stack(sides, axis=1).reshape(-1, corners)
         return (count_keys(self.config.comm, keys) == 1).reshape(len(self.nodes), len(sides))
+
+    def _open_nodes(self) -> npt.NDArray[np.bool_]:
+        """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""
+        mark = fem.Function(self.config.V)
+        marks = mark.x.array.reshape(-1, self.config.gdim)
+        for s, (_, nodes, _, _) in enumerate(self.shape.edges()):
+            marks[self.dofs[self.open_sides[:, s]][:, nodes].ravel()] = 1.0
+        compat.sum_ghosts(mark)
+        return marks[self.dofs, 0] > 0
 
     @cached_property
     def _normal_field(self) -> fem.Function:

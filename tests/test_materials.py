@@ -1,0 +1,99 @@
+"""Elastic laws: closed forms of uniaxial states, stress as derivative of the energy, indifference to rotation.
+
+Worth reading first: ``test_stress_is_derivative_of_energy`` and ``test_uniaxial_stress``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem, mesh
+from mpi4py import MPI
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+LAWS = [uem.LinearElastic, uem.StVenantKirchhoff, uem.NeoHooke]
+FINITE = LAWS[1:]
+E, NU = 7.0, 0.3
+
+
+def displacement(gradient: np.ndarray) -> fem.Function:
+    """Homogeneous displacement on a unit square or cube."""
+    gdim = len(gradient)
+    domain = (
+        mesh.create_unit_square(MPI.COMM_SELF, 1, 1) if gdim == 2 else mesh.create_unit_cube(MPI.COMM_SELF, 1, 1, 1)
+    )
+    u = fem.Function(compat.function_space(domain, 1, (gdim,)))
+    X = u.function_space.tabulate_dof_coordinates()[:, :gdim]
+    u.x.array[:] = (X @ gradient.T).ravel()
+    return u
+
+
+def value(expression, u: fem.Function) -> float:
+    return compat.assemble_scalar(compat.form(expression * ufl.dx(domain=u.function_space.mesh)), MPI.COMM_SELF)
+
+
+def matrix(expression, u: fem.Function) -> np.ndarray:
+    n = len(u)
+    return np.array([[value(expression[i, j], u) for j in range(n)] for i in range(n)])
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("kind", ["3d", "plane_strain", "plane_stress"])
+def test_stress_is_derivative_of_energy(law, kind):
+    gdim = 3 if kind == "3d" else 2
+    G = 0.2 * np.random.default_rng(1).standard_normal((gdim, gdim))
+    material, h = law(E, NU, kind), 1e-5
+    P = matrix(material.first_piola(u := displacement(G)), u)
+    for i in range(gdim):
+        for j in range(gdim):
+            D = np.zeros_like(G)
+            D[i, j] = h
+            plus, minus = displacement(G + D), displacement(G - D)
+            slope = (value(material.energy(plus), plus) - value(material.energy(minus), minus)) / (2 * h)
+            assert slope == pytest.approx(P[i, j], abs=1e-7 * E)
+
+
+@pytest.mark.parametrize("law", FINITE)
+@pytest.mark.parametrize("kind", ["3d", "plane_strain", "plane_stress"])
+def test_rigid_rotation_is_free_of_stress(law, kind):
+    a = 0.7
+    R = np.eye(3 if kind == "3d" else 2)
+    R[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    u = displacement(R - np.eye(len(R)))
+    assert np.abs(matrix(law(E, NU, kind).first_piola(u), u)).max() < 1e-13 * E
+
+
+@pytest.mark.parametrize("kind, modulus", [("plane_stress", E), ("plane_strain", E / (1 - NU**2)), ("3d", E)])
+@pytest.mark.parametrize("law", LAWS)
+def test_uniaxial_stress(law, kind, modulus):
+    """Every law begins with Young's modulus of its kind."""
+    e = 1e-6
+    across = -NU / (1 - NU) if kind == "plane_strain" else -NU
+    u = displacement(np.diag([e] + [across * e] * (2 if kind == "3d" else 1)))
+    S = matrix(law(E, NU, kind).stress(u), u)
+    assert S[0, 0] == pytest.approx(modulus * e, rel=1e-5)
+    assert abs(S[1, 1]) < 1e-5 * modulus * e
+
+
+def test_plane_stress_is_3d_free_of_stress_across():
+    """The stretch across the plane that makes P33 vanish in 3D gives the in-plane stresses of plane stress."""
+    G = np.array([[0.2, 0.1], [-0.05, -0.1]])
+    material = uem.NeoHooke(E, NU, "3d")
+    J2 = np.linalg.det(np.eye(2) + G)
+    l3 = np.sqrt((material.mu + material.lam / 2) / (material.mu + material.lam / 2 * J2**2))
+    G3 = np.zeros((3, 3))
+    G3[:2, :2], G3[2, 2] = G, l3 - 1
+    full = matrix(material.first_piola(u := displacement(G3)), u)
+    plane = matrix(uem.NeoHooke(E, NU, "plane_stress").first_piola(u := displacement(G)), u)
+    assert abs(full[2, 2]) < 1e-13 * E
+    assert np.abs(full[:2, :2] - plane).max() < 1e-13 * E
+
+
+def test_wrong_kind_is_refused():
+    with pytest.raises(ValueError, match="plane_strain"):
+        uem.LinearElastic(E, NU, "plain_strain")
+    with pytest.raises(ValueError, match="components"):
+        uem.LinearElastic(E, NU, "3d").stress(displacement(np.zeros((2, 2))))
