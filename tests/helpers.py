@@ -290,9 +290,9 @@ def complementary(contact: uem.Contact, length: float, force: float) -> None:
 
 def lowest(comm: MPI.Comm, values: npt.ArrayLike) -> float:
     """Smallest value over all ranks (collective); an assertion must not fail on one rank only."""
-    return float(min(comm.allgather(np.min(values, initial=np.inf))))
+    return float(min(comm.allgather(np.min(np.asarray(values, dtype=float), initial=np.inf))))
 
 
 def highest(comm: MPI.Comm, values: npt.ArrayLike) -> float:
     """Largest value over all ranks; NaN anywhere makes it NaN, -inf stands for no value (collective)."""
-    return float(np.max(comm.allgather(np.max(values, initial=-np.inf))))
+    return float(np.max(comm.allgather(np.max(np.asarray(values, dtype=float), initial=-np.inf))))

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 SHORTEST_STEP = 1.0 / 64
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 ENOUGH_DECREASE = 0.9
+#: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
+LARGEST_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
     """
     history: list[Iteration] = []
     seen: set[int] = set()
-    cautious, start, length = False, 0.0, 1.0
+    cautious, start, thrust, length = False, 0.0, 0.0, 1.0
     system.place(returning=False)
     if not system.assemble_residual():
         raise NotFiniteError(
@@ -151,7 +153,8 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
         state = system.unite(cautious)
         start = start if k else state.norm
         forces = max(state.scale, start)
-        converged = not state.changed and state.closed and state.norm <= max(rtol * forces, state.rounding)
+        small = max(rtol * forces, min(state.rounding, LARGEST_ROUNDING * max(forces, thrust)))
+        converged = not state.changed and state.closed and state.norm <= small
         if converged or k == max_iterations:
             history.append(Iteration(_ratio(state.norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
@@ -163,6 +166,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
         seen.add(fingerprint)
         rhs = system.linearise(state, first=k == 0)
         driving = rhs.norm()
+        thrust = max(thrust, driving if k == 0 else 0.0)
         dq, iterations = system.solve(rhs)
         residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
         history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))

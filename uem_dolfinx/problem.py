@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 #: A load step may be cut to this part of its nominal length.
 SHORTEST_LOAD_STEP = 1.0 / 1024
+#: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
+#: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
+RIM = 1.0 / (2.0**1.5 - 1.0)
 #: A step that needs no more iterations than this is easy: the next one may be longer again.
 EASY = 6
 
@@ -156,7 +159,7 @@ class UnitedProblem:
 
     def _predict(self, ratio: float) -> None:
         """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
-        self.u.x.array[:] = self._committed + ratio * (self._committed - self._last)
+        self.u.x.array[:] = self._committed + RIM * ratio * (self._committed - self._last)
         for pair in self.system.pairs:
             pair.project()
             pair.predict(ratio)
@@ -206,18 +209,14 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
         factor = min(done + length, 1.0)
         if 1.0 - factor < 1e-9:
             factor = 1.0
-        fraction = factor
-        if callable(problem.load) and not isinstance(problem.load, fem.Constant):
-            problem.load(factor)
-            fraction = 1.0
-        elif problem.load is not None:
-            problem.load.value = factor
+        fraction = _apply_load(problem, factor)
         try:
             iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
         except (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError) as error:
             cuts += 1
             length *= 0.5
             if length < SHORTEST_LOAD_STEP * nominal:
+                _apply_load(problem, done)
                 raise
             logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
             continue
@@ -226,3 +225,13 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
         cuts = 0
         if len(iterations) - 1 <= EASY:
             length = min(2.0 * length, nominal)
+
+
+def _apply_load(problem: UnitedProblem, factor: float) -> float:
+    """Set the load; returns how far the Dirichlet values are to be ramped."""
+    if callable(problem.load) and not isinstance(problem.load, fem.Constant):
+        problem.load(factor)
+        return 1.0
+    if problem.load is not None:
+        problem.load.value = factor
+    return factor

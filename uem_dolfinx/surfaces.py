@@ -105,6 +105,7 @@ def check_tag(config: Configuration, tag: Tag, role: str) -> None:
 
 def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:
     """Owned nodes on the closure of a tag's facets, sorted (collective)."""
+    config.mesh.topology.create_connectivity(tag.dim, config.tdim)
     nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
     return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
 

@@ -314,6 +314,8 @@ class ContactPair:
         """Start with the contactors that touch without force as active."""
         touching = np.abs(self.projection.gap) <= TOUCHING * self.config.size
         self.trial = replace(self.trial, active=self.trial.active | (touching & ~self.off & self.movable))
+        # a first step that fails and is cut starts from here again
+        self.committed = self.last_commit = self.trial
 
     def check_prescribed(self) -> None:
         """Refuse an equilibrium in which a contactor is held inside the target by its Dirichlet conditions (collective).
@@ -356,9 +358,10 @@ class ContactPair:
         gap = self.projection.gap
         release = state.active & ((state.lam < -force_rounding) | off | ~self.movable)
         enter = ~state.active & ~off & self.movable & (gap < -GAP_ROUNDING * self.config.size)
-        worst = [-np.min(gap[enter], initial=0.0), -np.min(state.lam[release], initial=0.0), float(state.active.any())]
-        deepest, tension, touched = np.max(comm.allgather(worst), axis=0)
-        if not touched:
+        worst = [-np.min(gap[enter], initial=0.0), -np.min(state.lam[release], initial=0.0)]
+        deepest, tension = np.max(comm.allgather(worst), axis=0)
+        entering, touching = comm.allreduce(np.array([enter.sum(), state.active.sum()]))
+        if entering > touching:
             # a body that comes down on a paraboloid touches where the overlap exceeds half of the deepest
             enter &= gap <= -0.5 * deepest
         if cautious:
