@@ -214,7 +214,6 @@ def test_order_of_convergence(cell):
         b, contact, problem = contact_scene(cell, consistent_tangent=consistent, rtol=1e-11, max_iterations=80)
         history = [step.iterations for step in run(problem, 2)]
         results[consistent] = [orders(h) for h in history], sum(len(h) - 1 for h in history), contact.resultant().force
-    print(results)
     assert max(max(o, default=0.0) for o in results[True][0]) >= 1.8
     assert all(np.median(o) < 1.3 for o in results[False][0])
     assert results[True][1] < 0.7 * results[False][1]

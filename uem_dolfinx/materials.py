@@ -99,8 +99,8 @@ class StVenantKirchhoff(Elastic):
 
     def strain(self, u: Any) -> Expr:
         """Green-Lagrange strain."""
-        F = self._check(u) + ufl.grad(u)
-        return (F.T * F - ufl.Identity(len(u))) / 2
+        self._check(u)
+        return green_lagrange(u)
 
     def energy(self, u: Any) -> Expr:
         """``mu E:E + lambda/2 tr(E)^2``; in plane stress E33 is eliminated by S33 = 0."""
@@ -125,28 +125,33 @@ class NeoHooke(Elastic):
     ``l3^2 = (mu + lambda/2) / (mu + lambda/2 J2^2)`` with the in-plane determinant J2.
     """
 
-    def _stretch_across(self, J2: Any) -> Any:
-        """Square of the stretch across the plane."""
-        if self.kind != "plane_stress":
-            return 1.0
-        return (self.mu + self.lam / 2) / (self.mu + self.lam / 2 * J2**2)
+    def _volume_change(self, u: Any) -> Any:
+        """``J^2 - 1``, from the strain itself lest small strains drown in rounding."""
+        E = green_lagrange(u)
+        second = (ufl.tr(E) ** 2 - ufl.inner(E, E)) / 2
+        change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if len(u) == 3 else 0)
+        return self.mu * change / (self.mu + self.lam / 2 * (1 + change)) if self.kind == "plane_stress" else change
 
     def energy(self, u: Any) -> Expr:
         """Stored energy per reference volume."""
         F = self._check(u) + ufl.grad(u)
-        J2 = ufl.det(F)
-        l3 = self._stretch_across(J2)
-        C33 = l3 if len(u) == 2 else 0.0
-        JJ = J2**2 * l3
-        return self.mu / 2 * (ufl.inner(F, F) + C33 - 3 - ufl.ln(JJ)) + self.lam / 4 * (JJ - 1 - ufl.ln(JJ))
+        JJ = 1 + self._volume_change(u)
+        across = JJ / ufl.det(F) ** 2 if len(u) == 2 else 0.0
+        return self.mu / 2 * (ufl.inner(F, F) + across - 3 - ufl.ln(JJ)) + self.lam / 4 * (JJ - 1 - ufl.ln(JJ))
 
     def stress(self, u: Any) -> Expr:
         """Second Piola-Kirchhoff stress ``mu (I - C^-1) + lambda/2 (J^2 - 1) C^-1``."""
-        F = self._check(u) + ufl.grad(u)
-        C = F.T * F
-        JJ = ufl.det(C) * self._stretch_across(ufl.det(F))
-        return self.mu * (ufl.Identity(len(u)) - ufl.inv(C)) + self.lam / 2 * (JJ - 1) * ufl.inv(C)
+        self._check(u)
+        E = green_lagrange(u)
+        C_inverse = ufl.inv(ufl.Identity(len(u)) + 2 * E)
+        return 2 * self.mu * C_inverse * E + self.lam / 2 * self._volume_change(u) * C_inverse
 
     def first_piola(self, u: Any) -> Expr:
         """``F S``."""
         return (self._check(u) + ufl.grad(u)) * self.stress(u)
+
+
+def green_lagrange(u: Any) -> Expr:
+    """Green-Lagrange strain; ``F'F - I`` would lose strains below the rounding of 1."""
+    G = ufl.grad(u)
+    return (G + G.T + G.T * G) / 2

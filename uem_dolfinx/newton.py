@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from uem_dolfinx.restriction import Restriction
 
+#: A residual that keeps this part of its norm twice has met its rounding.
+STALLED = 0.5
 #: Shortest step of the line search.
 SHORTEST_STEP = 1.0 / 64
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
@@ -56,7 +58,8 @@ class United:
         residual: ``P'F``, the out-of-balance forces.
         norm: its norm.
         scale: norm of the forces at work.
-        rounding: norm below which a force is rounding.
+        rounding: norm below which a force is rounding of the displacement.
+        strain_rounding: norm that rounding of the deformation gradient alone can make, in laws that start from it.
         gap: largest gap of an active contactor over the model's size.
         active: number of active contactors.
         changed: whether the active set changed.
@@ -68,6 +71,7 @@ class United:
     norm: float
     scale: float
     rounding: float
+    strain_rounding: float
     gap: float
     active: int
     changed: bool
@@ -142,7 +146,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
     """
     history: list[Iteration] = []
     seen: set[int] = set()
-    cautious, start, thrust, length = False, 0.0, 0.0, 1.0
+    cautious, start, thrust, length, norm, stalled = False, 0.0, 0.0, 1.0, 0.0, 0
     system.place(returning=False)
     if not system.assemble_residual():
         raise NotFiniteError(
@@ -153,10 +157,13 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
         state = system.unite(cautious)
         start = start if k else state.norm
         forces = max(state.scale, start)
-        small = max(rtol * forces, min(state.rounding, LARGEST_ROUNDING * max(forces, thrust)))
-        converged = not state.changed and state.closed and state.norm <= small
+        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
+        norm = state.norm
+        rounding = state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding)
+        small = max(rtol * forces, min(rounding, LARGEST_ROUNDING * max(forces, thrust)))
+        converged = not state.changed and state.closed and norm <= small
         if converged or k == max_iterations:
-            history.append(Iteration(_ratio(state.norm, forces), state.gap, state.active, state.changed, 0, length))
+            history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
                 return history

@@ -194,7 +194,7 @@ class BodySystem:
         largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
         short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
         closed = gap <= CLOSED * self.config.size and short <= 4 * np.finfo(float).eps * largest
-        return United(restriction, residual, residual.norm(), F.norm(), rounding, gap, active, changed, bool(closed))
+        return United(restriction, residual, residual.norm(), F.norm(), rounding, self._strain_rounding(), gap, active, changed, bool(closed))
 
     def _restrict(self) -> Restriction:
         n = self.config.n_owned
@@ -219,6 +219,10 @@ class BodySystem:
         u = self._du_like()
         u.array[:] = rounded.ravel() * self._stiffness.array_r
         return float(ROUNDING * u.norm())
+
+    def _strain_rounding(self) -> float:
+        """Norm of the forces that rounding of ``1 + grad(u)`` can make."""
+        return 0.0 if self._stiffness is None else float(np.finfo(float).eps * self._stiffness.norm() * self.config.size)
 
     def _local_stiffness(self) -> Array:
         """Diagonal of K at the owned nodes ``(n_owned, gdim)``."""
