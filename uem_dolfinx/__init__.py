@@ -1,18 +1,20 @@
 """Contact for FEniCSx by the United Elements Method: exact constraints, no multipliers, no penalty.
 
-    du = P dq + c,    P'KP dq = P'(r - K c)
+du = P dq + c,    P'KP dq = P'(r - K c)
 """
 
 from __future__ import annotations
 
-from uem_dolfinx import compat as _compat  # noqa: F401, I001  loads MPI before DOLFINx and PETSc
+from uem_dolfinx import compat as _compat
 from uem_dolfinx.contact import Balance, Contact, Resultant
 from uem_dolfinx.errors import (
     ConflictError,
     ConvergenceError,
     InvertedElementError,
     LinearSolveError,
+    MeshError,
     MissingBackendError,
+    MissingFileError,
     NotFiniteError,
     OrientationError,
     PenetrationError,

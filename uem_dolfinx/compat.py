@@ -10,16 +10,14 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
-
-import numpy as np
-from petsc4py import PETSc
-
 import basix
 import dolfinx.common
 import dolfinx.fem.petsc
+import numpy as np
 import ufl
 from dolfinx import cpp, fem, io, la, mesh
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
+from petsc4py import PETSc
 
 from .errors import MissingBackendError
 
@@ -568,7 +566,7 @@ def gmsh_is_initialized(gmsh: Any) -> bool:
     with _silence():
         try:
             return len(gmsh.model.list()) > 0
-        except Exception:  # noqa: BLE001  Gmsh raises bare Exceptions
+        except Exception:
             return False
 
 

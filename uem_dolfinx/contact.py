@@ -17,12 +17,12 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.mesh import Tag
 from uem_dolfinx.search import MeshTarget, Target
 from uem_dolfinx.surfaces import TargetFacets, check_distinct, check_tag, surface_nodes, tributary_areas
 from uem_dolfinx.uniting import ContactPair
 
 if TYPE_CHECKING:
-    from uem_dolfinx.mesh import Tag
     from uem_dolfinx.system import BodySystem
 
 Array = npt.NDArray[np.float64]
@@ -101,12 +101,14 @@ class Contact:
         config = self.config = system.config
         check_tag(config, self.contactor, "contactor")
         nodes = surface_nodes(config, self.contactor)
-        target = self.target
-        if not hasattr(target, "project"):
-            check_tag(config, target, "target")
-            facets = TargetFacets(config, target)
-            check_distinct(config, nodes, facets, (self.contactor.name, target.name))
+        target: Target
+        if isinstance(self.target, Tag):
+            check_tag(config, self.target, "target")
+            facets = TargetFacets(config, self.target)
+            check_distinct(config, nodes, facets, (str(self.contactor.name), str(self.target.name)))
             target = MeshTarget(facets, averaged=self.normals == "averaged")
+        else:
+            target = self.target
         self._pair = ContactPair(
             config,
             nodes,
@@ -204,7 +206,12 @@ class Contact:
         f = self.force.x.array.reshape(-1, g)[:n]
         x = self.config.x[:n]
         m = _moments(x, f)
-        sums = [f.sum(axis=0), m.sum(axis=0), np.linalg.norm(f, axis=1).sum(), (np.linalg.norm(f, axis=1) * np.linalg.norm(x, axis=1)).sum()]
+        sums = [
+            f.sum(axis=0),
+            m.sum(axis=0),
+            np.linalg.norm(f, axis=1).sum(),
+            (np.linalg.norm(f, axis=1) * np.linalg.norm(x, axis=1)).sum(),
+        ]
         force, moment, all_f, all_m = (sum(part) for part in zip(*self.config.comm.allgather(sums)))
         return Balance(
             float(np.linalg.norm(force) / all_f) if all_f > 0 else 0.0,

@@ -11,9 +11,8 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from mpi4py import MPI
-
 from dolfinx.common import Timer
+from mpi4py import MPI
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

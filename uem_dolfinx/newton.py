@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
 from uem_dolfinx.log import logger
 
@@ -83,47 +81,36 @@ class UnitedSystem(Protocol):
 
     def place(self, returning: bool) -> None:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
-        ...
 
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
-        ...
 
     def unite(self, cautious: bool) -> United:
         """Contact forces, activation and release, and the uniting equations that follow."""
-        ...
 
     def active_set(self) -> int:
         """Fingerprint of the active set, the same on all ranks."""
-        ...
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
-        ...
 
     def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
-        """dq and the number of linear iterations."""
-        ...
+        """Unknowns dq and the number of linear iterations."""
 
     def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
-        ...
 
     def displacement(self) -> PETSc.Vec:
         """Copy of the present displacement."""
-        ...
 
     def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
         """Set the displacement to ``start + length du``."""
-        ...
 
     def inverted(self) -> str | None:
         """Where a cell is inside out, if one is."""
-        ...
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
         """``P'F`` of the present residual with the P of ``state``."""
-        ...
 
 
 def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool) -> list[Iteration]:

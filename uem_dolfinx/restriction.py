@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import zlib
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -53,17 +53,13 @@ class Restriction:
         ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle.
     """
 
-    def __init__(
-        self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True
-    ):
+    def __init__(self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True):
         self.config, self.equations, self.free, self.stacked = config, equations, free, stacked
         self.comm = config.comm
         g, n = config.gdim, config.n_owned
         self._sizes = ((g * n, g * config.index_map.size_global),) * 2
         self._first = g * int(config.index_map.local_range[0])
-        self.n_equations, self._n_rows = (
-            int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)]))
-        )
+        self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and those that only hold their place in the sparsity of P.
         self.nodes: npt.NDArray[np.int32] = np.unique(equations.node)
         self.frames, self.lift = self._eliminate()
@@ -74,7 +70,7 @@ class Restriction:
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
         self.d = self._vector(closure)
-        self.M = self._coupling() if self._n_rows else None
+        self.M: Any = self._coupling() if self._n_rows else None
         #: Number of terms with M in the series of P and c.
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 

@@ -5,7 +5,7 @@ Anything with ``project(points) -> Projection`` is a target; these need no mesh 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,9 +36,9 @@ class RigidProjection:
     points: Array
     bend: Array
 
-    def take(self, which: Ints) -> RigidProjection:
-        """The projections of some of the points."""
-        return RigidProjection(*(getattr(self, f.name)[which] for f in fields(self)))
+    def with_gap(self, gap: Array) -> RigidProjection:
+        """The same projection of points that have moved along the normal."""
+        return replace(self, gap=gap)
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap ``(k, gdim, gdim)``."""

@@ -7,7 +7,8 @@ travels back, so no rank ever sees a whole surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Protocol
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -31,31 +32,37 @@ ON_SIDE = 1e-10
 
 
 class Projection(Protocol):
-    """Where points stand relative to a target: the one thing the uniting equations ask of it.
+    """Where points stand relative to a target: the one thing the uniting equations ask of it."""
 
-    Attributes:
-        gap: signed distance ``(n,)``, positive outside.
-        normal: unit normals out of the target ``(n, gdim)``.
-        nodes: global block numbers of the target's nodes ``(n, nn)``; ``nn = 0`` for a rigid target.
-        weights: shape functions at the foot ``(n, nn)``.
-        facet: number of the facet over all ranks ``(n,)``.
-        beyond: how far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``.
-    """
+    @property
+    def gap(self) -> Array:
+        """Signed distance ``(n,)``, positive outside."""
 
-    gap: Array
-    normal: Array
-    nodes: Ints
-    weights: Array
-    facet: Ints
-    beyond: Array
+    @property
+    def normal(self) -> Array:
+        """Unit normals out of the target ``(n, gdim)``."""
+
+    @property
+    def nodes(self) -> Ints:
+        """Global block numbers of the target's nodes ``(n, nn)``; ``nn = 0`` for a rigid target."""
+
+    @property
+    def weights(self) -> Array:
+        """Shape functions at the foot ``(n, nn)``."""
+
+    @property
+    def facet(self) -> Ints:
+        """Number of the facet over all ranks ``(n,)``."""
+
+    @property
+    def beyond(self) -> Array:
+        """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
-        ...
 
-    def take(self, which: Ints) -> Projection:
-        """The projections of some of the points."""
-        ...
+    def with_gap(self, gap: Array) -> Projection:
+        """The same projection of points that have moved along the normal."""
 
 
 class Target(Protocol):
@@ -65,11 +72,9 @@ class Target(Protocol):
 
     def project(self, points: Array) -> Projection:
         """Closest points in the current configuration (collective)."""
-        ...
 
-    def follow(self, points: Array, old: Projection) -> Projection:
-        """Gaps with the feet, normals and weights of an earlier projection (small sliding, collective)."""
-        ...
+    def follow(self, points: Array, old: Any) -> Projection:
+        """Gaps with the feet, normals and weights of an earlier projection of this target (small sliding, collective)."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +105,9 @@ class FacetProjection:
     ddN: Array
     bend: Array
 
-    def take(self, which: Ints) -> FacetProjection:
-        return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
+    def with_gap(self, gap: Array) -> FacetProjection:
+        """The same projection of points that have moved along the normal."""
+        return replace(self, gap=gap)
 
     def with_rows(self, which: Ints, values: Mapping[str, Array | float]) -> FacetProjection:
         """Copy with some fields replaced at some points."""
@@ -223,7 +229,7 @@ class MeshTarget:
         if comm.size == 1:
             return answer
         ends = np.cumsum([0, *(len(a[0]) for a in asked)])
-        parts = comm.alltoall([_pack(answer, distance, slice(a, b)) for a, b in zip(ends[:-1], ends[1:])])
+        parts = comm.alltoall([_pack(answer, distance, slice(a, b)) for a, b in pairwise(ends)])
         which = np.concatenate(requests)
         d = np.concatenate([part[0] for part in parts])
         # nearest first; a tie goes to the lower rank, whose answer on the shared side is the same
@@ -273,8 +279,19 @@ class MeshTarget:
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
         beyond[~at_end] = 0.0
         return FacetProjection(
-            gap, normal, data.nodes[facet], tab.N, facet + self.first[self.comm.rank], beyond,
-            xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend,
+            gap,
+            normal,
+            data.nodes[facet],
+            tab.N,
+            facet + self.first[self.comm.rank],
+            beyond,
+            xi,
+            foot,
+            averaged_normal,
+            x,
+            tab.dN,
+            tab.ddN,
+            bend,
         )
 
 

@@ -7,7 +7,7 @@ Lagrange degree 1 or 2, so one code serves straight, bilinear and curved facets.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -78,7 +78,8 @@ class FacetShape:
     def contains(self, xi: Array) -> npt.NDArray[np.bool_]:
         """Which ``xi (n, fdim)`` lie in the closed reference facet."""
         inside = (xi >= 0).all(axis=1)
-        return inside & ((xi.sum(axis=1) <= 1) if self.cell == "triangle" else (xi <= 1).all(axis=1))
+        below = xi.sum(axis=1) <= 1 if self.cell == "triangle" else (xi <= 1).all(axis=1)
+        return np.asarray(inside & below)
 
     def side_distances(self, xi: Array) -> Array:
         """How far ``xi (n, fdim)`` is inside each side, in reference units ``(n, n_sides)``."""
@@ -103,7 +104,7 @@ class FacetShape:
         return sides
 
 
-@lru_cache(maxsize=None)
+@cache
 def facet_shape(cell: str, degree: int) -> FacetShape:
     """The one ``FacetShape`` of this kind."""
     return FacetShape(cell, degree)

@@ -83,7 +83,7 @@ class UnitedSolver:
             self.ksp.setFromOptions()
         self._key: object = None
         self._P: PETSc.Mat | None = None
-        self.A: PETSc.Mat | None = None
+        self.A: Any = None
         self._modes: list[Array] | None = None
 
     @contextmanager

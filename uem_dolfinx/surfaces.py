@@ -15,7 +15,7 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat
-from uem_dolfinx.errors import OrientationError, SpaceError, SurfaceError, TagError, agree
+from uem_dolfinx.errors import OrientationError, SpaceError, SurfaceError, TagError, UEMError, agree
 from uem_dolfinx.shapes import FacetShape, facet_shape, unit_normals
 
 if TYPE_CHECKING:
@@ -45,15 +45,19 @@ class Configuration:
         self.comm = V.mesh.comm
         self.gdim: int = V.mesh.geometry.dim
         self.tdim: int = V.mesh.topology.dim
-        self.degree = compat.lagrange_degree(V)
+        degree = compat.lagrange_degree(V)
         if self.tdim != self.gdim:
-            raise SpaceError(f"a body of dimension {self.tdim} in {self.gdim}D space has no inside: use a mesh with gdim = {self.tdim}")
-        if V.dofmap.index_map_bs != self.gdim or self.degree is None:
             raise SpaceError(
-                f"the displacement has {V.dofmap.index_map_bs} component(s) in {self.gdim}D: use a vector Lagrange space of size {self.gdim}"
+                f"a body of dimension {self.tdim} in {self.gdim}D space has no inside: use a mesh with gdim = {self.tdim}"
             )
-        if self.degree > 2:
-            raise SpaceError(f"contact surfaces of degree {self.degree} are not supported: use degree 1 or 2")
+        if V.dofmap.index_map_bs != self.gdim or degree is None:
+            raise SpaceError(
+                f"the displacement has {V.dofmap.index_map_bs} component(s) in {self.gdim}D: "
+                f"use a vector Lagrange space of size {self.gdim}"
+            )
+        self.degree: int = degree
+        if degree > 2:
+            raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
         self.index_map = V.dofmap.index_map
         self.n_owned: int = self.index_map.size_local
         self.n_local: int = self.n_owned + self.index_map.num_ghosts
@@ -93,7 +97,7 @@ class Configuration:
 
 def check_tag(config: Configuration, tag: Tag, role: str) -> None:
     """Refuse tags that are not facets of this mesh (collective)."""
-    error: Exception | None = None
+    error: UEMError | None = None
     if tag.mesh is not config.mesh:
         error = SpaceError(f"{role} '{tag.name}' belongs to another mesh than the displacement: read both from one mesh")
     elif tag.dim != config.tdim - 1:
@@ -169,7 +173,7 @@ class TargetFacets:
 
     def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
-        config, X = self.config, self.config.X
+        X = self.config.X
         middle = np.tile(self.shape.middle, (len(self.dofs), 1))
         tab = self.shape.tabulate(middle)
         x = X[self.dofs]

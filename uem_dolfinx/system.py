@@ -6,7 +6,7 @@ Seventh step on the data's way; it implements ``newton.UnitedSystem`` and leaves
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -115,7 +115,7 @@ class BodySystem:
         #: Displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
         self.wanted: Array = np.array(config.displacement)
         self._factored: object = None
-        self._stiffness: PETSc.Vec | None = None
+        self._stiffness: Any = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._detector = self._inversion_detector() if check else None
 
@@ -194,7 +194,18 @@ class BodySystem:
         largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
         short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
         closed = gap <= CLOSED * self.config.size and short <= 4 * np.finfo(float).eps * largest
-        return United(restriction, residual, residual.norm(), F.norm(), rounding, self._strain_rounding(), gap, active, changed, bool(closed))
+        return United(
+            restriction,
+            residual,
+            residual.norm(),
+            F.norm(),
+            rounding,
+            self._strain_rounding(),
+            gap,
+            active,
+            changed,
+            bool(closed),
+        )
 
     def _restrict(self) -> Restriction:
         n = self.config.n_owned
@@ -287,7 +298,7 @@ class BodySystem:
         return G
 
     def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
-        """dq and the number of linear iterations."""
+        """Unknowns dq and the number of linear iterations."""
         return self.solver.solve(rhs)
 
     # -- displacement ------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ that changes only after convergence.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -144,7 +144,12 @@ class ContactPair:
         self.free = free
         none = np.full(n, -1, dtype=np.int64)
         self.committed = PairState(
-            np.zeros(n, bool), np.zeros(n), np.zeros((n, config.gdim)), none, np.full((n, config.gdim - 1), -1), np.zeros(n, np.int64)
+            np.zeros(n, bool),
+            np.zeros(n),
+            np.zeros((n, config.gdim)),
+            none,
+            np.full((n, config.gdim - 1), -1),
+            np.zeros(n, np.int64),
         )
         self.trial = self.last_commit = self.committed
         self.projection: Projection
@@ -210,7 +215,7 @@ class ContactPair:
         if self._corners is None:
             return projection
         c = self._corners
-        at_corner = {"normal": c.axes[:, 0], "gap": c.gaps(self.points[held])[:, 0], "facet": self.trial.facet[held]}
+        at_corner: dict[str, Any] = {"normal": c.axes[:, 0], "gap": c.gaps(self.points[held])[:, 0], "facet": self.trial.facet[held]}
         return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0})
 
     def _corners_of(self, which: Ints, others: Ints) -> Corners | None:
@@ -258,7 +263,7 @@ class ContactPair:
         self.config.displacement[self.nodes[i]] += correction
         gap = np.array(p.gap)
         gap[i] += np.einsum("ng,ng->n", correction, p.normal[i])
-        self.projection = replace(p, gap=gap)
+        self.projection = p.with_gap(gap)
 
     @staticmethod
     def _along(normal: Array, gap: Array, free: Bools) -> Array:
