@@ -1,7 +1,8 @@
 """What contact costs: its share of a Newton iteration, and CG iterations against the same bodies meshed as one.
 
-    python3 demos/contact_cost.py --json cost.json
+python3 demos/contact_cost.py --json cost.json
 """
+# CI: --dofs 5000
 
 # %% [markdown]
 # # What contact costs
@@ -92,9 +93,7 @@ def cg_iterations(dim: int, amg: str, fused: bool) -> tuple[int, int]:
     bcs = [dirichlet(V, tags[name], i, 0.0) for name in ("bottom", "top") for i in range(dim - 1)]
     bcs += [dirichlet(V, tags["bottom"], dim - 1, 0.0), dirichlet(V, tags["top"], dim - 1, -0.01)]
     contacts = [] if fused else [uem.Contact(contactor=tags["upper_bottom"], target=tags["lower_top"])]
-    problem = uem.UnitedProblem(
-        F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=AMG[amg], rtol=1e-6
-    )
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=AMG[amg], rtol=1e-6)
     solves = [i.linear_iterations for i in problem.solve() if i.linear_iterations]
     return round(sum(solves) / len(solves)), dim * V.dofmap.index_map.size_global
 
@@ -106,6 +105,4 @@ def compare(dim: int, amg: str) -> dict[str, object]:
 
 
 # %%
-common.report(
-    args, {"share": [share(dim) for dim in (2, 3)], "cg": [compare(dim, amg) for dim in (2, 3) for amg in AMG]}
-)
+common.report(args, {"share": [share(dim) for dim in (2, 3)], "cg": [compare(dim, amg) for dim in (2, 3) for amg in AMG]})

@@ -1,7 +1,8 @@
 """Hertzian contact of two elastic bodies: a cylinder pressed onto a block, plane strain.
 
-    python3 demos/hertz_cylinder.py --plot hertz.png
+python3 demos/hertz_cylinder.py --plot hertz.png
 """
+# CI: default
 
 # %% [markdown]
 # # A cylinder on a block
@@ -27,7 +28,14 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 
 args = common.arguments(
-    __doc__, h=1 / 120, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=5, quads=0, rtol=1e-8
+    __doc__,
+    h=1 / 120,
+    ratio=1.0,
+    normals=("facet", "averaged"),
+    degree=1,
+    steps=5,
+    quads=0,
+    tangent=("consistent", "without_contact"),
 )
 
 # %% [markdown]
@@ -58,8 +66,9 @@ contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], norm
 # %%
 start = time.perf_counter()
 problem = uem.UnitedProblem(
-    F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hertz_", rtol=args.rtol, verbose=args.verbose
-)
+    F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hertz_", consistent_tangent=args.tangent == "consistent",
+    verbose=args.verbose,
+)  # fmt: skip
 writer = uem.ResultsWriter(f"{args.output}/hertz_cylinder", problem) if args.output else None
 steps = []
 for step in uem.load_steps(problem, args.steps):
@@ -73,8 +82,7 @@ seconds = time.perf_counter() - start
 # %% [markdown]
 # ## The figures
 # Both halves together carry P. The half width is the length of surface that belongs to active contactors, which is exact to
-# half a cell. The order of convergence is observed on the
-# last three residuals of the last step that are above rounding.
+# half a cell.
 
 # %%
 P = 2 * contact.resultant().force[1]
@@ -94,12 +102,27 @@ results = {
     "max_gap": contact.max_gap(),
     "model_size": float(np.hypot(6, 9)),
     "force_imbalance": max(balance.force, balance.moment),
-    "order": common.order(steps[-1]),
     "residuals": [iteration.residual for iteration in steps[-1].iterations],
     "active": contact.n_active,
     "dofs": 2 * V.dofmap.index_map.size_global,
     "seconds": seconds,
 }
+
+# %% [markdown]
+# ## The order of convergence
+# The load steps end after two or three iterations, at rounding, too soon to see an order. So the solution is disturbed by a wave
+# along the contact, once of height 0.0001 a and once of half of it: the first residual on the way back shrinks with the power
+# that is the order: 2 with the consistent tangent, 1 without, as long as no contactor changes facets on the way.
+
+# %%
+solution, x = u.x.array.copy(), V.tabulate_dof_coordinates()[: len(u.x.array) // 2, :2] / results["a_hertz"]
+wave = np.exp(-(x**2).sum(axis=1)) * np.sin(6 * x[:, 0])
+after = []
+for height in (1e-4, 0.5e-4):
+    u.x.array[:] = solution
+    u.x.array[1::2] += height * results["a_hertz"] * wave
+    after.append(problem.solve()[1].residual)
+results["order"] = float(np.log2(after[0] / after[1]))
 common.report(args, results)
 
 # %% [markdown]
@@ -122,5 +145,5 @@ if args.plot:
         )  # fmt: skip
 
 # %%
-if args.h <= 1 / 120:
+if args.h <= 1 / 120 and args.ratio == 1:
     assert abs(results["p_max / p0_hertz"] - 1) < 0.01

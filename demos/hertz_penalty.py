@@ -1,7 +1,8 @@
 """Hertzian contact with a rigid indenter: united elements and the penalty method on the same mesh in one run.
 
-    python3 demos/hertz_penalty.py --plot penalty.png
+python3 demos/hertz_penalty.py --plot penalty.png
 """
+# CI: --N 12
 
 # %% [markdown]
 # # A rigid indenter, with and without a penalty
@@ -165,9 +166,13 @@ if args.plot:
             left.loglog([r["penalty"] for r in penalties], [abs(r["F"] / figures["F"] - 1) for r in penalties], "s-",
                         label="|F / F(united) - 1|")  # fmt: skip
             for r in penalties:
-                left.annotate(f"{r['newton_iterations']} its", (r["penalty"], r["overlap"] / d), (4, 6), textcoords="offset points")
+                left.annotate(
+                    f"{r['newton_iterations']} its", (r["penalty"], r["overlap"] / d), (4, 6), textcoords="offset points"
+                )
             left.set_xlabel("penalty")
-            left.set_title(f"united elements: overlap {figures['overlap']:.0e}, {figures['newton_iterations']} iterations", fontsize=10)
+            left.set_title(
+                f"united elements: overlap {figures['overlap']:.0e}, {figures['newton_iterations']} iterations", fontsize=10
+            )
             left.legend(frameon=False)
             left.grid(alpha=0.25)
         uem.plot_pressure(contact, right, reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)),

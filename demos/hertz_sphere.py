@@ -1,7 +1,8 @@
 """Hertzian contact of two elastic bodies in 3D: a half sphere pressed onto a block, CG with algebraic multigrid.
 
-    mpirun -n 2 python3 demos/hertz_sphere.py --plot sphere.png
+mpirun -n 2 python3 demos/hertz_sphere.py --plot sphere.png
 """
+# CI: --h 0.001 --refinements 2
 
 # %% [markdown]
 # # A half sphere on a block
@@ -28,9 +29,7 @@ from dolfinx import fem
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 
-args = common.arguments(
-    __doc__, h=0.0005, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=1, d=2.5e-5, refinements=3
-)
+args = common.arguments(__doc__, h=0.0005, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=1, d=2.5e-5, refinements=3)
 E, nu, R = 1e6, 0.3, 1.0
 E_star, a = E / (2 * (1 - nu**2)), np.sqrt(R * args.d)
 F_hertz = 4 / 3 * E_star * np.sqrt(R) * args.d**1.5
@@ -42,6 +41,7 @@ if compat.has_hypre():
 # %% [markdown]
 # ## One scene
 # `h` is the size of the cells under the contact; with the distance from there they grow in proportion.
+
 
 # %%
 def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:

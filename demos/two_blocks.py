@@ -1,7 +1,8 @@
 """Two blocks of very different stiffness, one pushed onto the other, against the closed form.
 
-    python3 demos/two_blocks.py --plot two_blocks.png
+python3 demos/two_blocks.py --plot two_blocks.png
 """
+# CI: default
 
 # %% [markdown]
 # # Two blocks
@@ -67,7 +68,11 @@ def solve(ratio: float, law: str, contactor: str) -> tuple[uem.UnitedProblem, di
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material, force = LAWS[law]
     F = material(E, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
-    bcs = [dirichlet(V, tags["sides"], 0, 0.0), dirichlet(V, tags["lower_bottom"], 1, 0.0), dirichlet(V, tags["upper_top"], 1, -args.d)]
+    bcs = [
+        dirichlet(V, tags["sides"], 0, 0.0),
+        dirichlet(V, tags["lower_bottom"], 1, 0.0),
+        dirichlet(V, tags["upper_top"], 1, -args.d),
+    ]
     surfaces = {"upper": tags["upper_bottom"], "lower": tags["lower_top"]}
     target = surfaces["lower" if contactor == "upper" else "upper"]
     contact = uem.Contact(contactor=surfaces[contactor], target=target)
@@ -77,7 +82,13 @@ def solve(ratio: float, law: str, contactor: str) -> tuple[uem.UnitedProblem, di
     exact = interface_displacement(ratio, force, args.d)
     nodes = np.concatenate([fem.locate_dofs_topological(V, 1, tag.entities) for tag in surfaces.values()])
     error = np.abs(-u.x.array.reshape(-1, 2)[nodes, 1] / exact - 1).max(initial=0.0)
-    row = {"ratio": ratio, "law": law, "contactor": contactor, "error": float(max(comm.allgather(error))), "newton_iterations": iterations}
+    row = {
+        "ratio": ratio,
+        "law": law,
+        "contactor": contactor,
+        "error": float(max(comm.allgather(error))),
+        "newton_iterations": iterations,
+    }
     return problem, row
 
 

@@ -86,7 +86,7 @@ def test_finite_strain_closed_form(cell):
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_closing_a_gap(cell):
     """No force before the gap is closed, the series stiffness after."""
-    gap = 0.02
+    gap = 0.025
     b = blocks(COMM, cell, 2, 4, gap=gap)
     contact = uem.Contact(b.high, b.low)
     problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=b.oedometer(0.05), contacts=[contact])
@@ -353,9 +353,8 @@ def test_history_and_its_lines(caplog):
 def sliding_block(cell, height, normals, start=0.0, n_low=8, length=2.0, offset=0.0):
     """A block, narrower than the polygon below it, on its way from left to right."""
     g = 2 if cell == "triangle" else 3
-    across = [0.0] * (g - 2), [1.0] * (g - 2)
-    low = box(cell, [-0.5, *across[0], -1.0], [length - 0.5, *across[1], 0.0], [n_low, *[2] * (g - 2), 2])
-    high = box(cell, [start, *across[0], offset], [start + 0.5, *across[1], offset + 0.5], [2, *[2] * (g - 2), 2])
+    low = box(cell, [-0.5, *[-0.25] * (g - 2), -1.0], [length - 0.5, *[1.25] * (g - 2), 0.0], [n_low, *[2] * (g - 2), 2])
+    high = box(cell, [start, *[0.0] * (g - 2), offset], [start + 0.5, *[1.0] * (g - 2), offset + 0.5], [2, *[2] * (g - 2), 2])
     s = scene(COMM, cell, [low, high], pose=arch(height))
     V = compat.function_space(s.mesh, 1, (g,))
     u = fem.Function(V)
@@ -387,7 +386,8 @@ def test_sliding_along_a_polygon(cell, height, normals):
     )
     touched, facets = [], set()
     for step in uem.load_steps(problem, 16):
-        assert step.cuts == 0 and step.newton_iterations <= 20
+        # averaged normals are no gradient of the gap, so that Newton is linear with them
+        assert step.cuts == 0 and step.newton_iterations <= (20 if normals == "facet" else 30)
         complementary(contact, 1e-12, 1e-10)
         touched.append(contact.n_active)
         facets |= {int(f) for part in COMM.allgather(contact.pair.projection.facet[contact.pair.trial.active]) for f in part}
@@ -398,7 +398,7 @@ def test_sliding_along_a_polygon(cell, height, normals):
 @pytest.mark.parametrize("normals", ["facet", "averaged"])
 def test_sliding_off_the_end(normals):
     """Past the end of the target a contactor is let go, one after the other, and the last force is gone with the last of them."""
-    s, V, u, (bottom, low, high, top) = sliding_block("triangle", 0.0, normals, start=1.0, offset=0.0)
+    s, V, u, (bottom, low, high, top) = sliding_block("triangle", 0.0, normals, start=0.9, offset=0.0)
     path = fem.Function(V)
     dofs = fem.locate_dofs_topological(V, 1, top.entities)
     contact = uem.Contact(high, low, normals=normals)
@@ -413,8 +413,8 @@ def test_sliding_off_the_end(normals):
     for step in uem.load_steps(problem, 16):
         counts.append(contact.n_active)
         complementary(contact, 1e-13, 1e-12)
-        inside = problem.config.X[contact.pair.nodes, 0] + problem.config.displacement[contact.pair.nodes, 0] < 1.5 + 0.1
-        assert not (contact.pair.trial.active & ~inside).any() or COMM.size == 0
+        # the end of the flat target has moved by a few per cent at most
+        assert highest(COMM, contact.pair.points[contact.pair.trial.active, 0]) < 1.55
     assert counts[0] == 3 and counts[-1] == 0 and (np.diff(counts) <= 0).all()
     assert np.abs(contact.resultant().force).max() == 0.0
 
@@ -466,7 +466,7 @@ def test_tip_in_a_groove(normals, off_centre):
         linear(u, modulus(s, 1.0, 1.0)), u, bcs=[*clamp(V, bottom), *clamp(V, top, value=[0.0, -0.1])], contacts=[contact]
     )
     for step in uem.load_steps(problem, 4):
-        assert step.newton_iterations <= 20
+        assert step.newton_iterations <= (12 if normals == "facet" else 30)
         complementary(contact, 1e-13, 1e-12)
     assert contact.n_active == 1
     force = contact.resultant().force

@@ -11,12 +11,11 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from mpi4py import MPI
-
 import helpers
 import numpy as np
 import pytest
 import ufl
+from mpi4py import MPI
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, results
@@ -38,7 +37,9 @@ def pressed(cell: str, degree: int = 1, names: tuple[str, ...] = ("pair",)) -> u
     """Two blocks pushed together by 0.1, with as many copies of their contact as there are names, all but the first asleep."""
     b = helpers.blocks(comm, cell, degree=degree)
     contacts = [uem.Contact(b.high, b.low, name=names[0])]
-    contacts += [uem.Contact(b.high, uem.RigidPlane([0.0] * (b.gdim - 1) + [-9.0], np.eye(b.gdim)[-1]), name=n) for n in names[1:]]
+    contacts += [
+        uem.Contact(b.high, uem.RigidPlane([0.0] * (b.gdim - 1) + [-9.0], np.eye(b.gdim)[-1]), name=n) for n in names[1:]
+    ]
     return uem.UnitedProblem(helpers.linear(b.u, 1.0), b.u, bcs=b.oedometer(0.1), contacts=contacts)
 
 
@@ -60,7 +61,9 @@ def test_history_is_what_the_contacts_say(folder: Path, cell: str) -> None:
     assert [bool(r["newton_iterations"]) for r in table] == [True, True, False]
     last, resultant = table[1], contact.resultant()
     np.testing.assert_allclose([float(last[f"force_{a}"]) for a in "xyz"[:g]], resultant.force, rtol=1e-11, atol=1e-14)
-    np.testing.assert_allclose([float(last[f"moment_{a}"]) for a in ("z" if g == 2 else "xyz")], resultant.moment, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(
+        [float(last[f"moment_{a}"]) for a in ("z" if g == 2 else "xyz")], resultant.moment, rtol=1e-11, atol=1e-14
+    )
     assert int(last["active"]) == contact.n_active > 0
     assert float(last["max_gap"]) < 1e-12
     # half the settlement, half the force
@@ -110,7 +113,13 @@ def test_pictures(folder: Path, cell: str) -> None:
     with uem.figure(folder / "new" / "both.png", comm, panels=2) as (left, right):
         assert (left is not None) == (comm.rank == 0)
         uem.plot_scene(
-            problem, left, field=ufl.div(problem.u), label="dilation", levels=[-0.2, -0.1, 0.0], window=(-1, 1, -0.5, 0.5), mirror=True
+            problem,
+            left,
+            field=ufl.div(problem.u),
+            label="dilation",
+            levels=[-0.2, -0.1, 0.0],
+            window=(-1, 1, -0.5, 0.5),
+            mirror=True,
         )
         uem.plot_pressure(problem.contacts[0], right, mirror=True, along=lambda x: x[:, 0], window=(-1.0, 1.0))
     comm.barrier()

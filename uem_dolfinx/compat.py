@@ -433,8 +433,10 @@ def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
     Returns:
         Local unrolled indices in the parent space, ascending, ghosts last, shape ``(n,)``, and the number owned.
     """
-    dofs, n_owned = bc.dof_indices()
-    return np.array(dofs, dtype=np.int32), int(n_owned)
+    dofs = np.sort(np.array(bc.dof_indices()[0], dtype=np.int32))
+    dofmap = bc.function_space.dofmap
+    # counted here: the number that DOLFINx up to 0.9 returns takes blocked ghosts for owned
+    return dofs, int(np.searchsorted(dofs, dofmap.index_map.size_local * dofmap.index_map_bs))
 
 
 def set_bc_values(x: PETSc.Vec | npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:

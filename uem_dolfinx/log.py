@@ -30,6 +30,12 @@ logger = logging.getLogger("uem_dolfinx")
 logger.addFilter(_is_rank_zero)
 
 
+def say(line: str) -> None:
+    """Print a line that the user has asked for, on rank 0."""
+    if MPI.COMM_WORLD.rank == 0:
+        print(line, flush=True)
+
+
 @contextmanager
 def timed(stage: str) -> Iterator[None]:
     """Time a stage of the method; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.

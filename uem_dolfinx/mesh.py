@@ -9,6 +9,7 @@ import difflib
 import re
 import tempfile
 from collections.abc import Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,7 +21,7 @@ from uem_dolfinx.errors import MeshError, MissingFileError, TagError, UEMError
 from uem_dolfinx.log import logger, timed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import numpy.typing as npt
     from mpi4py import MPI
@@ -275,37 +276,51 @@ def _constants(path: Path) -> list[str]:
 
 def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
     """Open and mesh a file in a session of our own, or in a model of our own in the user's session."""
-    found_running = compat.gmsh_is_initialized(gmsh)
-    if found_running:
-        current, terminal = gmsh.model.getCurrent(), gmsh.option.getNumber("General.Terminal")
-    else:
-        gmsh.initialize(["gmsh"], False)
-    gmsh.option.setNumber("General.Terminal", 0)
-    models = len(gmsh.model.list())
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            # constants set before the file is included win over its DefineConstant, in this model only
-            wrapper = Path(folder) / f"{path.stem}.geo"
-            lines = [f"{name} = {float(value)!r};" for name, value in parameters.items()]
-            wrapper.write_text("\n".join([*lines, f'Include "{path}";', ""]))
+    with _session(gmsh) as errors, tempfile.TemporaryDirectory() as folder:
+        # constants set before the file is included win over its DefineConstant, in this model only
+        wrapper = Path(folder) / f"{path.stem}.geo"
+        lines = [f"{name} = {float(value)!r};" for name, value in parameters.items()]
+        wrapper.write_text("\n".join([*lines, f'Include "{path}";', ""]))
+        try:
             gmsh.open(str(wrapper if parameters else path))
             dim = gdim or (3 if gmsh.model.getDimension() == 3 else 2)
-            if not len(gmsh.model.mesh.getElements(dim)[0]):
+            if not errors() and not len(gmsh.model.mesh.getElements(dim)[0]):
                 gmsh.model.mesh.generate(dim)
+            found = errors()
+        except Exception as error:  # Gmsh raises bare Exceptions
+            found = [*errors(), str(error)]
+        if found:
+            values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
+            raise MeshError(f"Gmsh cannot read or mesh {path}{' with ' + values if values else ''}: {found[0]}")
         return _extract(gmsh.model, gdim, str(path))
-    except UEMError:
-        raise
-    except Exception as error:  # Gmsh raises bare Exceptions
-        values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
-        raise MeshError(f"Gmsh cannot read or mesh {path}{' with ' + values if values else ''}: {error}") from None
+
+
+@contextmanager
+def _session(gmsh: Any) -> Iterator[Callable[[], list[str]]]:
+    """Work in a Gmsh session that is left as it was found; yields the errors that Gmsh has logged in it."""
+    found_running = compat.gmsh_is_initialized(gmsh)
+    if not found_running:
+        gmsh.initialize(["gmsh"], False)
+    names = ("General.Terminal", "General.AbortOnError")
+    options = [(name, gmsh.option.getNumber(name)) for name in names]
+    current, n_models, n_messages = gmsh.model.getCurrent(), len(gmsh.model.list()), len(gmsh.logger.get())
+    # an error that aborted the parser would make it stumble over the next file, even in another session
+    for name in names:
+        gmsh.option.setNumber(name, 0)
+    gmsh.logger.start()
+    try:
+        yield lambda: [m.split(":", 1)[1].strip() for m in gmsh.logger.get()[n_messages:] if m.startswith("Error")]
     finally:
+        if n_messages == 0:
+            gmsh.logger.stop()
         if not found_running:
             gmsh.finalize()
         else:
-            if len(gmsh.model.list()) > models:
+            if len(gmsh.model.list()) > n_models:
                 gmsh.model.remove()
             gmsh.model.setCurrent(current)
-            gmsh.option.setNumber("General.Terminal", terminal)
+            for name, value in options:
+                gmsh.option.setNumber(name, value)
 
 
 def _extract(model: Any, gdim: int | None, label: str) -> _RawMesh:

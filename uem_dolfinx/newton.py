@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
-from uem_dolfinx.log import logger
+from uem_dolfinx.log import logger, say
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
@@ -110,7 +110,7 @@ class UnitedSystem(Protocol):
         """Where a cell is inside out, if one is."""
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
-        """``P'F`` of the present residual with the P of ``state``."""
+        """``P'F`` at the present displacement, with the active set of ``state``."""
 
 
 def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool) -> list[Iteration]:
@@ -209,6 +209,6 @@ def _report(history: list[Iteration], verbose: bool) -> None:
         f"linear {i.linear_iterations:3d}  step {i.step_length:g}"
     )
     if verbose:
-        logger.warning(line)
+        say(line)
     else:
         logger.debug(line)

@@ -57,7 +57,7 @@ class UnitedProblem:
         check_inversion: look for cells turned inside out in every iteration; None does so unless K is constant.
         rtol: bound on the norm of ``P'r`` relative to the forces at work.
         max_iterations: bound on the linear solves of one step.
-        verbose: log one line per iteration.
+        verbose: print one line per iteration.
 
     Raises:
         SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, or F does not depend on it.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from uem_dolfinx.errors import MissingBackendError, agree
 from uem_dolfinx.problem import LoadStep
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
     from types import TracebackType
     from typing import IO
 
@@ -63,7 +64,7 @@ class HistoryWriter:
             self.columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
         if problem.comm.rank == 0:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(path, "w", newline="", encoding="utf-8")
+            self._file = Path(path).open("w", newline="", encoding="utf-8")  # noqa: SIM115  stays open between rows
             self._row(self.columns)
 
     def write(self, step: LoadStep | float) -> None:
@@ -201,7 +202,9 @@ def _geometry_degree(mesh: Any) -> int:
 
 
 @contextmanager
-def figure(path: str | Path | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8)) -> Iterator[list[Any]]:
+def figure(
+    path: str | Path | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8)
+) -> Iterator[list[Any]]:
     """Canvas with panels side by side, saved at the end; the backend of matplotlib stays as it is (collective).
 
     Args:
@@ -216,21 +219,20 @@ def figure(path: str | Path | None, comm: MPI.Comm, panels: int = 1, size: tuple
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
     """
-    Figure, error = None, None
-    if path is not None and comm.rank == 0:
-        try:
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-        except ImportError as missing:
-            error = MissingBackendError(f"the picture {path} needs matplotlib ({missing}): install it, or leave the picture out")
-    agree(comm, error)
-    if Figure is None:
+    if path is None or comm.rank != 0:
+        agree(comm, None)
         yield [None] * panels
         return
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as missing:
+        agree(comm, MissingBackendError(f"the picture {path} needs matplotlib ({missing}): install it, or leave the picture out"))
+        raise
+    agree(comm, None)
     canvas = Figure(figsize=(panels * size[0], size[1]), constrained_layout=True)
     FigureCanvasAgg(canvas)
     yield list(np.atleast_1d(canvas.subplots(1, panels)))
-    assert path is not None
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     canvas.savefig(path, dpi=150, bbox_inches="tight")
 
@@ -271,7 +273,9 @@ def plot_scene(
         ValueError: if the scene is not 2D.
     """
     if problem.config.gdim != 2:
-        raise ValueError(f"plot_scene draws 2D scenes, this one has dimension {problem.config.gdim}: open the XDMF file in ParaView")
+        raise ValueError(
+            f"plot_scene draws 2D scenes, this one has dimension {problem.config.gdim}: open the XDMF file in ParaView"
+        )
     if isinstance(picture, (str, Path)):
         with figure(picture, problem.comm) as (panel,):
             plot_scene(
@@ -316,9 +320,9 @@ def _draw_scene(
     used[triangles] = True
     reach = np.abs(x[:, 0]) if mirror else x[:, 0]
     shown = used & (reach <= window[1]) & (x[:, 1] >= window[2]) & (x[:, 1] <= window[3])
-    if not np.ndim(levels):
+    if isinstance(levels, int):
         seen = values[shown] if shown.any() else values[used]
-        levels = MaxNLocator(int(np.asarray(levels))).tick_values(float(seen.min()), float(seen.max()))
+        levels = MaxNLocator(levels).tick_values(float(seen.min()), float(seen.max()))
     beyond = (values[shown].min(initial=np.inf) < levels[0]) + 2 * (values[shown].max(initial=-np.inf) > levels[-1])
     extend = ("neither", "min", "max", "both")[beyond]
     coloured = None
@@ -382,7 +386,7 @@ def plot_pressure(
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
     """
-    pairs = list(contacts) if isinstance(contacts, (list, tuple)) else [contacts]
+    pairs: list[Contact] = list(contacts) if isinstance(contacts, Sequence) else [contacts]
     if isinstance(picture, (str, Path)):
         with figure(picture, pairs[0].config.comm) as (panel,):
             plot_pressure(

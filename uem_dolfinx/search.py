@@ -27,6 +27,8 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
+#: An averaged normal that leans further from the facet's (its cosine) no longer tells where the facet is.
+LEAST_LEAN = 0.1
 #: Reference distance from a facet's side below which a foot counts as lying on it.
 ON_SIDE = 1e-10
 
@@ -274,10 +276,17 @@ class MeshTarget:
         bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
         bend[~use_average] = 0.0
         gap = np.einsum("ng,ng->n", normal, points - foot)
+        # inside a facet an averaged normal leans, and the way along it is longer
+        lean = np.where(on_side.any(axis=1), 1.0, np.einsum("ng,ng->n", normal, facet_normal))
+        gap = np.where(lean > LEAST_LEAN, gap / lean**2, gap)
         beyond = points - foot - gap[:, None] * normal
         # a facet may touch the surface's end with a vertex alone
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
         beyond[~at_end] = 0.0
+        # along an averaged normal the way to the facet is longer than to its closest point
+        slope = np.einsum("ng,ng->n", normal, facet_normal)
+        leaning = use_average & ~on_side.any(axis=1)
+        gap = np.where(leaning, np.einsum("ng,ng->n", facet_normal, points - foot) / np.where(leaning, slope, 1.0), gap)
         return FacetProjection(
             gap,
             normal,

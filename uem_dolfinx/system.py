@@ -324,8 +324,12 @@ class BodySystem:
         self.u.x.scatter_forward()
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
-        """``P'F`` of the present residual with the P of ``state``."""
-        return state.restriction.reduce(state.restriction.pass_on(self.residual))
+        """``P'F`` at the present displacement, with the active set of ``state``.
+
+        P belongs to the present normals: the old P would take the turned contact forces for a residual.
+        """
+        restriction = self._restrict()
+        return restriction.reduce(restriction.pass_on(self.residual))
 
     def _inversion_detector(self) -> tuple[ufl.core.expr.Expr, object]:
         """Volume of the cells turned inside out, as a form."""

@@ -263,7 +263,11 @@ class ContactPair:
         self.config.displacement[self.nodes[i]] += correction
         gap = np.array(p.gap)
         gap[i] += np.einsum("ng,ng->n", correction, p.normal[i])
-        self.projection = p.with_gap(gap)
+        if isinstance(self.target, MeshTarget) and self.target.averaged:
+            # the foot moves when the way leans
+            self.project()
+        else:
+            self.projection = p.with_gap(gap)
 
     @staticmethod
     def _along(normal: Array, gap: Array, free: Bools) -> Array:

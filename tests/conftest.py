@@ -1,0 +1,37 @@
+"""Fixtures for tests that run alike on any number of ranks; hypothesis draws the same examples on all of them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import uem_dolfinx  # noqa: F401, I001  loads MPI before DOLFINx and PETSc
+import hypothesis
+import pytest
+from mpi4py import MPI
+
+hypothesis.settings.register_profile("ranks", deadline=None, derandomize=True, database=None, max_examples=25)
+hypothesis.settings.load_profile("ranks")
+
+
+@pytest.fixture
+def comm() -> MPI.Intracomm:
+    """All ranks."""
+    return MPI.COMM_WORLD
+
+
+@pytest.fixture
+def folder(comm: MPI.Intracomm) -> Iterator[Path]:
+    """An empty folder, the same on all ranks, removed after the test."""
+    with tempfile.TemporaryDirectory() if comm.rank == 0 else _nothing() as name:
+        yield Path(comm.bcast(name, root=0))
+        comm.barrier()
+
+
+class _nothing:
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, *error: object) -> None:
+        return None
