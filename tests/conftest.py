@@ -6,10 +6,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import uem_dolfinx  # noqa: F401, I001  loads MPI before DOLFINx and PETSc
+from mpi4py import MPI
+
 import hypothesis
 import pytest
-from mpi4py import MPI
+
+import uem_dolfinx  # noqa: F401
 
 hypothesis.settings.register_profile("ranks", deadline=None, derandomize=True, database=None, max_examples=25)
 hypothesis.settings.load_profile("ranks")

@@ -5,11 +5,12 @@ Worth reading first: ``test_stress_is_derivative_of_energy`` and ``test_uniaxial
 
 from __future__ import annotations
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, mesh
-from mpi4py import MPI
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -22,9 +23,7 @@ E, NU = 7.0, 0.3
 def displacement(gradient: np.ndarray) -> fem.Function:
     """Homogeneous displacement on a unit square or cube."""
     gdim = len(gradient)
-    domain = (
-        mesh.create_unit_square(MPI.COMM_SELF, 1, 1) if gdim == 2 else mesh.create_unit_cube(MPI.COMM_SELF, 1, 1, 1)
-    )
+    domain = mesh.create_unit_square(MPI.COMM_SELF, 1, 1) if gdim == 2 else mesh.create_unit_cube(MPI.COMM_SELF, 1, 1, 1)
     u = fem.Function(compat.function_space(domain, 1, (gdim,)))
     X = u.function_space.tabulate_dof_coordinates()[:, :gdim]
     u.x.array[:] = (X @ gradient.T).ravel()

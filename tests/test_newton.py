@@ -278,13 +278,13 @@ def test_loose_body_is_no_solution():
     assert np.abs(b.scene.gather(b.u)).max() == 0.0
 
 
-def test_line_search_saves_a_step_that_inverts_cells():
-    """Bending a slender neo-Hookean-like body far in one step needs shorter Newton steps, and gets them."""
-    b, contact, problem = pressed(d=0.45, rtol=1e-9, max_iterations=60)
-    history = problem.solve()
-    assert min(i.step_length for i in history) < 1.0
+def test_line_search_shortens_a_step_and_ends_in_the_same_state():
+    """A far step that full Newton steps cannot take is taken in shorter ones, or cut; the state is that of many small steps."""
+    b, contact, problem = pressed(d=0.4, rtol=1e-9)
+    steps = run(problem)
+    assert min(i.step_length for s in steps for i in s.iterations) < 1.0 or sum(s.cuts for s in steps) > 0
     complementary(contact, 1e-13, 1e-12)
-    reference, other, patient = pressed(d=0.45, rtol=1e-9)
+    reference, _, patient = pressed(d=0.4, rtol=1e-9)
     run(patient, 10)
     assert np.abs(b.scene.gather(b.u) - reference.scene.gather(reference.u)).max() < 1e-6
 
@@ -335,15 +335,16 @@ def test_failure_after_all_cuts_keeps_the_last_step():
     assert contact.resultant().force[1] == pytest.approx(0.5 * reached, rel=1e-6)
 
 
-def test_history_and_its_lines(caplog):
-    """One line per iteration on request, and the same figures in the history."""
+def test_history_and_its_lines(capsys):
+    """One line per iteration on request, on rank 0, with the figures of the history."""
     b, contact, problem = pressed(verbose=True)
-    with caplog.at_level("WARNING", logger="uem_dolfinx"):
-        history = problem.solve()
-    lines = [r.getMessage() for r in caplog.records if r.name == "uem_dolfinx"]
+    history = problem.solve()
+    lines = [line for line in capsys.readouterr().out.splitlines() if "residual" in line]
     if COMM.rank == 0:
         assert len(lines) == len(history)
         assert all(f"{i.residual:.3e}" in line and f"active {i.active:5d}" in line for i, line in zip(history, lines))
+    else:
+        assert not lines
     assert history[-1].residual < 1e-8 and history[-1].active == contact.n_active
 
 
@@ -364,11 +365,12 @@ def sliding_block(cell, height, normals, start=0.0, n_low=8, length=2.0, offset=
 
 
 @pytest.mark.parametrize("normals", ["facet", "averaged"])
-@pytest.mark.parametrize("cell,height", [("triangle", 0.4), ("triangle", -0.4), ("hexahedron", 0.4), ("hexahedron", -0.4)])
+@pytest.mark.parametrize("cell,height", [("triangle", 0.15), ("triangle", -0.15), ("hexahedron", 0.15), ("hexahedron", -0.15)])
 def test_sliding_along_a_polygon(cell, height, normals):
     """Over several facets and vertices of an arch or a bowl, starting exactly on a vertex; no step is cut, none cycles."""
     # the block's corners start above nodes of the polygon
-    s, V, u, (bottom, low, high, top) = sliding_block(cell, height, normals, offset=0.0 if height > 0 else 0.4)
+    offset = 0.0 if height > 0 else -height / 4
+    s, V, u, (bottom, low, high, top) = sliding_block(cell, height, normals, offset=offset)
     g = V.mesh.geometry.dim
     path = fem.Function(V)
     dofs = fem.locate_dofs_topological(V, g - 1, top.entities)
@@ -378,8 +380,8 @@ def test_sliding_along_a_polygon(cell, height, normals):
         p = path.x.array.reshape(-1, g)
         middle = 0.25 + factor
         p[:, 0] = factor
-        # follow the polygon's parabola, pressed in by a tenth
-        p[:, -1] = -height * (middle - 0.5) ** 2 - 0.05 - (0.4 if height < 0 else 0.0) * 0.9
+        # follow the polygon's parabola, pressed in a little
+        p[:, -1] = -height * (middle - 0.5) ** 2 - 0.02 - offset / 2
 
     problem = uem.UnitedProblem(
         st_venant(u, modulus(s, 1.0, 2.0)), u, bcs=[*clamp(V, bottom), fem.dirichletbc(path, dofs)], contacts=[contact], load=load
@@ -422,7 +424,10 @@ def test_sliding_off_the_end(normals):
 @pytest.mark.parametrize("normals", ["facet", "averaged"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_contactor_exactly_on_a_vertex(cell, normals):
-    """Matching meshes over a roof: every contactor sits on a vertex and stays there, by symmetry the ridge moves straight down."""
+    """Matching meshes over a roof: every contactor starts on a vertex, the middle ones on a ridge.
+
+    On a ridge the facets' normals have no balance but on one of its slopes; averaged normals keep the symmetry of the scene.
+    """
 
     def roof(x):
         y = x.copy()
@@ -440,10 +445,29 @@ def test_contactor_exactly_on_a_vertex(cell, normals):
     complementary(contact, 1e-13, 1e-12)
     u, x = b.scene.gather(b.u), b.scene.drawing
     ridge = (np.abs(x[:, 0] - 0.5) < 1e-9) & (np.abs(x[:, -1]) < 1e-9)
-    if cell == "hexahedron":
+    if cell == "hexahedron" and normals == "averaged":
         assert np.abs(u[ridge, 0]).max() < 1e-9
     assert u[ridge, -1].max() < -0.005
     assert contact.resultant().force[-1] > 0
+
+
+@pytest.mark.parametrize("cell,ratio", product(("quadrilateral", "tetrahedron", "hexahedron"), (0.2, 5.0)))
+def test_contactors_on_the_rim_of_the_target(cell, ratio):
+    """Equal blocks with free sides: the softer bulges past the stiffer one's rim, where contactors sit from the start."""
+    b = blocks(COMM, cell, 2, 4 if b_is_flat(cell) else 3)
+    g = b.gdim
+    contact = uem.Contact(b.high, b.low)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0] * (g - 1) + [-0.1])]
+    problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, ratio)), b.u, bcs=bcs, contacts=[contact])
+    for step in uem.load_steps(problem, 2):
+        assert step.cuts == 0 and step.newton_iterations <= 20
+        complementary(contact, 1e-12, 1e-10)
+    assert contact.n_active > 1
+
+
+def b_is_flat(cell):
+    """Whether cells are two-dimensional."""
+    return cell in ("triangle", "quadrilateral")
 
 
 @pytest.mark.parametrize("normals", ["facet", "averaged"])

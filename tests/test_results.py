@@ -11,11 +11,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from mpi4py import MPI
+
 import helpers
 import numpy as np
 import pytest
 import ufl
-from mpi4py import MPI
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, results
@@ -106,6 +107,7 @@ def test_vtx_where_there_is_none_is_a_named_error(folder: Path) -> None:
 def test_pictures(folder: Path, cell: str) -> None:
     pytest.importorskip("matplotlib")
     problem = pressed(cell, names=("pair", "asleep"))
+    uem.plot_scene(problem, folder / "start.png")
     for _ in uem.load_steps(problem):
         pass
     uem.plot_scene(problem, folder / "scene.png")
@@ -123,7 +125,7 @@ def test_pictures(folder: Path, cell: str) -> None:
         )
         uem.plot_pressure(problem.contacts[0], right, mirror=True, along=lambda x: x[:, 0], window=(-1.0, 1.0))
     comm.barrier()
-    for name in ("scene.png", "pressure.png", "new/both.png"):
+    for name in ("start.png", "scene.png", "pressure.png", "new/both.png"):
         assert (folder / name).stat().st_size > 5000
     with uem.figure(None, comm) as (panel,):
         assert panel is None

@@ -10,13 +10,14 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
+
 import basix
 import dolfinx.common
 import dolfinx.fem.petsc
 import numpy as np
 import ufl
 from dolfinx import cpp, fem, io, la, mesh
-from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 from petsc4py import PETSc
 
 from .errors import MissingBackendError
@@ -273,9 +274,7 @@ def create_lagrange_element(cell: str, degree: int) -> Any:
     Returns:
         The Basix element; ``tabulate(n, points)`` has shape ``(n_derivatives, n_points, n_nodes, 1)``.
     """
-    return basix.create_element(
-        basix.ElementFamily.P, getattr(basix.CellType, cell), degree, basix.LagrangeVariant.gll_warped
-    )
+    return basix.create_element(basix.ElementFamily.P, getattr(basix.CellType, cell), degree, basix.LagrangeVariant.gll_warped)
 
 
 def reference_topology(cell: str) -> list[list[list[int]]]:

@@ -11,8 +11,9 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from dolfinx.common import Timer
 from mpi4py import MPI
+
+from dolfinx.common import Timer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -23,8 +23,9 @@ from uem_dolfinx.log import logger, timed
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    import numpy.typing as npt
     from mpi4py import MPI
+
+    import numpy.typing as npt
 
 Key: TypeAlias = "str | int | tuple[int, str | int]"
 
@@ -368,9 +369,7 @@ def _elements(model: Any, dim: int, entity: int) -> dict[int, npt.NDArray[np.int
     return {int(k): np.asarray(n, dtype=np.int64).reshape(len(t), -1) for k, t, n in zip(kinds, tags, nodes) if len(t)}
 
 
-def _vertex_rows(
-    model: Any, dim: int, entities: list[int], node_tags: npt.NDArray[np.int64]
-) -> npt.NDArray[np.int64]:
+def _vertex_rows(model: Any, dim: int, entities: list[int], node_tags: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Vertices of a group's elements as ascending input node index; elements off the bodies are left out."""
     rows = []
     for entity in entities:

@@ -79,6 +79,10 @@ class United:
 class UnitedSystem(Protocol):
     """What the loop needs of the problem; every method is collective."""
 
+    @property
+    def linear(self) -> bool:
+        """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
+
     def place(self, returning: bool) -> None:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
 
@@ -183,19 +187,24 @@ def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec,
         last = not line_search or length <= SHORTEST_STEP
         system.displace(start, du, length)
         where = system.inverted()
-        if where is None:
-            system.place(returning=length == 1.0)
-            finite = system.assemble_residual()
-            if finite:
-                residual = system.reduced_residual(state)
-                less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
-                if last or less_work or residual.norm() <= ENOUGH_DECREASE * norm:
-                    return length
+        if where is not None:
             if last:
-                raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+                raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+        elif not line_search or system.linear:
+            break
+        # the bodies are asked before the normal return, which has its own reasons to move a contactor
+        elif system.assemble_residual():
+            residual = system.reduced_residual(state)
+            less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
+            if last or less_work or residual.norm() <= ENOUGH_DECREASE * norm:
+                break
         elif last:
-            raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+            break
         length *= 0.5
+    system.place(returning=length == 1.0)
+    if not system.assemble_residual():
+        raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+    return length
 
 
 def _ratio(norm: float, scale: float) -> float:

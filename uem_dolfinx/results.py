@@ -320,15 +320,16 @@ def _draw_scene(
     used[triangles] = True
     reach = np.abs(x[:, 0]) if mirror else x[:, 0]
     shown = used & (reach <= window[1]) & (x[:, 1] >= window[2]) & (x[:, 1] <= window[3])
+    seen = values[shown] if shown.any() else values[used]
+    bounds: Any = levels
     if isinstance(levels, int):
-        seen = values[shown] if shown.any() else values[used]
-        levels = MaxNLocator(levels).tick_values(float(seen.min()), float(seen.max()))
-    beyond = (values[shown].min(initial=np.inf) < levels[0]) + 2 * (values[shown].max(initial=-np.inf) > levels[-1])
+        bounds = MaxNLocator(levels).tick_values(float(seen.min()), float(seen.max()))
+    beyond = int(seen.min() < bounds[0]) + 2 * int(seen.max() > bounds[-1])
     extend = ("neither", "min", "max", "both")[beyond]
     coloured = None
     for side in (1.0, -1.0) if mirror else (1.0,):
         y = x * [side, 1.0]
-        coloured = ax.tricontourf(y[:, 0], y[:, 1], triangles, values, levels=levels, cmap=cmap, extend=extend)
+        coloured = ax.tricontourf(y[:, 0], y[:, 1], triangles, values, levels=bounds, cmap=cmap, extend=extend)
         if cells:
             ax.add_collection(LineCollection(y[outline], colors="k", linewidths=0.25, alpha=0.35))
     ax.figure.colorbar(coloured, ax=ax, label=label, shrink=0.85)

@@ -234,10 +234,8 @@ class MeshTarget:
         parts = comm.alltoall([_pack(answer, distance, slice(a, b)) for a, b in pairwise(ends)])
         which = np.concatenate(requests)
         d = np.concatenate([part[0] for part in parts])
-        # nearest first; a tie goes to the lower rank, whose answer on the shared side is the same
-        order = np.lexsort((np.arange(len(d)), d, which))
-        _, first = np.unique(which[order], return_index=True)
-        best = order[first]
+        gap = np.concatenate([part[1][0] for part in parts])
+        best = _nearest(which, d, gap, np.arange(len(d)))
         return FacetProjection(*(np.concatenate([part[1][k] for part in parts])[best] for k in range(len(parts[0][1]))))
 
     def _project_here(
@@ -246,11 +244,11 @@ class MeshTarget:
         """Project onto this rank's facets: projections and distances."""
         if facet is None:
             pairs, candidates = candidate_pairs(self.shape, data.x, points)
-            xi, d2 = closest_point(self.shape, data.x[candidates], points[pairs])
-            # the nearest facet; among those tied at a shared side, the one with the lowest number
-            order = np.lexsort((candidates, d2, pairs))
-            _, first = np.unique(pairs[order], return_index=True)
-            best = order[first]
+            xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
+            tab = self.shape.tabulate(xi)
+            away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
+            height = np.einsum("ng,ng->n", away, unit_normals(tab, x)) * self.facets.sign[candidates]
+            best = _nearest(pairs, np.sqrt(d2), height, candidates)
             facet, xi = candidates[best], xi[best]
         elif xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
@@ -268,25 +266,22 @@ class MeshTarget:
         averaged_normal = raw / np.where(length > 0, length, 1.0)
         on_side = self.shape.side_distances(xi) < ON_SIDE
         is_open = self.facets.open_sides[facet]
+        away = points - foot
         # exactly on a shared side either facet's normal would be an arbitrary choice
-        use_average = np.full(len(points), True) if self.averaged else (on_side & ~is_open).any(axis=1)
+        at_side = np.linalg.norm(away, axis=1) <= ON_SIDE * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+        use_average = np.full(len(points), True) if self.averaged else at_side & (on_side & ~is_open).any(axis=1)
         use_average &= length[:, 0] > 0
         normal = np.where(use_average[:, None], averaged_normal, facet_normal)
         bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / np.where(length > 0, length, 1.0)[:, :, None]
         bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
         bend[~use_average] = 0.0
-        gap = np.einsum("ng,ng->n", normal, points - foot)
-        # inside a facet an averaged normal leans, and the way along it is longer
-        lean = np.where(on_side.any(axis=1), 1.0, np.einsum("ng,ng->n", normal, facet_normal))
-        gap = np.where(lean > LEAST_LEAN, gap / lean**2, gap)
-        beyond = points - foot - gap[:, None] * normal
+        # along an averaged normal, which leans, the way to the facet is longer than to its closest point
+        lean = np.einsum("ng,ng->n", normal, facet_normal)
+        gap = np.einsum("ng,ng->n", facet_normal, away) / np.where(lean > LEAST_LEAN, lean, 1.0)
+        beyond = away - gap[:, None] * normal
         # a facet may touch the surface's end with a vertex alone
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
         beyond[~at_end] = 0.0
-        # along an averaged normal the way to the facet is longer than to its closest point
-        slope = np.einsum("ng,ng->n", normal, facet_normal)
-        leaning = use_average & ~on_side.any(axis=1)
-        gap = np.where(leaning, np.einsum("ng,ng->n", facet_normal, points - foot) / np.where(leaning, slope, 1.0), gap)
         return FacetProjection(
             gap,
             normal,
@@ -302,6 +297,20 @@ class MeshTarget:
             tab.ddN,
             bend,
         )
+
+
+def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints:
+    """The nearest of several candidates for each point, as indices.
+
+    Outside a convex edge the facets that share it are equally near; the point is then above the one over which it is highest,
+    so that it cannot hover in the plane of another. What is still tied goes by number.
+    """
+    closest = np.full(points.max(initial=-1) + 1, np.inf)
+    np.minimum.at(closest, points, distance)
+    farther = distance > closest[points] * (1 + 1e-9) + np.finfo(float).tiny
+    order = np.lexsort((number, -np.round(height / np.where(closest > 0, closest, 1.0)[points], 9), farther, points))
+    _, first = np.unique(points[order], return_index=True)
+    return order[first]
 
 
 def _unit_normals_of(p: FacetProjection) -> Array:

@@ -35,6 +35,8 @@ Bools = npt.NDArray[np.bool_]
 
 #: Multiple of the rounding of K u that the residual may be left with.
 ROUNDING = 4.0 * np.finfo(float).eps
+#: Residual relative to the forces at work below which contact forces can be trusted to release a contactor for good.
+SETTLED = 1e-6
 #: Part of the model's size that an active contactor's gap may be left with.
 CLOSED = 1e-13
 
@@ -179,8 +181,9 @@ class BodySystem:
             restriction = self._restrict()
             y = restriction.pass_on(F)
             self._read_forces(restriction, y)
+            settled = restriction.reduce(y).norm() <= max(SETTLED * F.norm(), rounding)
             # every pair decides, whatever the others did
-            decisions = [pair.decide(rounding, cautious) for pair in self.pairs]
+            decisions = [pair.decide(rounding, cautious, settled) for pair in self.pairs]
             changed = any(decisions)
             if changed:
                 for pair in self.pairs:
@@ -322,6 +325,11 @@ class BodySystem:
             n = self.config.n_owned
             self.config.displacement[:n][~self.free[:n]] = self.wanted[:n][~self.free[:n]]
         self.u.x.scatter_forward()
+
+    @property
+    def linear(self) -> bool:
+        """Whether the bodies' forces are linear in the displacement."""
+        return self.tangent.linear
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
         """``P'F`` at the present displacement, with the active set of ``state``.

@@ -26,6 +26,8 @@ Bools = npt.NDArray[np.bool_]
 
 #: A contactor past an open end by more than this part of its facet has slid off.
 SLID_OFF = 1e-6
+#: A contactor that came back after it had slid off is held at the end of the target, up to this part of the facet beyond it.
+END_HOLDS = 0.1
 #: Gaps below this part of the model's size are zero.
 GAP_ROUNDING = 1e-13
 #: A body touches at the start when its gap is below this part of the model's size.
@@ -38,6 +40,8 @@ GENTLE = 0.1
 HOLD_AFTER = 2
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
 MOST_CHANGES = 8
+#: A corner holds a contactor if its free components keep this part of each of the corner's directions.
+FREE_ENOUGH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,7 @@ class PairState:
         facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
         held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
         changes: how often in this step it has changed facets across a bend ``(n,)``.
+        slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
     """
 
     active: Bools
@@ -106,6 +111,7 @@ class PairState:
     facet: Ints
     held: Ints
     changes: Ints
+    slips: Ints
 
     @property
     def united_to(self) -> bytes:
@@ -149,6 +155,7 @@ class ContactPair:
             np.zeros((n, config.gdim)),
             none,
             np.full((n, config.gdim - 1), -1),
+            np.zeros(n, np.int64),
             np.zeros(n, np.int64),
         )
         self.trial = self.last_commit = self.committed
@@ -310,7 +317,8 @@ class ContactPair:
         if not isinstance(self.projection, FacetProjection):
             return beyond > 0
         x = self.projection.x
-        return beyond > SLID_OFF * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+        limit = np.where(self.trial.slips > 1, END_HOLDS, SLID_OFF)
+        return beyond > limit * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
 
     # -- activation and release ------------------------------------------------------------------------------------
 
@@ -353,12 +361,13 @@ class ContactPair:
         entering = (self.projection.gap < 0) & ~self.off & self.movable
         self.trial = replace(self.trial, active=np.where(self.committed.active, lam >= 0, entering))
 
-    def decide(self, force_rounding: float, cautious: bool) -> bool:
+    def decide(self, force_rounding: float, cautious: bool, settled: bool) -> bool:
         """Release contactors in tension, activate penetrating ones (collective).
 
         Args:
             force_rounding: forces below it are zero.
-            cautious: change only the worst contactor, which ends a cycle of active sets.
+            cautious: change only the worst contactor, and release none before equilibrium: this ends a cycle of active sets.
+            settled: whether the bodies are in equilibrium with the present active set.
 
         Returns:
             Whether any rank changed what its contactors are united to.
@@ -374,10 +383,11 @@ class ContactPair:
             # a body that comes down on a paraboloid touches where the overlap exceeds half of the deepest
             enter &= gap <= -0.5 * deepest
         if cautious:
-            enter &= gap <= -deepest
-            release &= off | (state.lam <= -tension) if deepest == 0.0 else off
+            enter &= (gap <= -deepest) | (state.slips > 1)
+            release &= off | (state.lam <= -tension) if settled and deepest == 0.0 else off
         active = (state.active | enter) & ~release
-        self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0))
+        slips = state.slips + (release & off)
+        self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips)
         changed = bool(enter.any() or release.any())
         if self._has_corners:
             changed |= self._leave_corners()
@@ -428,7 +438,7 @@ class ContactPair:
             c = self._corners_of(i[ask], others[ask])
             if c is None:
                 continue
-            hold = c.concave & (state.changes[c.which] >= HOLD_AFTER)
+            hold = c.concave & self._can_be_held(c) & (state.changes[c.which] >= HOLD_AFTER)
             held[c.which[hold]] = others[ask[hold]]
             taken[ask[hold]] = True
             changes[c.which[~c.flat]] += 1
@@ -437,6 +447,12 @@ class ContactPair:
         facet[switch], held[switch] = nearest[switch], -1
         self.trial = replace(state, facet=facet, held=held, changes=changes)
         return bent
+
+    def _can_be_held(self, c: Corners) -> Bools:
+        """Corners whose contactor has a free direction for every facet ``(k,)``."""
+        asked = np.arange(self.config.gdim) < c.count[:, None]
+        A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
+        return (np.linalg.svd(A, compute_uv=False) > FREE_ENOUGH).sum(axis=1) == c.count
 
     # -- what the united system gets ---------------------------------------------------------------------------------
 
@@ -498,7 +514,8 @@ class ContactPair:
 
     def commit(self) -> None:
         """Make the trial state the committed one."""
-        self.last_commit, self.committed = self.committed, replace(self.trial, changes=np.zeros_like(self.trial.changes))
+        slips = np.where(self.trial.active, self.trial.slips, 0)
+        self.last_commit, self.committed = self.committed, replace(self.trial, changes=np.zeros_like(slips), slips=slips)
         self.trial = self.committed
         self._corners = None
         if self.sliding == "small":
