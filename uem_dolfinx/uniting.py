@@ -390,19 +390,19 @@ class ContactPair:
         self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips)
         changed = bool(enter.any() or release.any())
         if self._has_corners:
-            changed |= self._leave_corners()
+            changed |= self._leave_corners(settled or not cautious)
             changed |= self._change_facets()
         return bool(comm.allreduce(changed))
 
-    def _leave_corners(self) -> bool:
-        """Let go of the facet of a corner that would have to pull."""
+    def _leave_corners(self, trusted: bool) -> bool:
+        """Let go of the facet of a corner that would have to pull, if the forces are to be trusted."""
         self._left = np.zeros(len(self.nodes), dtype=bool)
         c, state = self._corners, self.trial
         if c is None or not len(c.which):
             return False
         i = c.which
         pulls = c.pulls(state.force[i])
-        leaving = (pulls < 0).any(axis=1) | ~state.active[i]
+        leaving = (trusted & (pulls < 0).any(axis=1)) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)
         facets[rows, np.argmin(pulls[rows], axis=1)] = -1
