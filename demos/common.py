@@ -15,6 +15,8 @@ import numpy as np
 from dolfinx import fem
 from petsc4py import PETSc
 
+from uem_dolfinx import compat
+
 if TYPE_CHECKING:
     import uem_dolfinx as uem
 
@@ -47,6 +49,15 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
         parser.add_argument("--" + name.replace("_", "-"), help=f"default: {kind['default']}", **kind)
     logging.basicConfig(format="%(message)s")
     return parser.parse_args()
+
+
+def cg(amg: str = "", rtol: float = 1e-10) -> dict[str, Any]:
+    """PETSc options of CG with algebraic multigrid, hypre where PETSc has it."""
+    options = {"ksp_type": "cg", "ksp_rtol": rtol, "pc_type": amg or ("hypre" if compat.has_hypre() else "gamg")}
+    if options["pc_type"] == "hypre":
+        hypre = {"strong_threshold": 0.5, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4}
+        options |= {f"pc_hypre_boomeramg_{key}": value for key, value in hypre.items()}
+    return options
 
 
 def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) -> fem.DirichletBC:

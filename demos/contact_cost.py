@@ -28,10 +28,7 @@ from uem_dolfinx import compat
 args = common.arguments(__doc__, dofs=100_000, degree=1)
 CONTACT = ("search and projection", "uniting equations", "contact curvature", "united matrix P'KP")
 OTHERS = ("assemble residual", "assemble tangent", "linear solve")
-CG = {"ksp_type": "cg", "ksp_rtol": 1e-8}
-AMG = {"gamg": CG | {"pc_type": "gamg"}}
-if compat.has_hypre():
-    AMG["hypre"] = CG | {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
+AMG = ("gamg", "hypre") if compat.has_hypre() else ("gamg",)
 
 
 def elastic(mesh, dim: int) -> tuple[fem.Function, ufl.Form]:
@@ -93,7 +90,9 @@ def cg_iterations(dim: int, amg: str, fused: bool) -> tuple[int, int]:
     bcs = [dirichlet(V, tags[name], i, 0.0) for name in ("bottom", "top") for i in range(dim - 1)]
     bcs += [dirichlet(V, tags["bottom"], dim - 1, 0.0), dirichlet(V, tags["top"], dim - 1, -0.01)]
     contacts = [] if fused else [uem.Contact(contactor=tags["upper_bottom"], target=tags["lower_top"])]
-    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=AMG[amg], rtol=1e-6)
+    problem = uem.UnitedProblem(
+        F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=common.cg(amg, 1e-8), rtol=1e-6
+    )
     solves = [i.linear_iterations for i in problem.solve() if i.linear_iterations]
     return round(sum(solves) / len(solves)), dim * V.dofmap.index_map.size_global
 

@@ -33,9 +33,7 @@ from uem_dolfinx.surfaces import Configuration
 
 args = common.arguments(__doc__, N=30, degree=1)
 R, d = 0.5, 0.02
-OPTIONS = {"ksp_type": "cg", "ksp_rtol": 1e-8, "pc_type": "hypre" if compat.has_hypre() else "gamg"}
-if compat.has_hypre():
-    OPTIONS |= {"pc_hypre_type": "boomeramg", "pc_hypre_boomeramg_strong_threshold": 0.5}
+OPTIONS = common.cg(rtol=1e-8)
 
 
 def h(x):

@@ -33,9 +33,6 @@ args = common.arguments(__doc__, h=0.0005, ratio=1.0, normals=("facet", "average
 E, nu, R = 1e6, 0.3, 1.0
 E_star, a = E / (2 * (1 - nu**2)), np.sqrt(R * args.d)
 F_hertz = 4 / 3 * E_star * np.sqrt(R) * args.d**1.5
-OPTIONS = {"ksp_type": "cg", "ksp_rtol": 1e-10, "pc_type": "hypre" if compat.has_hypre() else "gamg"}
-if compat.has_hypre():
-    OPTIONS |= {"pc_hypre_type": "boomeramg", "pc_hypre_boomeramg_strong_threshold": 0.5}
 
 
 # %% [markdown]
@@ -61,7 +58,7 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
     ]
     contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], normals=args.normals)
     problem = uem.UnitedProblem(
-        residual, u, bcs=bcs, contacts=[contact], petsc_options_prefix="sphere_", petsc_options=OPTIONS, verbose=args.verbose
+        residual, u, bcs=bcs, contacts=[contact], petsc_options_prefix="sphere_", petsc_options=common.cg(), verbose=args.verbose
     )
     start = time.perf_counter()
     steps = list(uem.load_steps(problem, args.steps))

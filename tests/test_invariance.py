@@ -134,7 +134,7 @@ def test_ranks(reference, case):
 def test_rigid_motion_after_contact_leaves_the_forces(cell):
     """A pressed pair that is carried away and turned as a whole keeps its pressure: finite strain is objective."""
     g = 2 if cell == "triangle" else 3
-    b = blocks(COMM, cell, 4 if g == 2 else 2, 4 if g == 2 else 2, gap=0.1, overhang=0.5, pose=arch)
+    b = blocks(COMM, cell, 5 if g == 2 else 3, 4 if g == 2 else 2, gap=0.1, overhang=0.5, pose=arch)
     bottom, top = fem.Function(b.V), fem.Function(b.V)
     x = b.V.tabulate_dof_coordinates()[: len(bottom.x.array) // g, :g]
     contact = uem.Contact(b.high, b.low, max_penetration=0.2)

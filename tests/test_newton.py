@@ -164,7 +164,7 @@ def pressed(cell="triangle", height=0.3, d=0.2, law=st_venant, fine=2, overhang=
 def test_linear_body_assembles_its_tangent_once():
     b, contact, problem = pressed(law=linear, sliding="fixed", consistent_tangent=False)
     steps = run(problem, 3)
-    assert sum(step.newton_iterations for step in steps) > 3
+    assert sum(step.newton_iterations for step in steps) >= 3
     assert problem.system.tangent.number == 1
     assert contact.n_active > 0
 
@@ -240,7 +240,7 @@ def test_release_when_pulled_apart():
 
 def test_big_step_is_cut():
     """A step that fails in the iterations it is given is halved, and grown again; the end is the same."""
-    b, contact, problem = pressed(d=0.3, rtol=1e-10, max_iterations=6)
+    b, contact, problem = pressed(d=0.3, rtol=1e-10, max_iterations=4)
     steps = run(problem)
     assert sum(s.cuts for s in steps) > 0 and steps[-1].factor == 1.0
     assert [s.number for s in steps] == list(range(1, len(steps) + 1))

@@ -189,7 +189,9 @@ def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec,
         where = system.inverted()
         if where is not None:
             if last:
-                raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+                raise InvertedElementError(
+                    f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there"
+                )
         elif not line_search or system.linear:
             break
         # the bodies are asked before the normal return, which has its own reasons to move a contactor

@@ -41,8 +41,9 @@ def default_options(size: int, gdim: int) -> dict[str, Any]:
             "pc_type": "hypre",
             "pc_hypre_type": "boomeramg",
             "pc_hypre_boomeramg_strong_threshold": 0.5 if gdim == 3 else 0.25,
-            "pc_hypre_boomeramg_nodal_coarsen": 4,
-            "pc_hypre_boomeramg_vec_interp_variant": 2,
+            "pc_hypre_boomeramg_coarsen_type": "HMIS",
+            "pc_hypre_boomeramg_interp_type": "ext+i",
+            "pc_hypre_boomeramg_P_max": 4,
         }
     return common | {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
 

@@ -222,7 +222,11 @@ class ContactPair:
         if self._corners is None:
             return projection
         c = self._corners
-        at_corner: dict[str, Any] = {"normal": c.axes[:, 0], "gap": c.gaps(self.points[held])[:, 0], "facet": self.trial.facet[held]}
+        at_corner: dict[str, Any] = {
+            "normal": c.axes[:, 0],
+            "gap": c.gaps(self.points[held])[:, 0],
+            "facet": self.trial.facet[held],
+        }
         return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0})
 
     def _corners_of(self, which: Ints, others: Ints) -> Corners | None:
