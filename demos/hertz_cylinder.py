@@ -111,14 +111,14 @@ results = {
 # %% [markdown]
 # ## The order of convergence
 # The load steps end after two or three iterations, at rounding, too soon to see an order. So the solution is disturbed by a wave
-# along the contact, once of height 0.0001 a and once of half of it: the first residual on the way back shrinks with the power
+# along the contact, once of height 0.00001 a and once of half of it: the first residual on the way back shrinks with the power
 # that is the order: 2 with the consistent tangent, 1 without, as long as no contactor changes facets on the way.
 
 # %%
 solution, x = u.x.array.copy(), V.tabulate_dof_coordinates()[: len(u.x.array) // 2, :2] / results["a_hertz"]
 wave = np.exp(-(x**2).sum(axis=1)) * np.sin(6 * x[:, 0])
 after = []
-for height in (1e-4, 0.5e-4):
+for height in (1e-5, 0.5e-5):
     u.x.array[:] = solution
     u.x.array[1::2] += height * results["a_hertz"] * wave
     after.append(problem.solve()[1].residual)

@@ -16,7 +16,7 @@ If (dim == 2)
   bottom() = Curve In BoundingBox {-e, -e, -e, 1 + e, e, e};
   top() = Curve In BoundingBox {-e, 1.5 - e, -e, 1 + e, 1.5 + e, e};
   level() = Curve In BoundingBox {-e, 1 - e, -e, 1 + e, 1 + e, e};
-  other() = Boundary{ Surface{2}; };
+  upper_bottom() = Curve In BoundingBox {0.25 - e, 1 - e, -e, 0.75 + e, 1 + e, e};
   Physical Surface("blocks") = Surface{:};
   Physical Curve("bottom") = {bottom()};
   Physical Curve("top") = {top()};
@@ -29,7 +29,7 @@ Else
   bottom() = Surface In BoundingBox {-e, -e, -e, 1 + e, 1 + e, e};
   top() = Surface In BoundingBox {-e, -e, 1.5 - e, 1 + e, 1 + e, 1.5 + e};
   level() = Surface In BoundingBox {-e, -e, 1 - e, 1 + e, 1 + e, 1 + e};
-  other() = Boundary{ Volume{2}; };
+  upper_bottom() = Surface In BoundingBox {0.25 - e, 0.25 - e, 1 - e, 0.75 + e, 0.75 + e, 1 + e};
   Physical Volume("blocks") = Volume{:};
   Physical Surface("bottom") = {bottom()};
   Physical Surface("top") = {top()};
@@ -37,9 +37,7 @@ EndIf
 
 If (!fused)
   lower_top() = level();
-  lower_top() -= other();
-  upper_bottom() = level();
-  upper_bottom() -= lower_top();
+  lower_top() -= upper_bottom();
   If (dim == 2)
     Physical Curve("lower_top") = {lower_top()};
     Physical Curve("upper_bottom") = {upper_bottom()};

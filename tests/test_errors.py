@@ -79,12 +79,18 @@ def test_contactor_touches_its_target_in_one_node():
 def test_target_between_two_cells(cell):
     """A surface inside a body, as of bodies meshed together, has no outside."""
     g = 2 if cell == "triangle" else 3
-    s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g), box(cell, [0.0] * (g - 1) + [1.5], [1.0] * (g - 1) + [2.5], [2] * g)])
+    s = scene(
+        COMM,
+        cell,
+        [box(cell, [0.0] * g, [1.0] * g, [2] * g), box(cell, [0.0] * (g - 1) + [1.5], [1.0] * (g - 1) + [2.5], [2] * g)],
+    )
     V = compat.function_space(s.mesh, 1, (g,))
     u = fem.Function(V)
     inside, high = s.tag("inside", 0, at(g - 1, 0.5)), s.tag("high", 1, at(g - 1, 1.5))
     F = linear(u, fem.Constant(s.mesh, PETSc.ScalarType(1.0)))
-    on_every_rank(uem.OrientationError, "'inside'.*between two cells", lambda: uem.UnitedProblem(F, u, contacts=[uem.Contact(high, inside)]))
+    on_every_rank(
+        uem.OrientationError, "'inside'.*between two cells", lambda: uem.UnitedProblem(F, u, contacts=[uem.Contact(high, inside)])
+    )
 
 
 def test_contact_before_its_problem():
@@ -155,7 +161,9 @@ def test_residual_without_the_displacement():
 def test_initial_penetration_beyond_the_bound():
     b = blocks(COMM, "triangle", 2, 4, gap=-0.02, overhang=0.25)
     error = on_every_rank(
-        uem.PenetrationError, "0.02 inside the target.*max_penetration = 0.01", lambda: problem_of(b, uem.Contact(b.high, b.low, max_penetration=0.01))
+        uem.PenetrationError,
+        "0.02 inside the target.*max_penetration = 0.01",
+        lambda: problem_of(b, uem.Contact(b.high, b.low, max_penetration=0.01)),
     )
     assert "high on low" in str(error)
 
@@ -198,7 +206,13 @@ def test_residual_that_becomes_infinite():
     barrier = fem.Constant(b.scene.mesh, PETSc.ScalarType(1e-6))
     v = ufl.TestFunction(b.V)
     wall = barrier * ufl.ln(0.005 + b.u[1]) * v[1] * compat.surface_measure(b.scene.mesh, b.top.entities)
-    problem = problem_of(b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + wall, bcs=b.oedometer(0.01), max_iterations=10)
+    problem = problem_of(
+        b,
+        uem.Contact(b.high, b.low),
+        F=st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + wall,
+        bcs=b.oedometer(0.01),
+        max_iterations=10,
+    )
     reached = 0.0
 
     def load():
@@ -217,14 +231,18 @@ def test_residual_that_becomes_infinite():
 def test_inverted_element():
     """A prescribed displacement that turns cells inside out is named with its place, and taken back."""
     b = blocks(COMM, "triangle", 2, 4)
-    problem = problem_of(b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 1.0)), bcs=b.oedometer(2.5), line_search=False)
+    problem = problem_of(
+        b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 1.0)), bcs=b.oedometer(2.5), line_search=False
+    )
     on_every_rank(uem.InvertedElementError, r"cell at \[.*inside out", lambda: problem.solve())
     assert not b.u.x.array.any()
 
 
 def test_no_convergence():
     b = blocks(COMM, "triangle", 2, 4)
-    problem = problem_of(b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 3.0)), bcs=b.oedometer(0.2), max_iterations=2)
+    problem = problem_of(
+        b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 3.0)), bcs=b.oedometer(0.2), max_iterations=2
+    )
     error = on_every_rank(uem.ConvergenceError, "no convergence in 2 iterations.*smaller load steps", lambda: problem.solve())
     assert [i.active for i in error.history] == [5, 5, 5]
     assert error.history[-1].linear_iterations == 0 and error.history[-1].residual > 1e-8
@@ -256,7 +274,9 @@ def test_mutual_contact():
 def test_missing_backend(monkeypatch, backend, options):
     monkeypatch.setattr(compat, f"has_{backend}", lambda: False)
     b = blocks(COMM, "triangle", 2, 2)
-    error = on_every_rank(uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options))
+    error = on_every_rank(
+        uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options)
+    )
     assert "use" in str(error)
 
 

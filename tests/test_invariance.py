@@ -36,7 +36,9 @@ def rotation(g, angle, other=0.0):
     return R
 
 
-def press(cell, *, comm=COMM, turn=None, shift=0.0, length=1.0, stress=1.0, shuffle=None, law=st_venant, normals="facet", steps=2):
+def press(
+    cell, *, comm=COMM, turn=None, shift=0.0, length=1.0, stress=1.0, shuffle=None, law=st_venant, normals="facet", steps=2
+):
     """Press a block sideways onto an arch; displacements, forces and counts in the drawing's frame and units."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     R = np.eye(g) if turn is None else turn
@@ -97,7 +99,9 @@ def test_translation(reference, case):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("angle", [0.3, np.pi / 2, -2.0])
 def test_rotation(reference, case, angle):
-    turned = press(case[0], normals=case[1], turn=rotation(2 if case[0] in ("triangle", "quadrilateral") else 3, angle, 0.7 * angle))
+    turned = press(
+        case[0], normals=case[1], turn=rotation(2 if case[0] in ("triangle", "quadrilateral") else 3, angle, 0.7 * angle)
+    )
     same(turned, reference[case], 1e-9)
     assert turned["iterations"] == reference[case]["iterations"]
 
@@ -147,8 +151,12 @@ def test_rigid_motion_after_contact_leaves_the_forces(cell):
         bottom.x.array[:] = (x @ R.T - x + shift).ravel()
         top.x.array[:] = ((x + press_down) @ R.T - x + shift).ravel()
 
-    bcs = [fem.dirichletbc(f, fem.locate_dofs_topological(b.V, g - 1, tag.entities)) for f, tag in ((bottom, b.bottom), (top, b.top))]
-    problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], load=load, rtol=1e-11)
+    bcs = [
+        fem.dirichletbc(f, fem.locate_dofs_topological(b.V, g - 1, tag.entities)) for f, tag in ((bottom, b.bottom), (top, b.top))
+    ]
+    problem = uem.UnitedProblem(
+        st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], load=load, rtol=1e-11
+    )
     for step in uem.load_steps(problem, 8):
         if step.factor >= 0.5:
             pressures.append(b.scene.gather(contact.pressure))

@@ -41,7 +41,9 @@ def loop_closest(shape, x, p):
     grid = grid[shape.contains(grid)]
     start = grid[np.argmin(((shape.tabulate(grid).N @ x - p) ** 2).sum(axis=1))]
     below = [{"type": "ineq", "fun": lambda xi: 1 - xi.sum()}] if shape.cell == "triangle" else []
-    best = minimize(d2, start, bounds=[(0, 1)] * shape.dim, constraints=below, method="SLSQP", options={"ftol": 1e-16, "maxiter": 100})
+    best = minimize(
+        d2, start, bounds=[(0, 1)] * shape.dim, constraints=below, method="SLSQP", options={"ftol": 1e-16, "maxiter": 100}
+    )
     return min(best.fun, d2(start)) ** 0.5
 
 
@@ -215,7 +217,9 @@ def test_points_on_vertices_and_sides(cell):
     assert np.abs(p.gap).max() <= 4 * EPS
     assert np.linalg.norm(p.foot - corners, axis=1).max() <= 4 * EPS
     # the corners of a facet, each with its two neighbours on the rim
-    rim = {"triangle": [(0, 1), (1, 0)], "tetrahedron": [(0, 1, 2), (1, 2, 0), (2, 0, 1)]}.get(cell, [(0, 1, 2), (1, 3, 0), (2, 0, 3), (3, 2, 1)])
+    rim = {"triangle": [(0, 1), (1, 0)], "tetrahedron": [(0, 1, 2), (1, 2, 0), (2, 0, 1)]}.get(
+        cell, [(0, 1, 2), (1, 3, 0), (2, 0, 3), (3, 2, 1)]
+    )
     for k in np.unique(nodes):
         total = np.zeros(config.gdim)
         for f in np.flatnonzero((nodes == k).any(axis=1)):

@@ -37,7 +37,9 @@ def quarter(cell, n, target, *, comm=COMM, power=2, sliding="finite", **options)
     for c in range(g - 1):
         bcs += clamp(V, s.tag("symmetry", 0, at(c, 0.0)), c)
     contact = uem.Contact(s.tag("top", 0, at(g - 1, 0.0)), target, sliding=sliding, max_penetration=1.0)
-    problem = uem.UnitedProblem(linear(u, fem.Constant(s.mesh, PETSc.ScalarType(10.0))), u, bcs=bcs, contacts=[contact], **options)
+    problem = uem.UnitedProblem(
+        linear(u, fem.Constant(s.mesh, PETSc.ScalarType(10.0))), u, bcs=bcs, contacts=[contact], **options
+    )
     return s, contact, problem
 
 
@@ -52,7 +54,9 @@ def vertical_gap(g, d, R):
     )
 
 
-@pytest.mark.parametrize("cell,n", [("triangle", (8, 6)), ("quadrilateral", (10, 6)), ("tetrahedron", (4, 4, 3)), ("hexahedron", (4, 4, 3))])
+@pytest.mark.parametrize(
+    "cell,n", [("triangle", (8, 6)), ("quadrilateral", (10, 6)), ("tetrahedron", (4, 4, 3)), ("hexahedron", (4, 4, 3))]
+)
 def test_against_quadratic_programming(cell, n):
     """min u'Ku/2 with g >= 0 by SciPy's bounded least squares: the same active set, forces and displacements."""
     g, d, R = len(n), 0.02, 0.5

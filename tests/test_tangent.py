@@ -41,7 +41,8 @@ def bumpy_top(cell, degree):
 
 @pytest.mark.parametrize("height", [0.0, 0.1, -0.05])
 @pytest.mark.parametrize(
-    "cell,degree", [("triangle", 1), ("triangle", 2), ("tetrahedron", 1), ("tetrahedron", 2), ("hexahedron", 1), ("hexahedron", 2)]
+    "cell,degree",
+    [("triangle", 1), ("triangle", 2), ("tetrahedron", 1), ("tetrahedron", 2), ("hexahedron", 1), ("hexahedron", 2)],
 )
 def test_gap_derivatives_on_a_facet(cell, degree, height):
     """First and second derivative of the gap, projected anew at every displaced configuration."""
@@ -143,7 +144,15 @@ def arched(x):
 
 
 def contact_scene(cell, target="mesh", **options):
-    b = blocks(COMM, cell, 6 if cell in ("triangle", "quadrilateral") else 3, 5 if cell == "triangle" else 2, gap=0.1, overhang=0.5, pose=arched)
+    b = blocks(
+        COMM,
+        cell,
+        6 if cell in ("triangle", "quadrilateral") else 3,
+        5 if cell == "triangle" else 2,
+        gap=0.1,
+        overhang=0.5,
+        pose=arched,
+    )
     slide = [0.2, -0.25] if b.gdim == 2 else [0.2, 0.0, -0.25]
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=slide)]
     other = b.low if target == "mesh" else uem.RigidSphere([0.4] * (b.gdim - 1) + [-1.0], 1.05)
@@ -154,7 +163,9 @@ def contact_scene(cell, target="mesh", **options):
     return b, contact, problem
 
 
-@pytest.mark.parametrize("cell,target", [("triangle", "mesh"), ("quadrilateral", "rigid"), ("tetrahedron", "mesh"), ("hexahedron", "mesh")])
+@pytest.mark.parametrize(
+    "cell,target", [("triangle", "mesh"), ("quadrilateral", "rigid"), ("tetrahedron", "mesh"), ("hexahedron", "mesh")]
+)
 def test_united_tangent_is_the_derivative_of_the_residual(cell, target):
     """``K - sum lambda grad^2 g`` against differences of ``F - sum lambda grad g`` with the contact forces lambda held."""
     b, contact, problem = contact_scene(cell, target)

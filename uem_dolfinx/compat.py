@@ -423,6 +423,15 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))
 
 
+def free_petsc_garbage(comm: MPI.Comm) -> None:
+    """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective).
+
+    Args:
+        comm: their communicator.
+    """
+    PETSc.garbage_cleanup(comm)
+
+
 def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
     """D.o.f. that a Dirichlet condition constrains.
 

@@ -250,11 +250,13 @@ class BodySystem:
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
+        compat.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
             self.tangent.update()
             self._stiffness = self.tangent.K.getDiagonal()
         K, restriction = self.tangent.K, state.restriction
-        curvature = self._curvature() if self.consistent_tangent else None
+        with timed("contact curvature"):
+            curvature = self._curvature() if self.consistent_tangent else None
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else restriction.fingerprint(values=self.newton == "full")
         made_of = self.comm.allgather((self.tangent.number, exact, restriction.fingerprint(values=False)))
