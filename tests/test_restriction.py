@@ -18,10 +18,10 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.solver import UnitedSolver, rigid_body_modes
 from uem_dolfinx.surfaces import Configuration
-from uem_dolfinx.uniting import UnitingEquations
 
 COMM = MPI.COMM_WORLD
 DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}

@@ -23,18 +23,17 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from uem_dolfinx.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.errors import ConflictError, agree
 
 if TYPE_CHECKING:
+    from uem_dolfinx.equations import UnitingEquations
     from uem_dolfinx.surfaces import Configuration
-    from uem_dolfinx.uniting import UnitingEquations
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-#: An equation whose direction has less than this part left in the free components of its node is a conflict.
-MOSTLY_PRESCRIBED = 1e-6
 #: Stacks of bodies higher than this are taken for a cycle.
 LONGEST_CHAIN = 16
 

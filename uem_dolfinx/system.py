@@ -15,13 +15,13 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
+from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import NotFiniteError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import MeshTarget
 from uem_dolfinx.surfaces import followed_nodes
-from uem_dolfinx.uniting import UnitingEquations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

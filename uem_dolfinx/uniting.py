@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.corners import Corners, find_corners
+from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, agree
-from uem_dolfinx.restriction import MOSTLY_PRESCRIBED
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
 if TYPE_CHECKING:
@@ -42,53 +42,6 @@ HOLD_AFTER = 2
 MOST_CHANGES = 8
 #: A corner holds a contactor if its free components keep this part of each of the corner's directions.
 FREE_ENOUGH = 1e-3
-
-
-@dataclass(frozen=True)
-class UnitingEquations:
-    """Scalar equations ``direction . (du_node - sum_a weights_a du_a) = -gap`` [UEM, 4.1 and 6.1].
-
-    Attributes:
-        node: local number of the owned node whose displacement is eliminated ``(m,)``.
-        direction: unit vectors ``(m, gdim)``.
-        targets: global block numbers of the nodes it follows ``(m, nn)``, -1 for none.
-        weights: ``(m, nn)``.
-        gap: lengths ``(m,)``.
-        active: whether the equation holds ``(m,)``; one that does not only keeps its place in the sparsity of P, so that
-            contactors can be activated and released without new symbolic work.
-    """
-
-    node: npt.NDArray[np.int32]
-    direction: Array
-    targets: Ints
-    weights: Array
-    gap: Array
-    active: Bools
-
-    def __len__(self) -> int:
-        return len(self.node)
-
-    @staticmethod
-    def join(parts: list[UnitingEquations], gdim: int) -> UnitingEquations:
-        """All equations of several pairs, padded to the same number of target nodes."""
-        if not parts:
-            return UnitingEquations(
-                np.zeros(0, np.int32), np.zeros((0, gdim)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
-                np.zeros(0, bool),
-            )  # fmt: skip
-        width = max(p.targets.shape[1] for p in parts)
-
-        def pad(a: npt.NDArray[np.generic], fill: float) -> npt.NDArray[np.generic]:
-            return np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=fill)
-
-        return UnitingEquations(
-            np.concatenate([p.node for p in parts]),
-            np.concatenate([p.direction for p in parts]),
-            np.concatenate([pad(p.targets, -1) for p in parts]),
-            np.concatenate([pad(p.weights, 0.0) for p in parts]),
-            np.concatenate([p.gap for p in parts]),
-            np.concatenate([p.active for p in parts]),
-        )
 
 
 @dataclass(frozen=True)
