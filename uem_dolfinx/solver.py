@@ -6,6 +6,7 @@ Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_optio
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.log import timed
+from uem_dolfinx.surfaces import find_bodies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
+#: Up to so many bodies each have rigid-body modes of their own in the near-null space.
+MODES_OF_THEIR_OWN = 4
+#: A mode of which less than this part is new adds nothing to the near-null space.
+INDEPENDENT = 1e-6
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 
@@ -102,7 +108,13 @@ class UnitedSolver:
     @property
     def needs_near_null_space(self) -> bool:
         """Whether the preconditioner can use the rigid-body modes."""
-        return self.ksp.getPC().getType() in ("gamg", "ml", "hypre", "bddc")
+        return self.ksp.getPC().getType() in ("gamg", "ml", "bddc")
+
+    @cached_property
+    def _bodies(self) -> tuple[npt.NDArray[np.int64], int]:
+        """Body that each owned node belongs to, and how many there are."""
+        labels, count = find_bodies(self.config)
+        return labels[: self.config.n_owned], count
 
     def set_operator(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Build ``P'(K + curvature)P`` and give it to the KSP (collective).
@@ -143,15 +155,24 @@ class UnitedSolver:
         self.ksp.setOperators(self.A)
 
     def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
-        """Rigid-body modes in the unknowns q: at a contactor their tangential components only."""
+        """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
+
+        Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
+        across a contact would lock its sliding.
+        """
+        body, n_bodies = self._bodies
+        own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
+        joint = rigid_body_modes(self.config)
         vectors: list[PETSc.Vec] = []
-        for mode in rigid_body_modes(self.config):
+        for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
             full = self.A.createVecLeft()
             full.array[:] = mode.ravel()
             q = restriction.reduce(full)
-            for other in vectors:
+            before = q.norm()
+            # twice is enough
+            for other in [*vectors, *vectors]:
                 q.axpy(-q.dot(other), other)
-            if q.norm() > 0:
+            if q.norm() > INDEPENDENT * before:
                 q.normalize()
                 vectors.append(q)
         return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import OrientationError, SpaceError, SurfaceError, TagError, UEMError, agree
@@ -264,6 +266,28 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.i
                 row += list(layout.entity_dofs(dim, i))
         rows.append(row)
     return np.array(rows, dtype=np.int32)
+
+
+def find_bodies(config: Configuration) -> tuple[Ints, int]:
+    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective).
+
+    Every rank labels its own pieces; only the list of pieces that share nodes across ranks is known to all.
+    """
+    comm, cells = config.comm, compat.cell_dofs(config.V)
+    pairs = np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(config.n_local,) * 2)
+    n_pieces, piece = connected_components(graph, directed=False)
+    sizes = comm.allgather(n_pieces)
+    mine = piece + sum(sizes[: comm.rank])
+    label = fem.Function(config.V)
+    view = label.x.array.reshape(-1, config.gdim)
+    view[:, 0] = mine
+    label.x.scatter_forward()
+    links = np.unique(np.column_stack([mine, view[:, 0].astype(np.int64)]), axis=0)
+    links = np.concatenate(comm.allgather(links))
+    total = sum(sizes)
+    count, body = connected_components(coo_matrix((np.ones(len(links)), links.T), shape=(total, total)), directed=False)
+    return body[mine].astype(np.int64), int(count)
 
 
 def followed_nodes(config: Configuration, targets: list[TargetFacets]) -> npt.NDArray[np.bool_]:
