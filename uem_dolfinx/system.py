@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 #: Multiple of the rounding of K u that the residual may be left with.
-ROUNDING = 16.0 * np.finfo(float).eps
+ROUNDING = 4.0 * np.finfo(float).eps
 #: Residual relative to the forces at work below which contact forces can be trusted to release a contactor for good.
 SETTLED = 1e-6
 #: Part of the model's size that an active contactor's gap may be left with.
