@@ -77,33 +77,6 @@ def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.
     return mesh.create_mesh(comm, cells=cells, x=x, e=ufl.Mesh(element))
 
 
-def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]:
-    """Turn a Gmsh model living on rank 0 into a mesh with DOLFINx's own reader (collective).
-
-    ``uem_dolfinx.mesh.read_gmsh`` is the reader to use: it also knows names, overlapping groups and errors.
-
-    Args:
-        model: ``gmsh.model`` on rank 0, anything elsewhere.
-        comm: communicator of the mesh.
-        gdim: geometric dimension.
-
-    Returns:
-        The mesh, its cell tags and its facet tags.
-    """
-    if DOLFINX_VERSION < (0, 10):
-        import dolfinx.io.gmshio
-
-        return dolfinx.io.gmshio.model_to_mesh(model, comm, 0, gdim=gdim)
-    import dolfinx.io.gmsh
-
-    data = dolfinx.io.gmsh.model_to_mesh(model, comm, 0, gdim=gdim)
-    empty = np.empty(0, dtype=np.int32)
-    facet_tags = data.facet_tags
-    if facet_tags is None:
-        facet_tags = mesh_tags(data.mesh, data.mesh.topology.dim - 1, empty, empty)
-    return data.mesh, data.cell_tags, facet_tags
-
-
 def cell_name(domain: Any) -> str:
     """Name of the cells, e.g. ``"triangle"``.
 
@@ -482,21 +455,6 @@ def open_xdmf(comm: MPI.Comm, path: str | Path, domain: Any) -> Any:
     file = io.XDMFFile(comm, str(path), "w")
     file.write_mesh(domain)
     return file
-
-
-def write_xdmf_tags(file: Any, tags: Any, domain: Any) -> None:
-    """Write MeshTags to an open XDMF file (collective).
-
-    Args:
-        file: from :func:`open_xdmf`.
-        tags: the MeshTags.
-        domain: their mesh.
-    """
-    domain.topology.create_connectivity(tags.dim, domain.topology.dim)
-    if DOLFINX_VERSION < (0, 7):
-        file.write_meshtags(tags)
-    else:
-        file.write_meshtags(tags, domain.geometry)
 
 
 def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
