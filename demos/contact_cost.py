@@ -2,7 +2,6 @@
 
 python3 demos/contact_cost.py --json cost.json
 """
-# CI: --dofs 5000
 
 # %% [markdown]
 # # What contact costs

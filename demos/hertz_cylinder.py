@@ -2,7 +2,6 @@
 
 python3 demos/hertz_cylinder.py --plot hertz.png
 """
-# CI: default
 
 # %% [markdown]
 # # A cylinder on a block

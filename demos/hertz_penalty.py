@@ -2,7 +2,6 @@
 
 python3 demos/hertz_penalty.py --plot penalty.png
 """
-# CI: --N 12
 
 # %% [markdown]
 # # A rigid indenter, with and without a penalty

@@ -2,7 +2,6 @@
 
 mpirun -n 2 python3 demos/hertz_sphere.py --plot sphere.png
 """
-# CI: --h 0.001 --refinements 2
 
 # %% [markdown]
 # # A half sphere on a block

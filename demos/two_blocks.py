@@ -2,7 +2,6 @@
 
 python3 demos/two_blocks.py --plot two_blocks.png
 """
-# CI: default
 
 # %% [markdown]
 # # Two blocks
