@@ -187,7 +187,7 @@ def test_projection_is_the_nearest_of_all_facets(cell, degree):
 @pytest.mark.parametrize("cell,degree", SURFACES)
 @pytest.mark.parametrize("averaged", [False, True])
 def test_ranks_see_what_one_rank_sees(cell, degree, averaged):
-    points = points_about(2 if cell in ("triangle", "quadrilateral") else 3, 60, 2)
+    points = points_about(2 if cell in ("triangle", "quadrilateral") else 3, 400, 2)
     _, _, target = surface(cell, degree=degree, averaged=averaged)
     _, _, serial = surface(cell, MPI.COMM_SELF, degree=degree, averaged=averaged)
     p, q = target.project(points), serial.project(points)

@@ -227,21 +227,20 @@ class MeshTarget:
         p, *rest = (np.concatenate(a) for a in zip(*asked))
         if rest:
             rest[0] = rest[0] - self.first[comm.rank]
-        answer, distance = self._project_here(p, data, *rest)
+        answer = self._project_here(p, data, *rest)
         if comm.size == 1:
             return answer
+        # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
+        away = p - answer.foot
+        distance, height = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.outward(answer))
         ends = np.cumsum([0, *(len(a[0]) for a in asked)])
-        parts = comm.alltoall([_pack(answer, distance, slice(a, b)) for a, b in pairwise(ends)])
-        which = np.concatenate(requests)
-        d = np.concatenate([part[0] for part in parts])
-        gap = np.concatenate([part[1][0] for part in parts])
-        best = _nearest(which, d, gap, np.arange(len(d)))
-        return FacetProjection(*(np.concatenate([part[1][k] for part in parts])[best] for k in range(len(parts[0][1]))))
+        parts = comm.alltoall([_pack(answer, distance, height, slice(a, b)) for a, b in pairwise(ends)])
+        d, h, *columns = (np.concatenate(column) for column in zip(*parts))
+        best = _nearest(np.concatenate(requests), d, h, np.arange(len(d)))
+        return FacetProjection(*(column[best] for column in columns))
 
-    def _project_here(
-        self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
-    ) -> tuple[FacetProjection, Array]:
-        """Project onto this rank's facets: projections and distances."""
+    def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> FacetProjection:
+        """Project onto this rank's facets."""
         if facet is None:
             pairs, candidates = candidate_pairs(self.shape, data.x, points)
             xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
@@ -252,8 +251,7 @@ class MeshTarget:
             facet, xi = candidates[best], xi[best]
         elif xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
-        answer = self._evaluate(points, facet, xi, data)
-        return answer, np.linalg.norm(points - answer.foot, axis=1)
+        return self._evaluate(points, facet, xi, data)
 
     def _evaluate(self, points: Array, facet: Ints, xi: Array, data: FacetData) -> FacetProjection:
         """Gap, normal and geometry at the feet ``xi`` on this rank's facets."""
@@ -317,8 +315,8 @@ def _unit_normals_of(p: FacetProjection) -> Array:
     return unit_normals(Tabulated(p.weights, p.dN, p.ddN), p.x)
 
 
-def _pack(answer: FacetProjection, distance: Array, part: slice) -> tuple[Array, list[npt.NDArray[np.generic]]]:
-    return distance[part], [getattr(answer, f.name)[part] for f in fields(answer)]
+def _pack(answer: FacetProjection, distance: Array, height: Array, part: slice) -> list[npt.NDArray[np.generic]]:
+    return [distance[part], height[part], *(getattr(answer, f.name)[part] for f in fields(answer))]
 
 
 def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
