@@ -45,7 +45,7 @@ args = common.arguments(
 E, nu, R = 1e6, 0.3, 3.0
 mesh, tags = uem.read_gmsh(
     common.MESHES / "hertz_cylinder.geo", comm, gdim=2,
-    parameters={"h": args.h, "ratio": args.ratio, "quads": args.quads},
+    parameters={"h": args.h, "ratio": args.ratio, "quads": args.quads, "order": args.degree},
 )  # fmt: skip
 V = compat.function_space(mesh, args.degree, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)

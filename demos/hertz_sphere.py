@@ -44,7 +44,8 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
     """Press the bodies together on a mesh of size h: the problem and the figures measured."""
     mesh, tags = uem.read_gmsh(
         common.MESHES / "hertz_sphere.geo", comm, gdim=3,
-        parameters={"h": h, "ratio": args.ratio, "R": R, "W": 2 * R, "zone": 1.4 * a, "growth": 0.8 / a},
+        parameters={"h": h, "ratio": args.ratio, "R": R, "W": 2 * R, "zone": 1.4 * a, "growth": 0.8 / a,
+                    "order": args.degree},
     )  # fmt: skip
     V = compat.function_space(mesh, args.degree, (3,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)

@@ -9,7 +9,8 @@ DefineConstant[
   W = 6,         // width and height of the block
   zone = 0.15,   // the contact zone reaches this far from the tip
   growth = 6,    // cells at distance r are growth * h * r large
-  quads = 0      // 1: quadrilaterals
+  quads = 0,     // 1: quadrilaterals
+  order = 1      // of the cells: 2 follows the arc with curved ones
 ];
 h_block = h * (ratio > 1 ? ratio : 1);
 h_disc = h / (ratio < 1 ? ratio : 1);
@@ -48,6 +49,7 @@ Background Field = 1;
 Mesh.MeshSizeFromPoints = 0;
 Mesh.MeshSizeExtendFromBoundary = 0;
 Mesh.Algorithm = 6;
+Mesh.ElementOrder = order;
 If (quads)
   Recombine Surface {1, 2};
 EndIf

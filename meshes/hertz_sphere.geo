@@ -8,7 +8,8 @@ DefineConstant[
   R = 1,         // radius of the sphere
   W = 2,         // width and height of the block
   zone = 0.05,   // the contact zone reaches this far from the tip
-  growth = 30    // cells at distance r are growth * h * r large
+  growth = 30,   // cells at distance r are growth * h * r large
+  order = 1      // of the cells: 2 follows the sphere with curved ones
 ];
 h_block = h * (ratio > 1 ? ratio : 1);
 h_sphere = h / (ratio < 1 ? ratio : 1);
@@ -47,3 +48,4 @@ Field[1].F = Sprintf("%g + (%g) * 0.5 * (1 + z / (Abs(z) + 1e-9)) + %g * Max(0, 
 Background Field = 1;
 Mesh.MeshSizeFromPoints = 0;
 Mesh.MeshSizeExtendFromBoundary = 0;
+Mesh.ElementOrder = order;

@@ -282,7 +282,7 @@ def complementary(contact: uem.Contact, length: float, force: float) -> None:
         force: nodal forces below it are rounding.
     """
     pair, comm = contact.pair, contact.config.comm
-    lam, gap, active = pair.trial.lam, pair.projection.gap, pair.trial.active
+    lam, gap, active = pair.trial.lam, pair.gap, pair.trial.active
     assert lowest(comm, lam) >= -force
     assert lowest(comm, gap[~pair.off]) >= -length
     assert highest(comm, np.abs(lam[~active])) <= 0.0

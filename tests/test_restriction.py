@@ -6,6 +6,8 @@ Lagrange system, and ``test_product_keeps_its_pattern`` shows that an iteration 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -62,7 +64,7 @@ class Case:
         targets, weights = np.full((len(mine), width), -1, np.int64), np.zeros((len(mine), width))
         for k, r in enumerate(mine):
             targets[k, : len(r[2])], weights[k, : len(r[2])] = r[2], r[3]
-        self.equations = UnitingEquations(
+        self.equations = UnitingEquations.along(
             np.array([r[0] - first for r in mine], np.int32),
             np.array([r[1] for r in mine]).reshape(-1, g),
             targets,
@@ -279,10 +281,10 @@ def test_product_keeps_its_pattern(name):
     turn = np.eye(case.g)
     turn[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
     e = case.equations
-    weights = np.where(e.targets >= 0, 1.3 * e.weights + 0.1, 0.0)
+    other = np.repeat(1.3 * e.coefficients[:, :1] + 0.1, case.g, axis=1) @ turn.T
     active = e.active.copy()
     active[::2] = False
-    case.equations = UnitingEquations(e.node, e.direction @ turn.T, e.targets, weights, e.gap, active)
+    case.equations = replace(e, direction=e.direction @ turn.T, coefficients=other, active=active)
     r = case.restriction()
     solver.set_operator(r, K, None)
     after = solver.A.getInfo()
@@ -301,8 +303,8 @@ def test_new_pattern_is_noticed():
     K = case.stiffness()
     solver = UnitedSolver(case.config, "restriction_", DIRECT)
     e = case.equations
-    none = UnitingEquations(*(getattr(e, f)[:0] for f in ("node", "direction", "targets", "weights", "gap", "active")))
-    other = UnitingEquations(e.node, e.direction, np.full_like(e.targets, case.where[0]), e.weights, e.gap, e.active)
+    none = e.select(np.zeros(len(e), bool))
+    other = replace(e, followed=np.full_like(e.followed, case.where[0]))
     for equations in (e, other, none, e):
         case.equations = equations
         r = case.restriction()

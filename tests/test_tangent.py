@@ -174,7 +174,7 @@ def test_united_tangent_is_the_derivative_of_the_residual(cell, target):
     smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
     direction = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
     lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
-    pair.trial = replace(pair.trial, active=np.ones(len(lam), bool), lam=lam)
+    pair.trial = replace(pair.trial, active=np.ones(len(lam), bool), lam=lam, nodal=lam)
 
     def residual(u):
         problem.u.x.array[:] = u.ravel()

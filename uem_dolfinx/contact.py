@@ -142,7 +142,8 @@ class Contact:
     @cached_property
     def _areas(self) -> Array:
         """Tributary reference area of each contactor ``(n_contactors,)`` (collective)."""
-        return tributary_areas(self.config, self.contactor)[self.pair.nodes]
+        areas = tributary_areas(self.config, self.contactor)[self.pair.nodes]
+        return areas if self.pair.control is None else self.pair.control.areas(areas)
 
     @property
     def pressures(self) -> Array:
@@ -177,7 +178,7 @@ class Contact:
         f, g, pair = self._fields["force"], self.config.gdim, self.pair
         f.x.array[:] = 0.0
         total = compat.petsc_vector(f)
-        p, i = pair.projection, np.flatnonzero(pair.trial.active)
+        p, i = pair.projection, np.flatnonzero((pair.trial.force != 0).any(axis=1))
         nodes = np.concatenate([self.config.to_global(pair.nodes[i])[:, None], p.nodes[i]], axis=1)
         share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
         rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)

@@ -124,10 +124,9 @@ class Restriction:
     def _coupling_entries(self) -> tuple[Ints, Ints, Array]:
         """Local rows, global columns and values of M, zeros stored so that the sparsity does not depend on directions."""
         g, eq = self.config.gdim, self.equations
-        i, a = np.nonzero(eq.targets >= 0)
-        values = self.lift[i][:, :, None] * (eq.weights[i, a][:, None] * eq.direction[i])[:, None, :]
-        rows = np.broadcast_to((eq.node[i, None] * g + np.arange(g))[:, :, None], values.shape)
-        columns = np.broadcast_to((eq.targets[i, a, None] * g + np.arange(g))[:, None, :], values.shape)
+        values = self.lift[eq.row][:, :, None] * eq.coefficients[:, None, :]
+        rows = np.broadcast_to((eq.node[eq.row, None] * g + np.arange(g))[:, :, None], values.shape)
+        columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
         return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
 
     def _longest_chain(self) -> int:
@@ -243,9 +242,9 @@ class Restriction:
     def fingerprint(self, *, values: bool) -> int:
         """Hash of this rank's part of P: of its sparsity, or of its values too."""
         eq = self.equations
-        parts = [eq.node.tobytes(), eq.targets.tobytes(), bytes([self.chain])]
+        parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), bytes([self.chain])]
         if values:
-            parts += [eq.direction.tobytes(), eq.weights.tobytes(), eq.active.tobytes()]
+            parts += [eq.direction.tobytes(), eq.coefficients.tobytes(), eq.active.tobytes()]
         return zlib.crc32(b"".join(parts))
 
 

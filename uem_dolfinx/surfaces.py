@@ -85,6 +85,29 @@ class Configuration:
         return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
 
     @cached_property
+    def _courier(self) -> fem.Function:
+        return fem.Function(self.V)
+
+    def from_owners(self, nodes: npt.NDArray[np.integer], values: Array, wanted: npt.NDArray[np.integer]) -> Array:
+        """Values that owners have at their ``nodes (n, k)``, at local nodes ``wanted (m, k)``, ghosts or not (collective)."""
+        out = np.empty((len(wanted), values.shape[1]))
+        carried = self._courier.x.array.reshape(-1, self.gdim)
+        for first in range(0, values.shape[1], self.gdim):
+            part = values[:, first : first + self.gdim]
+            carried[nodes, : part.shape[1]] = part
+            self._courier.x.scatter_forward()
+            out[:, first : first + self.gdim] = carried[wanted, : part.shape[1]]
+        return out
+
+    def to_owners(self, nodes: npt.NDArray[np.integer], values: Array) -> Array:
+        """Sums of values at local ``nodes (m,)``, ghosts or not, at every local node ``(n_local,)`` (collective)."""
+        carried = self._courier.x.array.reshape(-1, self.gdim)
+        carried[:] = 0.0
+        np.add.at(carried[:, 0], nodes, values)
+        compat.sum_ghosts(self._courier)
+        return np.array(carried[:, 0])
+
+    @cached_property
     def size(self) -> float:
         """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with."""
         lo = -np.max(-self.X, axis=0, initial=-np.inf)

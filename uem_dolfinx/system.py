@@ -126,7 +126,8 @@ class BodySystem:
         self.pairs = list(pairs)
         targets = [pair.target.facets for pair in pairs if isinstance(pair.target, MeshTarget)]
         followed = followed_nodes(self.config, targets) if targets else np.zeros(self.config.n_local, bool)
-        self.stacked = any(self.comm.allgather(any(followed[pair.nodes].any() for pair in pairs)))
+        chained = any(pair.control is not None and pair.control.chained for pair in pairs)
+        self.stacked = any(self.comm.allgather(chained or any(followed[pair.nodes].any() for pair in pairs)))
         self.place(returning=False)
         for pair in pairs:
             pair.check_initial()

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, agree
+from uem_dolfinx.quadratic import ControlGaps
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ class PairState:
 
     Attributes:
         active: united to the target ``(n,)``.
-        lam: contact force along the normal, positive in compression ``(n,)``.
+        lam: contact force along the normal, positive in compression ``(n,)``; on a degree-2 surface the control force.
+        nodal: contact force of the node along the normal ``(n,)``; the same as ``lam`` on a degree-1 surface.
         force: contact force on the contactor ``(n, gdim)``.
         facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
         held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
@@ -60,6 +62,7 @@ class PairState:
 
     active: Bools
     lam: Array
+    nodal: Array
     force: Array
     facet: Ints
     held: Ints
@@ -105,6 +108,7 @@ class ContactPair:
         self.committed = PairState(
             np.zeros(n, bool),
             np.zeros(n),
+            np.zeros(n),
             np.zeros((n, config.gdim)),
             none,
             np.full((n, config.gdim - 1), -1),
@@ -113,6 +117,9 @@ class ContactPair:
         )
         self.trial = self.last_commit = self.committed
         self.projection: Projection
+        #: Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface.
+        self.gap: Array = np.zeros(n)
+        self.control = ControlGaps(config, nodes) if config.degree == 2 else None
         #: Number of equations of the last call of ``equations``.
         self.n_equations = 0
         self._united: Ints = none
@@ -139,6 +146,20 @@ class ContactPair:
         else:
             self.projection = self.target.follow(self.points, self._anchor)
         self.check_finite()
+        self._measure()
+
+    def _measure(self) -> None:
+        """Gaps of the present projection (collective)."""
+        self.gap = self.projection.gap
+        if self.control is not None:
+            self.control.look(self.projection, ~self.off & (self.trial.held < 0).all(axis=1))
+            self._update_control()
+
+    def _update_control(self) -> None:
+        """Control gaps of the present active set (collective)."""
+        if self.control is not None:
+            self.control.follow(self.trial.active)
+            self.gap = self.control.gaps(self.projection.gap)
 
     def check_finite(self) -> None:
         """Refuse a projection that is not finite, which a rigid surface's functions may return (collective).
@@ -201,6 +222,7 @@ class ContactPair:
             own = replace(own, gap=np.einsum("ng,ng->n", own.normal, self.points[left] - own.foot))
             self._nearest = self._nearest.with_rows(left, {f.name: getattr(own, f.name) for f in fields(own)})
         self.projection = self._in_corners(self._nearest)
+        self._measure()
 
     def return_to_target(self, stiffness: Array) -> None:
         """Normal return [UEM, 4.2]: put the active contactors back onto the moved target.
@@ -212,7 +234,7 @@ class ContactPair:
         """
         i = np.flatnonzero(self.trial.active)
         p = self.projection
-        correction = self._along(p.normal[i], p.gap[i], self.free[i])
+        correction = self._along(p.normal[i], self.gap[i], self.free[i])
         if self._corners is not None:
             c = self._corners
             at = np.zeros((len(self.nodes), self.config.gdim))
@@ -232,6 +254,7 @@ class ContactPair:
             self.project()
         else:
             self.projection = p.with_gap(gap)
+            self._measure()
 
     @staticmethod
     def _along(normal: Array, gap: Array, free: Bools) -> Array:
@@ -247,7 +270,7 @@ class ContactPair:
 
     def largest_gap(self) -> float:
         """Largest gap of an active contactor over all ranks, a length (collective)."""
-        here = np.abs(self.projection.gap[self.trial.active]).max(initial=0.0)
+        here = np.abs(self.gap[self.trial.active]).max(initial=0.0)
         return float(max(self.config.comm.allgather(here)))
 
     def check_initial(self) -> None:
@@ -286,10 +309,11 @@ class ContactPair:
 
     def touch(self) -> None:
         """Start with the contactors that touch without force as active."""
-        touching = np.abs(self.projection.gap) <= TOUCHING * self.config.size
+        touching = np.abs(self.gap) <= TOUCHING * self.config.size
         self.trial = replace(self.trial, active=self.trial.active | (touching & ~self.off & self.movable))
         # a first step that fails and is cut starts from here again
         self.committed = self.last_commit = self.trial
+        self._update_control()
 
     def check_prescribed(self) -> None:
         """Refuse an equilibrium in which a contactor is held inside the target by its Dirichlet conditions (collective).
@@ -315,8 +339,9 @@ class ContactPair:
             ratio: this step's length over the last one's.
         """
         lam = self.committed.lam + ratio * (self.committed.lam - self.last_commit.lam)
-        entering = (self.projection.gap < 0) & ~self.off & self.movable
+        entering = (self.gap < 0) & ~self.off & self.movable
         self.trial = replace(self.trial, active=np.where(self.committed.active, lam >= 0, entering))
+        self._update_control()
 
     def decide(self, force_rounding: float, cautious: bool, settled: bool) -> bool:
         """Release contactors in tension, activate penetrating ones (collective).
@@ -330,7 +355,7 @@ class ContactPair:
             Whether any rank changed what its contactors are united to.
         """
         comm, state, off = self.config.comm, self.trial, self.off
-        gap = self.projection.gap
+        gap = self.gap
         release = state.active & ((state.lam < -force_rounding) | off | ~self.movable)
         enter = ~state.active & ~off & self.movable & (gap < -GAP_ROUNDING * self.config.size)
         worst = [-np.min(gap[enter], initial=0.0), -np.min(state.lam[release], initial=0.0)]
@@ -349,6 +374,7 @@ class ContactPair:
         if self._has_corners:
             changed |= self._leave_corners(settled or not cautious)
             changed |= self._change_facets()
+        self._update_control()
         return bool(comm.allreduce(changed))
 
     def _leave_corners(self, trusted: bool) -> bool:
@@ -417,7 +443,9 @@ class ContactPair:
         """Uniting equations of the contactors that are or may become active; two for one held in a corner."""
         i = self._united = np.flatnonzero(self._near())
         p, active = self.projection, self.trial.active
-        first = UnitingEquations(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], p.gap[i], active[i])
+        first = UnitingEquations.along(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], self.gap[i], active[i])
+        if self.control is not None:
+            first = self._with_parents(first)
         self.n_equations = len(first)
         c = self._corners
         if c is None:
@@ -426,9 +454,26 @@ class ContactPair:
         for r in range(1, self.config.gdim):
             j = np.flatnonzero(r < c.count)
             w = c.which[j]
-            parts.append(UnitingEquations(self.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], active[w]))
+            parts.append(UnitingEquations.along(self.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], active[w]))
         self.n_equations = sum(len(part) for part in parts)
         return UnitingEquations.join(parts, self.config.gdim)
+
+    def _with_parents(self, equations: UnitingEquations) -> UnitingEquations:
+        """Add the terms of the parents whose gaps stay open [Bernstein's basis, see ``quadratic``]."""
+        c = self.control
+        assert c is not None
+        place = np.full(len(self.nodes), -1, dtype=np.int64)
+        place[self._united] = np.arange(len(self._united))
+        k = np.flatnonzero(c.kept & self.trial.active[c.child])
+        own = c.weight[k, None] * c.normal[k]
+        a, b = np.nonzero(c.targets[k] >= 0)
+        row = place[c.child[k]]
+        return replace(
+            equations,
+            row=np.concatenate([equations.row, row, row[a]]),
+            followed=np.concatenate([equations.followed, self.config.to_global(c.parent[k]), c.targets[k][a, b]]),
+            coefficients=np.concatenate([equations.coefficients, own, -c.weights[k][a, b][:, None] * own[a]]),
+        )
 
     def _near(self) -> Bools:
         """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks."""
@@ -445,7 +490,10 @@ class ContactPair:
         i = self._united
         full = np.zeros(len(self.nodes))
         full[i] = lam[: len(i)]
-        force = full[:, None] * self.projection.normal
+        nodal = full
+        if self.control is not None:
+            full, nodal = self.control.forces(full, self.trial.active)
+        force = nodal[:, None] * self.projection.normal
         c = self._corners
         if c is not None:
             start = len(i)
@@ -453,14 +501,14 @@ class ContactPair:
                 j = np.flatnonzero(r < c.count)
                 force[c.which[j]] += lam[start : start + len(j), None] * c.axes[j, r]
                 start += len(j)
-        self.trial = replace(self.trial, lam=full, force=force)
+        self.trial = replace(self.trial, lam=full, nodal=nodal, force=force)
 
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
         state, p, c = self.trial, self.projection, self._corners
-        plain = state.active & (state.lam > 0) & (state.held < 0).all(axis=1)
+        plain = ((state.lam > 0) | ~state.active) & (state.nodal != 0) & (state.held < 0).all(axis=1)
         i = np.flatnonzero(plain) if self.sliding == "finite" else np.zeros(0, np.int64)
-        own, followed, blocks = self.nodes[i], p.nodes[i], -state.lam[i, None, None] * p.hessians(i)
+        own, followed, blocks = self.nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
         if c is not None:
             own = np.concatenate([own, self.nodes[c.which]])
             followed = np.concatenate([followed, c.nodes])
