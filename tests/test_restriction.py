@@ -323,7 +323,7 @@ def test_rigid_motion_is_a_united_motion(cell):
     problem = uem.UnitedProblem(linear(b.u, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))), b.u, contacts=[contact])
     system = problem.system
     assert contact.n_active == 4 ** (b.gdim - 1)
-    r = system._restrict()
+    r, _ = system._restrict()
     system.tangent.update()
     solver = UnitedSolver(problem.config, "modes_", {"ksp_type": "cg", "pc_type": "gamg"})
     solver.set_operator(r, system.tangent.K, None)
@@ -404,7 +404,7 @@ def test_forces_keep_their_sum_and_moment():
     problem = uem.UnitedProblem(
         linear(b.u, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))), b.u, bcs=clamped, contacts=[uem.Contact(b.high, b.low)]
     )
-    r = problem.system._restrict()
+    r, _ = problem.system._restrict()
     y = r.P.createVecLeft()
     nodal = np.zeros((problem.config.n_owned, 2))
     nodes = problem.contacts[0].pair.nodes

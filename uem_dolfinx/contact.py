@@ -113,7 +113,7 @@ class Contact:
             config,
             nodes,
             target,
-            free=system.free[nodes],
+            free=system.free[: config.n_owned],
             name=self.name,
             sliding=self.sliding,
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
@@ -141,14 +141,13 @@ class Contact:
 
     @cached_property
     def _areas(self) -> Array:
-        """Tributary reference area of each contactor ``(n_contactors,)`` (collective)."""
-        areas = tributary_areas(self.config, self.contactor)[self.pair.nodes]
-        return areas if self.pair.control is None else self.pair.control.areas(areas)
+        """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (collective)."""
+        return tributary_areas(self.config, self.contactor)[self.pair.nodes]
 
     @property
     def pressures(self) -> Array:
-        """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)``."""
-        areas = self._areas
+        """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)`` (collective)."""
+        areas = self._areas if self.pair.control is None else self.pair.control.areas(self._areas)
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:

@@ -8,8 +8,9 @@ gap has the coefficients
 
 and its forces are integrals of the pressure with positive weights. So contact is decided by these control gaps and control
 forces: ``control gap >= 0, control force >= 0``, one of them zero. Where all nodes of a facet are active this unites the same
-nodes as nodal gaps do; at the rim it keeps active sets stable and pressures positive. A contactor's own coefficient is scaled
-to one here, so that its control gap is ``g_m - (g_1 + g_2) / 4``.
+nodes as nodal gaps do; at the rim it keeps active sets stable and pressures positive. The equations scale a contactor's own
+coefficient to one, so that its control gap is ``g_m - (g_1 + g_2) / 4``; the control forces are those of Bernstein's basis, and
+add up to the resultant.
 """
 
 from __future__ import annotations
@@ -117,12 +118,20 @@ class ControlGaps:
         control = control + active * self._handed_on(control, dropped & self._of_facet)
         control = control + active * self._handed_on(control, dropped & ~self._of_facet)
         nodal = control - self._handed_on(control, self.shared)
-        return control, nodal
+        return self._scale * control, nodal
+
+    @property
+    def _scale(self) -> Array:
+        """Bernstein's basis functions over those that belong to the scaled gaps ``(n,)``."""
+        scale = np.ones(len(self.nodes))
+        scale[self.child[self.shared]] = 0.5
+        scale[self.child[self.shared & self._of_facet]] = 0.25
+        return scale
 
     def areas(self, areas: Array) -> Array:
         """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
-        areas = areas + self._handed_on(areas, self._of_facet)
-        return areas + self._handed_on(areas, ~self._of_facet)
+        areas = areas + self._handed_on(areas, self.shared & self._of_facet)
+        return self._scale * (areas + self._handed_on(areas, self.shared & ~self._of_facet))
 
     def _handed_on(self, values: Array, terms: Bools) -> Array:
         """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""

@@ -36,6 +36,8 @@ Bools = npt.NDArray[np.bool_]
 
 #: Stacks of bodies higher than this are taken for a cycle.
 LONGEST_CHAIN = 16
+#: Coefficients below it are rounding.
+ROUNDING = 1e-12
 
 
 class Restriction:
@@ -113,8 +115,11 @@ class Restriction:
 
     def _coupling(self) -> PETSc.Mat:
         """M: rows of the eliminated nodes, columns of the nodes they follow."""
+        return self._matrix(*self._coupling_entries)
+
+    def _matrix(self, rows: Ints, columns: Ints, values: Array) -> PETSc.Mat:
+        """Matrix from sorted local rows, global columns and values."""
         n = self.config.gdim * self.config.n_owned
-        rows, columns, values = self._coupling_entries
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(
             self._sizes, bsize=self.config.gdim, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
@@ -129,6 +134,15 @@ class Restriction:
         columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
         return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
 
+    @property
+    def _eliminated(self) -> PETSc.Mat:
+        """Projector of a displacement onto what the equations eliminate of it."""
+        g, eq = self.config.gdim, self.equations
+        blocks = self.lift[:, :, None] * eq.direction[:, None, :]
+        rows = np.broadcast_to((eq.node[:, None] * g + np.arange(g))[:, :, None], blocks.shape)
+        columns = self._first + rows.transpose(0, 2, 1)
+        return self._matrix(*_sum_duplicates(rows.ravel().astype(np.int64), columns.ravel().astype(np.int64), blocks.ravel()))
+
     def _longest_chain(self) -> int:
         """How many equations follow one another from node to node.
 
@@ -136,12 +150,13 @@ class Restriction:
             ConflictError: if they never end.
         """
         assert self.M is not None
-        path = self.M.copy()
+        path = self.M.matMult(self._eliminated)
         indptr, columns, values = path.getValuesCSR()
-        path.setValuesCSR(indptr, columns, (values != 0).astype(float))
+        # an equation may follow what is left free of an eliminated node
+        path.setValuesCSR(indptr, columns, (np.abs(values) > ROUNDING).astype(float))
         path.assemble()
         at = self._vector(np.ones((self.config.n_owned, self.config.gdim)))
-        for length in range(LONGEST_CHAIN + 1):
+        for length in range(1, LONGEST_CHAIN + 1):
             at = path * at
             if at.norm(PETSc.NormType.INFINITY) == 0.0:
                 return length

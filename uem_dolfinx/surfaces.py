@@ -108,6 +108,31 @@ class Configuration:
         return np.array(carried[:, 0])
 
     @cached_property
+    def _first_nodes(self) -> Ints:
+        """First global node of every rank, and one past the last."""
+        return np.array([*self.comm.allgather(self.index_map.local_range[0]), self.index_map.size_global], dtype=np.int64)
+
+    def owner_of(self, nodes: Ints) -> Ints:
+        """Ranks that own global nodes."""
+        return np.searchsorted(self._first_nodes, nodes, side="right") - 1
+
+    def tell_owners(self, nodes: Ints) -> Ints:
+        """Owned local nodes that any rank names by their global number (collective)."""
+        owner = self.owner_of(nodes)
+        told = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
+        return np.unique(np.concatenate(told)) - self._first_nodes[self.comm.rank]
+
+    def ask_owners(self, nodes: Ints, values: Array) -> Array:
+        """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
+        owner = self.owner_of(nodes)
+        asked = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
+        answers = self.comm.alltoall([values[a - self._first_nodes[self.comm.rank]] for a in asked])
+        out = np.empty((len(nodes), values.shape[1]))
+        for r, answer in enumerate(answers):
+            out[owner == r] = answer
+        return out
+
+    @cached_property
     def size(self) -> float:
         """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with."""
         lo = -np.max(-self.X, axis=0, initial=-np.inf)

@@ -15,6 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
+from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import NotFiniteError, SpaceError
 from uem_dolfinx.log import timed
@@ -128,10 +129,26 @@ class BodySystem:
         followed = followed_nodes(self.config, targets) if targets else np.zeros(self.config.n_local, bool)
         chained = any(pair.control is not None and pair.control.chained for pair in pairs)
         self.stacked = any(self.comm.allgather(chained or any(followed[pair.nodes].any() for pair in pairs)))
+        self._find_mutual(self.pairs)
+        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
+        shared = len(np.unique(contactors)) < len(contactors)
+        #: Whether equations can get in each other's way.
+        self.contestable = any(self.comm.allgather(shared or any(pair.prescribed or pair.mutual for pair in pairs)))
         self.place(returning=False)
         for pair in pairs:
             pair.check_initial()
             pair.touch()
+
+    def _find_mutual(self, pairs: list[ContactPair]) -> None:
+        """Mark pairs whose surfaces are contactor and target of each other (collective)."""
+        if not self.stacked:
+            return
+        meshed = [(pair, pair.target) for pair in pairs if isinstance(pair.target, MeshTarget)]
+        follows = [followed_nodes(self.config, [target.facets]) for _, target in meshed]
+        meets = np.array([[f[pair.nodes].any() for f in follows] for pair, _ in meshed])
+        meets = np.any(self.comm.allgather(meets), axis=0)
+        for k, (pair, _) in enumerate(meshed):
+            pair.mutual = bool((meets[k] & meets[:, k]).any())
 
     def _free_components(self) -> Bools:
         """Components without Dirichlet condition ``(n_local, gdim)``."""
@@ -154,7 +171,9 @@ class BodySystem:
             if returning and self._stiffness is not None:
                 stiffness = self._local_stiffness()
                 for pair in self.pairs:
-                    pair.return_to_target(stiffness)
+                    # surfaces that follow each other would both make up for the same gap
+                    if not pair.mutual:
+                        pair.return_to_target(stiffness)
                 self.u.x.scatter_forward()
 
     # -- residual and uniting equations ------------------------------------------------------------------------------
@@ -179,9 +198,9 @@ class BodySystem:
         """Contact forces, activation and release, and the uniting equations that follow."""
         F, rounding = self.residual, self._rounding()
         with timed("uniting equations"):
-            restriction = self._restrict()
+            restriction, resolution = self._restrict()
             y = restriction.pass_on(F)
-            self._read_forces(restriction, y)
+            self._read_forces(resolution, restriction.multipliers(y))
             settled = restriction.reduce(y).norm() <= max(SETTLED * F.norm(), rounding)
             # every pair decides, whatever the others did
             decisions = [pair.decide(rounding, cautious, settled) for pair in self.pairs]
@@ -189,7 +208,7 @@ class BodySystem:
             if changed:
                 for pair in self.pairs:
                     pair.refresh_corners()
-                restriction = self._restrict()
+                restriction, _ = self._restrict()
                 y = restriction.pass_on(F)
             residual = restriction.reduce(y)
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
@@ -211,16 +230,29 @@ class BodySystem:
             bool(closed),
         )
 
-    def _restrict(self) -> Restriction:
-        n = self.config.n_owned
-        equations = UnitingEquations.join([pair.equations() for pair in self.pairs], self.config.gdim)
+    def _restrict(self) -> tuple[Restriction, Resolution | None]:
+        """P and c of the present uniting equations, and how those that got in each other's way were resolved."""
+        n, free = self.config.n_owned, self.free[: self.config.n_owned]
+        parts = [pair.equations() for pair in self.pairs]
+        equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
+        if self.contestable:
+            mutual = np.repeat([pair.mutual for pair in self.pairs], [len(part) for part in parts]).astype(bool)
+            resolution = Resolution(self.config, equations, free, mutual)
+            equations = resolution.equations
         prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
-        return Restriction(self.config, equations, self.free[:n], prescribed, self.stacked)
+        stacked = self.stacked or (resolution is not None and resolution.found)
+        return Restriction(self.config, equations, free, prescribed, stacked), resolution
 
-    def _read_forces(self, restriction: Restriction, y: PETSc.Vec) -> None:
-        lam, start = restriction.multipliers(y), 0
+    def _read_forces(self, resolution: Resolution | None, lam: Array) -> None:
+        """Hand the contact forces to the pairs (collective)."""
+        redundant = np.zeros(len(lam), dtype=bool)
+        if resolution is not None:
+            lam = resolution.forces(lam)
+            redundant = resolution.redundant
+        start = 0
         for pair in self.pairs:
-            pair.read_forces(lam[start : start + pair.n_equations])
+            part = slice(start, start + pair.n_equations)
+            pair.read_forces(lam[part], redundant[part])
             start += pair.n_equations
 
     def _rounding(self) -> float:
@@ -339,7 +371,7 @@ class BodySystem:
 
         P belongs to the present normals: the old P would take the turned contact forces for a residual.
         """
-        restriction = self._restrict()
+        restriction, _ = self._restrict()
         return restriction.reduce(restriction.pass_on(self.residual))
 
     def _inversion_detector(self) -> tuple[ufl.core.expr.Expr, object]:

@@ -33,6 +33,8 @@ END_HOLDS = 0.1
 GAP_ROUNDING = 1e-13
 #: A body touches at the start when its gap is below this part of the model's size.
 TOUCHING = 1e-9
+#: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
+LEFT_OUT = 1e-6
 #: Contactors nearer than this many facets keep a row in the sparsity of P.
 NEAR = 1.0
 #: Normal return may change nodal forces by this part of the largest contact force.
@@ -83,7 +85,7 @@ class ContactPair:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         target: what they may touch.
-        free: their components without Dirichlet condition ``(n, gdim)``.
+        free: components without Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
         name: for messages.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` at the start of every step, ``"fixed"`` once.
         max_penetration: bound on the initial penetration, a length.
@@ -103,7 +105,9 @@ class ContactPair:
         self.config, self.nodes, self.target, self.name = config, nodes, target, name
         self.sliding, self.max_penetration = sliding, max_penetration
         n = len(nodes)
-        self.free = free
+        self.free, self._free = free[nodes], free
+        #: Whether any contactor on any rank is prescribed in some direction.
+        self.prescribed = bool(config.comm.allreduce(int(not self.free.all())))
         none = np.full(n, -1, dtype=np.int64)
         self.committed = PairState(
             np.zeros(n, bool),
@@ -120,11 +124,16 @@ class ContactPair:
         #: Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface.
         self.gap: Array = np.zeros(n)
         self.control = ControlGaps(config, nodes) if config.degree == 2 else None
+        #: Whether the target's nodes are contactors on this pair's own contactor surface (two-pass).
+        self.mutual = False
+        #: Active contactors whose equations depend on others and were left out ``(n,)``.
+        self.redundant: Bools = np.zeros(n, dtype=bool)
         #: Number of equations of the last call of ``equations``.
         self.n_equations = 0
         self._united: Ints = none
         self._reserved: Bools = np.zeros(n, dtype=bool)
         self._anchor: Projection | None = None
+        self._target_moves: Bools | None = None
         self._nearest: Projection
         self._corners: Corners | None = None
         self._left: Bools = np.zeros(n, dtype=bool)
@@ -146,6 +155,8 @@ class ContactPair:
         else:
             self.projection = self.target.follow(self.points, self._anchor)
         self.check_finite()
+        if self.prescribed:
+            self._ask_target()
         self._measure()
 
     def _measure(self) -> None:
@@ -270,7 +281,7 @@ class ContactPair:
 
     def largest_gap(self) -> float:
         """Largest gap of an active contactor over all ranks, a length (collective)."""
-        here = np.abs(self.gap[self.trial.active]).max(initial=0.0)
+        here = np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0)
         return float(max(self.config.comm.allgather(here)))
 
     def check_initial(self) -> None:
@@ -304,8 +315,17 @@ class ContactPair:
 
     @property
     def movable(self) -> Bools:
-        """Contactors whose Dirichlet conditions leave them some motion along the normal ``(n,)``."""
-        return np.linalg.norm(self.projection.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
+        """Contactors that can move along the normal, or whose target can, for all the Dirichlet conditions ``(n,)``."""
+        own = np.linalg.norm(self.projection.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
+        return own if self._target_moves is None else own | self._target_moves
+
+    def _ask_target(self) -> None:
+        """Find out which targets can move along the normal (collective)."""
+        p = self.projection
+        if p.nodes.shape[1]:
+            moves = self.config.ask_owners(p.nodes.ravel(), self._free.astype(float)).reshape(*p.nodes.shape, self.config.gdim)
+            moves = np.abs(p.weights[:, :, None] * p.normal[:, None] * moves).max(axis=(1, 2))
+            self._target_moves = moves > MOSTLY_PRESCRIBED
 
     def touch(self) -> None:
         """Start with the contactors that touch without force as active."""
@@ -316,19 +336,21 @@ class ContactPair:
         self._update_control()
 
     def check_prescribed(self) -> None:
-        """Refuse an equilibrium in which a contactor is held inside the target by its Dirichlet conditions (collective).
+        """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
 
         Raises:
             ConflictError: naming the deepest such node of the first rank that has one.
         """
-        inside = ~self.movable & ~self.off & (self.projection.gap < -TOUCHING * self.config.size)
+        left_out = self.trial.active & self.redundant
+        depth = -self.projection.gap / self.config.size
+        inside = ~self.off & ((~self.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
         error = None
         if inside.any():
             i = int(np.argmin(np.where(inside, self.projection.gap, np.inf)))
             error = ConflictError(
                 f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i]))} is prescribed to be "
-                f"{-self.projection.gap[i]:.4g} inside the target, where a Dirichlet condition fights the uniting equation: "
-                "release the condition along the normal, or make the other surface the contactor"
+                f"{-self.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
+                "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
             )
         agree(self.config.comm, error)
 
@@ -485,9 +507,11 @@ class ContactPair:
             self._reserved = self.trial.active | (near & ~self.off)
         return self._reserved
 
-    def read_forces(self, lam: Array) -> None:
-        """Take the contact forces, in the order of ``equations``."""
+    def read_forces(self, lam: Array, redundant: Bools) -> None:
+        """Take the contact forces, and which equations were left out, in the order of ``equations``."""
         i = self._united
+        self.redundant = np.zeros(len(self.nodes), dtype=bool)
+        self.redundant[i] = redundant[: len(i)]
         full = np.zeros(len(self.nodes))
         full[i] = lam[: len(i)]
         nodal = full
