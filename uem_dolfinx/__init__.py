@@ -10,6 +10,7 @@ from uem_dolfinx.contact import Balance, Contact, Resultant
 from uem_dolfinx.errors import (
     ConflictError,
     ConvergenceError,
+    FloatingBodyError,
     InvertedElementError,
     LinearSolveError,
     MeshError,

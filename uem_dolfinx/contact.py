@@ -18,7 +18,8 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.mesh import Tag
-from uem_dolfinx.search import MeshTarget, Target
+from uem_dolfinx.rigid import RigidSurface, finite_point
+from uem_dolfinx.search import FacetProjection, MeshTarget, Target
 from uem_dolfinx.surfaces import TargetFacets, check_distinct, check_tag, surface_nodes, tributary_areas
 from uem_dolfinx.uniting import ContactPair
 
@@ -33,7 +34,7 @@ MAX_PENETRATION = 0.05
 
 @dataclass(frozen=True)
 class Resultant:
-    """Force ``(gdim,)`` and moment about the origin, ``(1,)`` in 2D and ``(3,)`` in 3D."""
+    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D."""
 
     force: Array
     moment: Array
@@ -186,10 +187,30 @@ class Contact:
         f.x.scatter_forward()
         return f
 
-    def resultant(self) -> Resultant:
-        """Force and moment that the contact exerts on the contactor's body (collective)."""
+    def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
+        """Force and moment that the contact exerts on one of the bodies (collective).
+
+        Args:
+            about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
+                the surface's reference point where it is now: a tool's moment is about the point it turns about.
+            on: ``"contactor"``, or ``"target"``: a meshed one receives its forces at the feet of the contactors, a rigid one,
+                which has no nodes, where the contactors are.
+
+        Raises:
+            ValueError: for an unknown body, or a point that is not finite.
+        """
+        if on not in ("contactor", "target"):
+            raise ValueError(f"'{on}' is not known here: expected one of contactor, target")
+        target, p, g = self.pair.target, self.pair.projection, self.config.gdim
+        centre = np.zeros(g) if about is None else finite_point(about, "about", g)
         x, f = self.pair.points, self.pair.trial.force
-        parts = self.config.comm.allgather((f.sum(axis=0), _moments(x, f).sum(axis=0)))
+        if on == "target":
+            f = -f
+            if isinstance(p, FacetProjection):
+                x = p.foot
+            if about is None and isinstance(target, RigidSurface):
+                centre = target.reference(g)
+        parts = self.config.comm.allgather((f.sum(axis=0), _moments(x - centre, f).sum(axis=0)))
         return Resultant(np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0))
 
     def balance(self) -> Balance | None:

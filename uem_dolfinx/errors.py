@@ -53,6 +53,10 @@ class ConflictError(UEMError, ValueError):
     """A Dirichlet condition and a uniting equation, or two uniting equations, ask different things of one node."""
 
 
+class FloatingBodyError(UEMError, RuntimeError):
+    """A body moves as a rigid body under its loads, and neither conditions nor contacts can hold it."""
+
+
 class NotFiniteError(UEMError, ArithmeticError):
     """The residual, the tangent or the increment holds NaN or infinity."""
 

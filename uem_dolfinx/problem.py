@@ -118,8 +118,8 @@ class UnitedProblem:
             The history of iterations.
 
         Raises:
-            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError: after the committed
-                state has been restored.
+            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError: after
+                the committed state has been restored.
         """
         start = self._committed if start is None else start
         wanted = np.array(start)
@@ -128,6 +128,7 @@ class UnitedProblem:
         try:
             if ratio > 0.0:
                 self._predict(ratio)
+            self.system.settle()
             history = solve_united(
                 self.system,
                 rtol=self.rtol,

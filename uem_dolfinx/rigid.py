@@ -1,4 +1,4 @@
-"""Rigid targets: surfaces given by a signed distance and its gradient.
+"""Rigid targets: surfaces given by a signed distance and its gradient, which may move between load steps.
 
 Anything with ``project(points) -> Projection`` is a target; these need no mesh and no communication.
 """
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,12 +20,36 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
+class Motion:
+    """Rigid motion from the drawing to the present: ``x = about + Q (X - about) + translation``.
+
+    Attributes:
+        translation: of the point ``about`` ``(gdim,)``.
+        Q: rotation ``(gdim, gdim)``.
+        about: point of the drawing that the rotation leaves alone ``(gdim,)``.
+    """
+
+    translation: Array
+    Q: Array
+    about: Array
+
+    def carry(self, X: Array) -> Array:
+        """Where points ``X (n, gdim)`` of the drawing are now."""
+        return (X - self.about) @ self.Q.T + self.about + self.translation
+
+    def back(self, x: Array) -> Array:
+        """Where points that are at ``x (n, gdim)`` now are in the drawing."""
+        return (x - self.about - self.translation) @ self.Q + self.about
+
+
+@dataclass(frozen=True)
 class RigidProjection:
     """Projection onto a rigid surface; fields as in ``search.Projection``, without nodes.
 
     Attributes:
         points: where it was taken ``(n, gdim)``.
         bend: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
+        motion: of the surface when it was taken; None where it was drawn.
     """
 
     gap: Array
@@ -35,6 +60,7 @@ class RigidProjection:
     beyond: Array
     points: Array
     bend: Array
+    motion: Motion | None = None
 
     def with_gap(self, gap: Array) -> RigidProjection:
         """The same projection of points that have moved along the normal."""
@@ -46,16 +72,20 @@ class RigidProjection:
 
 
 class RigidSurface:
-    """Rigid target of any shape.
+    """Rigid target of any shape, still or moved as a rigid body.
 
     The gap is ``distance / |gradient|``, which is the signed distance wherever it is zero; a gradient of constant direction
-    measures the gap along that direction.
+    measures the gap along that direction. All functions are of points of the drawing, wherever the surface has been moved to.
 
     Args:
         distance: of points ``(n, gdim)``, positive outside ``(n,)``, a length.
         gradient: its gradient, pointing out of the target ``(n, gdim)``.
         hessian: its second derivative ``(n, gdim, gdim)``; None takes differences of the gradient.
         name: for messages.
+        reference: point about which it turns and its moment is taken ``(gdim,)``; None is the origin.
+
+    Raises:
+        ValueError: if ``reference`` is not finite.
     """
 
     n_nodes = 0
@@ -66,26 +96,87 @@ class RigidSurface:
         gradient: Callable[[Array], Array],
         hessian: Callable[[Array], Array] | None = None,
         name: str = "rigid surface",
+        reference: npt.ArrayLike | None = None,
     ):
         self.distance, self.gradient, self.hessian, self.name = distance, gradient, hessian, name
+        self.motion: Motion | None = None
+        self._reference = None if reference is None else finite_point(reference, f"{name}: reference")
+
+    def move(
+        self, translation: npt.ArrayLike, rotation: npt.ArrayLike | None = None, about: npt.ArrayLike | None = None
+    ) -> RigidSurface:
+        """Put the surface where this motion from the drawing takes it, whatever motion it had before.
+
+        Call it between load steps, usually from the function of the load factor that a problem gets as ``load``: being a
+        function of the factor alone, the motion of a step that fails and is cut is then that of the shorter step. Call it
+        alike on all ranks.
+
+        Args:
+            translation: of the point ``about`` ``(gdim,)``.
+            rotation: angle in 2D, counter-clockwise; rotation vector ``(3,)`` in 3D; None does not turn.
+            about: point of the drawing to turn about ``(gdim,)``; None is the surface's reference point,
+                which is the point, centre or apex that a ready-made one is given.
+
+        Returns:
+            The surface itself.
+
+        Raises:
+            ValueError: naming what is not finite, or not of the surface's dimension.
+        """
+        t = finite_point(translation, f"{self.name}: translation", None if self._reference is None else len(self._reference))
+        g = len(t)
+        centre = self._reference if about is None else finite_point(about, f"{self.name}: about", g)
+        centre = np.zeros(g) if centre is None else centre
+        turn = np.zeros(1 if g == 2 else 3) if rotation is None else _finite(rotation, f"{self.name}: rotation")
+        if turn.shape != ((1,) if g == 2 else (3,)):
+            expected = "an angle" if g == 2 else "a rotation vector of 3 numbers"
+            raise ValueError(f"{self.name}: rotation {rotation} in {g}D: expected {expected}")
+        c, s = np.cos(turn[0]), np.sin(turn[0])
+        Q = np.array([[c, -s], [s, c]]) if g == 2 else Rotation.from_rotvec(turn).as_matrix()
+        self.motion = Motion(t, Q, centre)
+        return self
+
+    def reference(self, gdim: int) -> Array:
+        """Where the point is now that the surface turns about and its moment is taken about ``(gdim,)``."""
+        if self.motion is not None:
+            return self.motion.about + self.motion.translation
+        return np.zeros(gdim) if self._reference is None else self._reference
 
     def project(self, points: Array) -> RigidProjection:
-        """Gap and normal at ``points (n, gdim)``."""
+        """Gap and normal at ``points (n, gdim)``.
+
+        Raises:
+            ValueError: if the points are not of the dimension in which the surface was moved.
+        """
         n, g = points.shape
-        slope = np.asarray(self.gradient(points), dtype=float).reshape(n, g)
+        motion = self.motion
+        if motion is not None and len(motion.translation) != g:
+            raise ValueError(f"{self.name} was moved in {len(motion.translation)}D but is met by points in {g}D: move it in {g}D")
+        X = points if motion is None else motion.back(points)
+        slope = np.asarray(self.gradient(X), dtype=float).reshape(n, g)
         length = np.linalg.norm(slope, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             normal = slope / length[:, None]
-            gap = np.asarray(self.distance(points), dtype=float).reshape(n) / length
+            gap = np.asarray(self.distance(X), dtype=float).reshape(n) / length
+        bend = self._bend(X, normal, length)
+        if motion is not None:
+            normal, bend = normal @ motion.Q.T, motion.Q @ bend @ motion.Q.T
         return RigidProjection(
             gap, normal, np.zeros((n, 0), np.int64), np.zeros((n, 0)), np.zeros(n, np.int64), np.zeros((n, g)), points.copy(),
-            self._bend(points, normal, length),
+            bend, motion,
         )  # fmt: skip
 
     def follow(self, points: Array, old: RigidProjection) -> RigidProjection:
-        """Gaps in the tangent planes of an earlier projection."""
-        gap = old.gap + np.einsum("ng,ng->n", old.normal, points - old.points)
-        return RigidProjection(gap, old.normal, old.nodes, old.weights, old.facet, old.beyond, points.copy(), old.bend)
+        """Gaps in the tangent planes of an earlier projection, which move with the surface."""
+        touched, normal, bend = old.points, old.normal, old.bend
+        if self.motion is not old.motion:
+            g = points.shape[1]
+            still = Motion(np.zeros(g), np.eye(g), np.zeros(g))
+            then, now = old.motion or still, self.motion or still
+            Q = now.Q @ then.Q.T
+            touched, normal, bend = now.carry(then.back(touched)), normal @ Q.T, Q @ bend @ Q.T
+        gap = old.gap + np.einsum("ng,ng->n", normal, points - touched)
+        return replace(old, gap=gap, normal=normal, points=points.copy(), bend=bend, motion=self.motion)
 
     def _bend(self, points: Array, normal: Array, length: Array) -> Array:
         """``t . grad^2 phi . t / |grad phi|`` in the tangent plane."""
@@ -116,6 +207,7 @@ class RigidPlane(RigidSurface):
             lambda x: np.tile(n, (len(x), 1)),
             lambda x: np.zeros((len(x), len(n), len(n))),
             name="rigid plane",
+            reference=p,
         )
 
 
@@ -140,7 +232,13 @@ class RigidSphere(RigidSurface):
             r, e = arm(x)
             return side * (np.eye(len(c)) - e[:, :, None] * e[:, None, :]) / np.where(r > 0, r, np.inf)[:, None, None]
 
-        super().__init__(lambda x: side * (arm(x)[0] - radius), lambda x: side * arm(x)[1], hessian, name="rigid sphere")
+        super().__init__(
+            lambda x: side * (arm(x)[0] - radius),
+            lambda x: side * arm(x)[1],
+            hessian,
+            name="rigid sphere",
+            reference=c,
+        )
 
 
 class RigidCylinder(RigidSurface):
@@ -168,6 +266,7 @@ class RigidCylinder(RigidSurface):
             lambda x: ball.gradient((x - p) @ across),
             hessian,
             name="rigid cylinder",
+            reference=p,
         )
 
 
@@ -193,7 +292,33 @@ class RigidParaboloid(RigidSurface):
             lambda x: (x - o) @ across / radius - a,
             lambda x: np.tile(across / radius, (len(x), 1, 1)),
             name="rigid paraboloid",
+            reference=o,
         )
+
+
+def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Array:
+    """A point or vector of the plane or of space ``(gdim,)``.
+
+    Args:
+        value: to be read as such.
+        what: it is, for the message.
+        gdim: its dimension; None takes 2 and 3.
+
+    Raises:
+        ValueError: if it is not finite, or has another dimension.
+    """
+    a = _finite(value, what)
+    if a.shape not in (((2,), (3,)) if gdim is None else ((gdim,),)):
+        raise ValueError(f"{what} {value} has shape {a.shape}: expected {'2 or 3' if gdim is None else gdim} numbers")
+    return a
+
+
+def _finite(value: npt.ArrayLike, what: str) -> Array:
+    """Copy as an array of at least one dimension."""
+    a = np.array(value, dtype=float, ndmin=1)
+    if not np.isfinite(a).all():
+        raise ValueError(f"{what} {value} is not finite: give finite numbers")
+    return a
 
 
 def _unit(v: npt.ArrayLike) -> Array:

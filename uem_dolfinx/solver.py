@@ -6,7 +6,6 @@ Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_optio
 from __future__ import annotations
 
 from contextlib import contextmanager
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.log import timed
-from uem_dolfinx.surfaces import find_bodies
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,12 +108,6 @@ class UnitedSolver:
         """Whether the preconditioner can use the rigid-body modes."""
         return self.ksp.getPC().getType() in ("gamg", "ml", "bddc")
 
-    @cached_property
-    def _bodies(self) -> tuple[npt.NDArray[np.int64], int]:
-        """Body that each owned node belongs to, and how many there are."""
-        labels, count = find_bodies(self.config)
-        return labels[: self.config.n_owned], count
-
     def set_operator(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Build ``P'(K + curvature)P`` and give it to the KSP (collective).
 
@@ -160,7 +152,8 @@ class UnitedSolver:
         Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
         across a contact would lock its sliding.
         """
-        body, n_bodies = self._bodies
+        body, n_bodies = self.config.bodies
+        body = body[: self.config.n_owned]
         own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
         joint = rigid_body_modes(self.config)
         vectors: list[PETSc.Vec] = []

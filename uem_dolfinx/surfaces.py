@@ -69,6 +69,11 @@ class Configuration:
         X.x.scatter_forward()
         self.X: Array = np.array(X.x.array.reshape(-1, self.gdim))
 
+    @cached_property
+    def bodies(self) -> tuple[Ints, int]:
+        """Body of each local node ``(n_local,)``, and their number (collective)."""
+        return find_bodies(self)
+
     @property
     def displacement(self) -> Array:
         """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (a view)."""

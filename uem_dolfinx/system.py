@@ -17,7 +17,8 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.errors import NotFiniteError, SpaceError
+from uem_dolfinx.errors import NotFiniteError, SpaceError, agree
+from uem_dolfinx.floating import FloatingBodies
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
@@ -38,6 +39,10 @@ Bools = npt.NDArray[np.bool_]
 ROUNDING = 4.0 * np.finfo(float).eps
 #: Residual relative to the forces at work below which contact forces can be trusted to release a contactor for good.
 SETTLED = 1e-6
+#: A contactor comes nearer if it closes its gap by more than this part of the motion.
+CLOSING = 1e-9
+#: A body that falls touches ground after so many stations at most.
+MOST_STATIONS = 200
 #: Part of the model's size that an active contactor's gap may be left with.
 CLOSED = 1e-13
 
@@ -117,6 +122,9 @@ class BodySystem:
         self.free = self._free_components()
         #: Displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
         self.wanted: Array = np.array(config.displacement)
+        #: Bodies that contact must hold, if there are any.
+        self.floating: FloatingBodies | None = None
+        self._open: Array = np.zeros((0, 0))
         self._factored: object = None
         self._stiffness: Any = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
@@ -130,6 +138,9 @@ class BodySystem:
         chained = any(pair.control is not None and pair.control.chained for pair in pairs)
         self.stacked = any(self.comm.allgather(chained or any(followed[pair.nodes].any() for pair in pairs)))
         self._find_mutual(self.pairs)
+        if self.pairs:
+            floating = FloatingBodies(self.config, self.free[: self.config.n_owned], finite=not self.tangent.linear)
+            self.floating = floating if floating.loose else None
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
         shared = len(np.unique(contactors)) < len(contactors)
         #: Whether equations can get in each other's way.
@@ -176,6 +187,37 @@ class BodySystem:
                         pair.return_to_target(stiffness)
                 self.u.x.scatter_forward()
 
+    def settle(self) -> None:
+        """Let bodies that nothing holds move rigidly along their loads until contact holds them (collective).
+
+        Raises:
+            FloatingBodyError: naming a body, and the motion that nothing stops.
+        """
+        floating = self.floating
+        if floating is None:
+            return
+        for _ in range(MOST_STATIONS):
+            self.place(returning=False)
+            self.assemble_residual()
+            motions = floating.open_motions(self._equations())
+            motion = floating.load(motions, self.residual.array_r.reshape(-1, self.config.gdim))
+            if not motion.any():
+                return
+            motion /= np.linalg.norm(motion)
+            closing, distance = [], np.inf
+            for pair in self.pairs:
+                ahead = pair.approach
+                rate = floating.rates(ahead) @ motion
+                closing.append(rate < -CLOSING)
+                way = np.where(rate < -CLOSING, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, CLOSING), np.inf)
+                distance = min(distance, float(way.min(initial=np.inf)))
+            distance = min(self.comm.allgather(distance))
+            agree(self.comm, floating.error(motion) if np.isinf(distance) else None)
+            # on curved surfaces the touch may come later than it seems; then the next station is nearer
+            if not any([pair.land(c) for pair, c in zip(self.pairs, closing)]):
+                floating.move(distance * motion)
+        agree(self.comm, floating.error(motion))
+
     # -- residual and uniting equations ------------------------------------------------------------------------------
 
     def assemble_residual(self) -> bool:
@@ -208,6 +250,10 @@ class BodySystem:
             if changed:
                 for pair in self.pairs:
                     pair.refresh_corners()
+                if self.floating is not None:
+                    # a body that has been let go comes to rest anew
+                    self.settle()
+                    F = self.residual
                 restriction, _ = self._restrict()
                 y = restriction.pass_on(F)
             residual = restriction.reduce(y)
@@ -230,11 +276,18 @@ class BodySystem:
             bool(closed),
         )
 
+    def _equations(self) -> UnitingEquations:
+        """Uniting equations of all pairs."""
+        return UnitingEquations.join([pair.equations() for pair in self.pairs], self.config.gdim)
+
     def _restrict(self) -> tuple[Restriction, Resolution | None]:
         """P and c of the present uniting equations, and how those that got in each other's way were resolved."""
         n, free = self.config.n_owned, self.free[: self.config.n_owned]
         parts = [pair.equations() for pair in self.pairs]
         equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
+        if self.floating is not None:
+            self._open = self.floating.open_motions(equations)
+            free = free & ~self.floating.supports(self._open, equations)
         if self.contestable:
             mutual = np.repeat([pair.mutual for pair in self.pairs], [len(part) for part in parts]).astype(bool)
             resolution = Resolution(self.config, equations, free, mutual)
@@ -345,6 +398,8 @@ class BodySystem:
         """``du = P dq + c``."""
         du = state.restriction.expand(dq)
         du.axpy(1.0, state.restriction.c)
+        if self.floating is not None:
+            du.array[:] -= self.floating.part(self._open, du.array_r.reshape(-1, self.config.gdim)).ravel()
         return du
 
     def displacement(self) -> PETSc.Vec:

@@ -335,6 +335,23 @@ class ContactPair:
         self.committed = self.last_commit = self.trial
         self._update_control()
 
+    @property
+    def approach(self) -> UnitingEquations:
+        """The equations that all contactors in front of the target would have, of those that are not active."""
+        p = self.projection
+        i = np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+        return UnitingEquations.along(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], p.gap[i], np.ones(len(i), bool))
+
+    def land(self, closing: Bools) -> bool:
+        """Activate the contactors among those of ``approach`` that close and touch (collective): whether there are any."""
+        i = np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+        touching = i[closing & (self.projection.gap[i] <= TOUCHING * self.config.size)]
+        active = self.trial.active.copy()
+        active[touching] = True
+        self.trial = replace(self.trial, active=active)
+        self._update_control()
+        return bool(self.config.comm.allreduce(len(touching)))
+
     def check_prescribed(self) -> None:
         """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
 
