@@ -1,4 +1,8 @@
-"""Fixtures for tests that run alike on any number of ranks; hypothesis draws the same examples on all of them."""
+"""Fixtures for tests that run alike on any number of ranks; hypothesis draws the same examples on all of them.
+
+Every state in which any test's Newton loop has converged is checked for equilibrium under the contact forces, complementarity and
+action = reaction.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,17 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
 import hypothesis
+import numpy as np
 import pytest
+from helpers import complementary, highest
 
-import uem_dolfinx  # noqa: F401
+import uem_dolfinx as uem
+from uem_dolfinx import compat
 
 hypothesis.settings.register_profile("ranks", deadline=None, derandomize=True, database=None, max_examples=25)
 hypothesis.settings.load_profile("ranks")
@@ -35,6 +43,43 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
             print(f"\nrank {_MEETING.rank} is alone after {item.nodeid}\n{report.longreprtext}", file=sys.__stderr__, flush=True)
             _MEETING.Abort(1)
         time.sleep(1e-4)
+
+
+@pytest.fixture(autouse=True)
+def every_converged_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check what ``UnitedProblem.solve`` ends with (collective)."""
+    solve = uem.UnitedProblem.solve
+    largest: dict[uem.UnitedProblem, float] = {}
+
+    def checked(self: uem.UnitedProblem, **how: Any) -> list[Any]:
+        history = solve(self, **how)
+        # a step that unloads is in equilibrium against the forces that were there before
+        largest[self] = max(largest.get(self, 0.0), self.system.residual.norm())
+        check_state(self, largest[self])
+        return history
+
+    monkeypatch.setattr(uem.UnitedProblem, "solve", checked)
+
+
+def check_state(problem: uem.UnitedProblem, scale: float) -> None:
+    """Bodies in equilibrium, contacts closed or free of force, forces in pairs; ``scale`` is the norm of forces (collective)."""
+    system, config = problem.system, problem.config
+    system.assemble_residual()
+    F = system.residual
+    rounding = 10 * system.rounding()
+    forces = F.duplicate()
+    forces.set(0.0)
+    for contact in problem.contacts:
+        # a small-sliding contact has been projected anew since
+        if contact.sliding != "small":
+            complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
+        balance = contact.balance()
+        # where the foot stays behind, or a contactor is held beyond the target's end, the forces of a pair lie on two lines
+        one_line = contact.sliding == "finite" and highest(config.comm, contact.pair.trial.slips) <= 1
+        assert balance is None or (balance.force < 1e-11 and (balance.moment < 1e-11 or not one_line))
+        forces.axpy(1.0, compat.petsc_vector(contact.force))
+    left = (F - forces).array_r.reshape(-1, config.gdim) * system.free[: config.n_owned]
+    assert highest(config.comm, np.abs(left)) <= 1e-5 * scale + rounding
 
 
 @pytest.fixture

@@ -238,7 +238,7 @@ class BodySystem:
 
     def unite(self, cautious: bool) -> United:
         """Contact forces, activation and release, and the uniting equations that follow."""
-        F, rounding = self.residual, self._rounding()
+        F, rounding = self.residual, self.rounding()
         with timed("uniting equations"):
             restriction, resolution = self._restrict()
             y = restriction.pass_on(F)
@@ -308,7 +308,7 @@ class BodySystem:
             pair.read_forces(lam[part], redundant[part])
             start += pair.n_equations
 
-    def _rounding(self) -> float:
+    def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make."""
         if self._stiffness is None:
             return 0.0
