@@ -35,6 +35,7 @@ args = common.arguments(
     steps=5,
     quads=0,
     tangent=("consistent", "without_contact"),
+    chords=0,
 )
 
 # %% [markdown]
@@ -56,7 +57,7 @@ bcs = [
     dirichlet(V, tags["block_bottom"], 1, 0.0),
     dirichlet(V, tags["disc_top"], 1, -0.006),
 ]
-contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], normals=args.normals)
+contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], normals=args.normals, chords=bool(args.chords))
 
 # %% [markdown]
 # ## The solution

@@ -125,9 +125,7 @@ class Resolution:
             A = np.zeros((len(which), len(columns), g))
             np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
             np.add.at(A, (at_row, at[len(which) :]), -rows.coefficients[terms])
-            groups.append(
-                _eliminate(A, -rows.gap[which], at[: len(which)], movable[columns], node[columns], origin[which])
-            )
+            groups.append(_eliminate(A, -rows.gap[which], at[: len(which)], movable[columns], node[columns], origin[which]))
         return groups
 
     def _take_home(self, plain: UnitingEquations, groups: list[Group]) -> UnitingEquations:
@@ -227,7 +225,7 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, origin: I
         node: global numbers ``(n_nodes,)``.
         origin: rank and place of each equation ``(m, 2)``.
     """
-    m, n, g = A.shape
+    m, _, g = A.shape
     given = (A * free).reshape(m, -1)
     A, h = A.copy(), h.copy()
     rest = np.ones(m, dtype=bool)
@@ -254,7 +252,9 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, origin: I
         size = np.linalg.norm(A * free, axis=2)
     k = np.array(order, dtype=np.int64)
     solved = (A[k] * free).reshape(len(k), -1)
-    shares = np.linalg.lstsq(given.T, solved.T, rcond=None)[0] if len(k) else np.zeros((m, 0))
+    shares: Array = np.zeros((m, 0))
+    if len(k):
+        shares = np.asarray(np.linalg.lstsq(given.T, solved.T, rcond=None)[0])
     terms = A[k].copy()
     # what is left of the pivot's own block is across the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot[k]] -= direction[k]

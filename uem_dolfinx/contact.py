@@ -64,6 +64,8 @@ class Contact:
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
+        chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
+            the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
 
     Raises:
@@ -78,13 +80,14 @@ class Contact:
         sliding: str = "finite",
         normals: str = "facet",
         max_penetration: float | None = None,
+        chords: bool = False,
         name: str | None = None,
     ):
         for value, known in ((sliding, ("finite", "small", "fixed")), (normals, ("facet", "averaged"))):
             if value not in known:
                 raise ValueError(f"'{value}' is not known here: expected one of {', '.join(known)}")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
-        self.max_penetration = max_penetration
+        self.max_penetration, self.chords = max_penetration, chords
         target_name = getattr(target, "name", type(target).__name__)
         self.name = name or f"{contactor.name} on {target_name}"
         self._pair: ContactPair | None = None
@@ -118,6 +121,7 @@ class Contact:
             name=self.name,
             sliding=self.sliding,
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
+            chords=self.chords and config.degree == 2,
         )
         self._system = system
         return self._pair
@@ -135,6 +139,11 @@ class Contact:
     def n_active(self) -> int:
         """Number of active contactors over all ranks (collective)."""
         return self.pair.n_active
+
+    @property
+    def initial_overlap(self) -> float:
+        """How deep contactors were inside the target before the first step, a length; 0 if none was."""
+        return self.pair.initial_overlap
 
     def max_gap(self) -> float:
         """Largest gap of an active contactor, a length (collective)."""

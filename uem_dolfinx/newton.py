@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 STALLED = 0.5
+#: An active set that still changes after so many iterations changes by one contactor at a time from then on.
+CAUTIOUS_AFTER = 10
 #: Shortest step of the line search.
 SHORTEST_STEP = 1.0 / 64
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
@@ -53,6 +55,7 @@ class United:
 
     Attributes:
         restriction: P and c.
+        step: P and c that the step is taken with; the same unless a contact approximates curved facets by chords.
         residual: ``P'F``, the out-of-balance forces.
         norm: its norm.
         scale: norm of the forces at work.
@@ -65,6 +68,7 @@ class United:
     """
 
     restriction: Restriction
+    step: Restriction
     residual: PETSc.Vec
     norm: float
     scale: float
@@ -117,7 +121,9 @@ class UnitedSystem(Protocol):
         """``P'F`` at the present displacement, with the active set of ``state``."""
 
 
-def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool) -> list[Iteration]:
+def solve_united(
+    system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool, forces_before: float = 0.0
+) -> list[Iteration]:
     """Iterate until ``P'r`` vanishes against the forces at work and every contact condition holds.
 
     Args:
@@ -126,6 +132,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
         max_iterations: bound on the number of linear solves.
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
+        forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
 
     Returns:
         The history; its last entry is the converged state.
@@ -151,7 +158,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
         stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
         norm = state.norm
         rounding = state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding)
-        small = max(rtol * forces, min(rounding, LARGEST_ROUNDING * max(forces, thrust)))
+        small = max(rtol * forces, min(rounding, LARGEST_ROUNDING * max(forces, thrust, forces_before)))
         converged = not state.changed and state.closed and norm <= small
         if converged or k == max_iterations:
             history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
@@ -160,7 +167,7 @@ def solve_united(system: UnitedSystem, *, rtol: float, max_iterations: int, line
                 return history
             break
         fingerprint = system.active_set()
-        cautious |= state.changed and fingerprint in seen
+        cautious |= state.changed and (fingerprint in seen or k >= CAUTIOUS_AFTER)
         seen.add(fingerprint)
         rhs = system.linearise(state, first=k == 0)
         driving = rhs.norm()

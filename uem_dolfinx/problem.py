@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat
+from uem_dolfinx.checks import check_prescribed
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, LinearSolveError, NotFiniteError, UEMError
 from uem_dolfinx.log import logger
 from uem_dolfinx.newton import Iteration, solve_united
@@ -102,7 +103,7 @@ class UnitedProblem:
         self.system.add_pairs([contact.attach(self.system) for contact in self.contacts])
         self._committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
-        self._last_fraction: float | None = None
+        self._largest_forces = 0.0
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -135,9 +136,10 @@ class UnitedProblem:
                 max_iterations=self.max_iterations,
                 line_search=self.line_search,
                 verbose=self.verbose,
+                forces_before=self._largest_forces,
             )
             for pair in self.system.pairs:
-                pair.check_prescribed()
+                check_prescribed(pair)
         except UEMError:
             self.restore()
             raise
@@ -147,6 +149,7 @@ class UnitedProblem:
     def commit(self) -> None:
         """Keep the present displacement and contact state."""
         self._last, self._committed = self._committed, np.array(self.u.x.array)
+        self._largest_forces = max(self._largest_forces, self.system.residual.norm())
         for pair in self.system.pairs:
             pair.commit()
             pair.project()
@@ -218,6 +221,8 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
             length *= 0.5
             if length < SHORTEST_LOAD_STEP * nominal:
                 _apply_load(problem, done)
+                # the targets that the load moves are back, too
+                problem.restore()
                 raise
             logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
             continue

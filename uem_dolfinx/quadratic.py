@@ -15,6 +15,7 @@ add up to the resultant.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy.typing as npt
 from uem_dolfinx import compat
 
 if TYPE_CHECKING:
+    from uem_dolfinx.equations import UnitingEquations
     from uem_dolfinx.search import Projection
     from uem_dolfinx.surfaces import Configuration
 
@@ -127,6 +129,27 @@ class ControlGaps:
         scale[self.child[self.shared]] = 0.5
         scale[self.child[self.shared & self._of_facet]] = 0.25
         return scale
+
+    def extend(self, equations: UnitingEquations, united: Ints, active: Bools) -> UnitingEquations:
+        """Add the terms of the parents whose gaps stay open.
+
+        Args:
+            equations: of some contactors.
+            united: their places ``(m,)``.
+            active: who is united ``(n,)``.
+        """
+        place = np.full(len(self.nodes), -1, dtype=np.int64)
+        place[united] = np.arange(len(united))
+        k = np.flatnonzero(self.kept & active[self.child])
+        own = self.weight[k, None] * self.normal[k]
+        a, b = np.nonzero(self.targets[k] >= 0)
+        row = place[self.child[k]]
+        return replace(
+            equations,
+            row=np.concatenate([equations.row, row, row[a]]),
+            followed=np.concatenate([equations.followed, self.config.to_global(self.parent[k]), self.targets[k][a, b]]),
+            coefficients=np.concatenate([equations.coefficients, own, -self.weights[k][a, b][:, None] * own[a]]),
+        )
 
     def areas(self, areas: Array) -> Array:
         """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""

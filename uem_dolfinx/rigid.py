@@ -130,7 +130,7 @@ class RigidSurface:
         turn = np.zeros(1 if g == 2 else 3) if rotation is None else _finite(rotation, f"{self.name}: rotation")
         if turn.shape != ((1,) if g == 2 else (3,)):
             expected = "an angle" if g == 2 else "a rotation vector of 3 numbers"
-            raise ValueError(f"{self.name}: rotation {rotation} in {g}D: expected {expected}")
+            raise ValueError(f"{self.name}: rotation {rotation!r} in {g}D: expected {expected}")
         c, s = np.cos(turn[0]), np.sin(turn[0])
         Q = np.array([[c, -s], [s, c]]) if g == 2 else Rotation.from_rotvec(turn).as_matrix()
         self.motion = Motion(t, Q, centre)
@@ -309,7 +309,7 @@ def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Ar
     """
     a = _finite(value, what)
     if a.shape not in (((2,), (3,)) if gdim is None else ((gdim,),)):
-        raise ValueError(f"{what} {value} has shape {a.shape}: expected {'2 or 3' if gdim is None else gdim} numbers")
+        raise ValueError(f"{what} {value!r} has shape {a.shape}: expected {'2 or 3' if gdim is None else gdim} numbers")
     return a
 
 
@@ -317,7 +317,7 @@ def _finite(value: npt.ArrayLike, what: str) -> Array:
     """Copy as an array of at least one dimension."""
     a = np.array(value, dtype=float, ndmin=1)
     if not np.isfinite(a).all():
-        raise ValueError(f"{what} {value} is not finite: give finite numbers")
+        raise ValueError(f"{what} {value!r} is not finite: give finite numbers")
     return a
 
 

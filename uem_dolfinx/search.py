@@ -239,7 +239,9 @@ class MeshTarget:
         best = _nearest(np.concatenate(requests), d, h, np.arange(len(d)))
         return FacetProjection(*(column[best] for column in columns))
 
-    def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> FacetProjection:
+    def _project_here(
+        self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
+    ) -> FacetProjection:
         """Project onto this rank's facets."""
         if facet is None:
             pairs, candidates = candidate_pairs(self.shape, data.x, points)

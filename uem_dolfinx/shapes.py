@@ -65,6 +65,16 @@ class FacetShape:
             ddN[..., 0, 1] = ddN[..., 1, 0] = t[4]
         return Tabulated(t[0], np.moveaxis(t[1 : 1 + d], 0, -1), ddN)
 
+    def chords(self, xi: Array) -> Array:
+        """Weights of the straight pieces between neighbouring nodes at ``xi (n, fdim)``: ``(n, nn)`` [UEM, 4.5]."""
+        if self.degree == 1:
+            return self.tabulate(xi).N
+        if self.cell != "triangle":
+            return np.maximum(1 - 2 * np.abs(xi[:, None, :] - self.nodes), 0.0).prod(axis=2)
+        b = np.column_stack([1 - xi.sum(axis=1), xi])
+        middles = [np.minimum(np.minimum(2 * b[:, i], 2 * b[:, j]), 1 - 2 * b[:, 3 - i - j]) for i, j in self.topology[1]]
+        return np.maximum(np.column_stack([2 * b - 1, *middles]), 0.0)
+
     @property
     def nodes(self) -> Array:
         """Reference positions of the nodes ``(nn, fdim)``."""

@@ -15,6 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
+from uem_dolfinx.checks import check_initial
 from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import NotFiniteError, SpaceError, agree
@@ -147,7 +148,7 @@ class BodySystem:
         self.contestable = any(self.comm.allgather(shared or any(pair.prescribed or pair.mutual for pair in pairs)))
         self.place(returning=False)
         for pair in pairs:
-            pair.check_initial()
+            check_initial(pair)
             pair.touch()
 
     def _find_mutual(self, pairs: list[ContactPair]) -> None:
@@ -257,6 +258,7 @@ class BodySystem:
                 restriction, _ = self._restrict()
                 y = restriction.pass_on(F)
             residual = restriction.reduce(y)
+            step = self._restrict(chords=True)[0] if any(pair.chords for pair in self.pairs) else restriction
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         active = sum(pair.n_active for pair in self.pairs)
         short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
@@ -265,6 +267,7 @@ class BodySystem:
         closed = gap <= CLOSED * self.config.size and short <= 4 * np.finfo(float).eps * largest
         return United(
             restriction,
+            step,
             residual,
             residual.norm(),
             F.norm(),
@@ -280,10 +283,10 @@ class BodySystem:
         """Uniting equations of all pairs."""
         return UnitingEquations.join([pair.equations() for pair in self.pairs], self.config.gdim)
 
-    def _restrict(self) -> tuple[Restriction, Resolution | None]:
+    def _restrict(self, chords: bool = False) -> tuple[Restriction, Resolution | None]:
         """P and c of the present uniting equations, and how those that got in each other's way were resolved."""
         n, free = self.config.n_owned, self.free[: self.config.n_owned]
-        parts = [pair.equations() for pair in self.pairs]
+        parts = [pair.equations(chords) for pair in self.pairs]
         equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
         if self.floating is not None:
             self._open = self.floating.open_motions(equations)
@@ -340,7 +343,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.tangent.update()
             self._stiffness = self.tangent.K.getDiagonal()
-        K, restriction = self.tangent.K, state.restriction
+        K, restriction = self.tangent.K, state.step
         with timed("contact curvature"):
             curvature = self._curvature() if self.consistent_tangent else None
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
@@ -355,7 +358,7 @@ class BodySystem:
         if curvature is not None:
             load.axpy(1.0, curvature * c)
         load.axpy(1.0, self.residual)
-        rhs = restriction.reduce(restriction.pass_on(load))
+        rhs = state.restriction.reduce(state.restriction.pass_on(load))
         rhs.scale(-1.0)
         return rhs
 
@@ -396,8 +399,8 @@ class BodySystem:
 
     def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
-        du = state.restriction.expand(dq)
-        du.axpy(1.0, state.restriction.c)
+        du = state.step.expand(dq)
+        du.axpy(1.0, state.step.c)
         if self.floating is not None:
             du.array[:] -= self.floating.part(self._open, du.array_r.reshape(-1, self.config.gdim)).ravel()
         return du

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.checks import TOUCHING, check_finite
 from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
-from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, agree
 from uem_dolfinx.quadratic import ControlGaps
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
@@ -31,10 +31,6 @@ SLID_OFF = 1e-6
 END_HOLDS = 0.1
 #: Gaps below this part of the model's size are zero.
 GAP_ROUNDING = 1e-13
-#: A body touches at the start when its gap is below this part of the model's size.
-TOUCHING = 1e-9
-#: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
-LEFT_OUT = 1e-6
 #: Contactors nearer than this many facets keep a row in the sparsity of P.
 NEAR = 1.0
 #: Normal return may change nodal forces by this part of the largest contact force.
@@ -89,6 +85,7 @@ class ContactPair:
         name: for messages.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` at the start of every step, ``"fixed"`` once.
         max_penetration: bound on the initial penetration, a length.
+        chords: approximate curved facets by straight pieces in P, and there alone.
     """
 
     def __init__(
@@ -101,9 +98,12 @@ class ContactPair:
         name: str,
         sliding: str,
         max_penetration: float,
+        chords: bool = False,
     ):
         self.config, self.nodes, self.target, self.name = config, nodes, target, name
-        self.sliding, self.max_penetration = sliding, max_penetration
+        self.sliding, self.max_penetration, self.chords = sliding, max_penetration, chords
+        #: Depth of the deepest contactor inside the target before the first step, a length.
+        self.initial_overlap = 0.0
         n = len(nodes)
         self.free, self._free = free[nodes], free
         #: Whether any contactor on any rank is prescribed in some direction.
@@ -154,7 +154,7 @@ class ContactPair:
             self._anchor = self.projection = self.target.project(self.points)
         else:
             self.projection = self.target.follow(self.points, self._anchor)
-        self.check_finite()
+        check_finite(self)
         if self.prescribed:
             self._ask_target()
         self._measure()
@@ -171,22 +171,6 @@ class ContactPair:
         if self.control is not None:
             self.control.follow(self.trial.active)
             self.gap = self.control.gaps(self.projection.gap)
-
-    def check_finite(self) -> None:
-        """Refuse a projection that is not finite, which a rigid surface's functions may return (collective).
-
-        Raises:
-            NotFiniteError: naming the first such contactor.
-        """
-        p = self.projection
-        bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
-        error = None
-        if len(bad):
-            error = NotFiniteError(
-                f"{self.name}: gap {p.gap[bad[0]]}, normal {p.normal[bad[0]]} at {self.config.describe(int(self.nodes[bad[0]]))}: "
-                "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
-            )
-        agree(self.config.comm, error)
 
     @property
     def _has_corners(self) -> bool:
@@ -284,23 +268,6 @@ class ContactPair:
         here = np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0)
         return float(max(self.config.comm.allgather(here)))
 
-    def check_initial(self) -> None:
-        """Refuse an initial penetration beyond the bound (collective).
-
-        Raises:
-            PenetrationError: naming the deepest node of the first rank that has one.
-        """
-        gap = np.where(self.off, np.inf, self.projection.gap)
-        error = None
-        if len(gap) and gap.min() < -self.max_penetration:
-            i = int(gap.argmin())
-            error = PenetrationError(
-                f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i]))} starts {-gap[i]:.4g} inside the target, "
-                f"more than max_penetration = {self.max_penetration:.4g}: move the bodies apart, restrict the surfaces to the parts "
-                "that can touch, or raise max_penetration if this interference is meant"
-            )
-        agree(self.config.comm, error)
-
     @property
     def off(self) -> Bools:
         """Contactors that have slid past an open end of the target in a direction in which they can move ``(n,)``."""
@@ -351,25 +318,6 @@ class ContactPair:
         self.trial = replace(self.trial, active=active)
         self._update_control()
         return bool(self.config.comm.allreduce(len(touching)))
-
-    def check_prescribed(self) -> None:
-        """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
-
-        Raises:
-            ConflictError: naming the deepest such node of the first rank that has one.
-        """
-        left_out = self.trial.active & self.redundant
-        depth = -self.projection.gap / self.config.size
-        inside = ~self.off & ((~self.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
-        error = None
-        if inside.any():
-            i = int(np.argmin(np.where(inside, self.projection.gap, np.inf)))
-            error = ConflictError(
-                f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i]))} is prescribed to be "
-                f"{-self.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
-                "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
-            )
-        agree(self.config.comm, error)
 
     def predict(self, ratio: float) -> None:
         """First active set of a step, extrapolated from the last one; call it projected at the extrapolated displacement.
@@ -478,13 +426,21 @@ class ContactPair:
 
     # -- what the united system gets ---------------------------------------------------------------------------------
 
-    def equations(self) -> UnitingEquations:
-        """Uniting equations of the contactors that are or may become active; two for one held in a corner."""
+    def equations(self, chords: bool = False) -> UnitingEquations:
+        """Uniting equations of the contactors that are or may become active; two for one held in a corner.
+
+        Args:
+            chords: take the weights of the straight pieces between the target's nodes, if this pair is to.
+        """
         i = self._united = np.flatnonzero(self._near())
-        p, active = self.projection, self.trial.active
-        first = UnitingEquations.along(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], self.gap[i], active[i])
+        p, active, weights = self.projection, self.trial.active, self.projection.weights[i]
+        if chords and self.chords and isinstance(p, FacetProjection):
+            plain: Bools = np.all(self.trial.held[i] < 0, axis=1)
+            assert isinstance(self.target, MeshTarget)
+            weights = np.where(plain[:, None], self.target.shape.chords(p.xi[i]), weights)
+        first = UnitingEquations.along(self.nodes[i], p.normal[i], p.nodes[i], weights, self.gap[i], active[i])
         if self.control is not None:
-            first = self._with_parents(first)
+            first = self.control.extend(first, i, active)
         self.n_equations = len(first)
         c = self._corners
         if c is None:
@@ -496,23 +452,6 @@ class ContactPair:
             parts.append(UnitingEquations.along(self.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], active[w]))
         self.n_equations = sum(len(part) for part in parts)
         return UnitingEquations.join(parts, self.config.gdim)
-
-    def _with_parents(self, equations: UnitingEquations) -> UnitingEquations:
-        """Add the terms of the parents whose gaps stay open [Bernstein's basis, see ``quadratic``]."""
-        c = self.control
-        assert c is not None
-        place = np.full(len(self.nodes), -1, dtype=np.int64)
-        place[self._united] = np.arange(len(self._united))
-        k = np.flatnonzero(c.kept & self.trial.active[c.child])
-        own = c.weight[k, None] * c.normal[k]
-        a, b = np.nonzero(c.targets[k] >= 0)
-        row = place[c.child[k]]
-        return replace(
-            equations,
-            row=np.concatenate([equations.row, row, row[a]]),
-            followed=np.concatenate([equations.followed, self.config.to_global(c.parent[k]), c.targets[k][a, b]]),
-            coefficients=np.concatenate([equations.coefficients, own, -c.weights[k][a, b][:, None] * own[a]]),
-        )
 
     def _near(self) -> Bools:
         """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks."""
