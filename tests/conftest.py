@@ -74,9 +74,8 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         if contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
         balance = contact.balance()
-        # where the foot stays behind, or a contactor is held beyond the target's end, the forces of a pair lie on two lines
-        one_line = contact.sliding == "finite" and highest(config.comm, contact.pair.trial.slips) <= 1
-        assert balance is None or (balance.force < 1e-11 and (balance.moment < 1e-11 or not one_line))
+        # where the foot stays behind, the forces of a pair lie on two lines
+        assert balance is None or (balance.force < 1e-11 and (balance.moment < 1e-11 or contact.sliding != "finite"))
         forces.axpy(1.0, compat.petsc_vector(contact.force))
     left = (F - forces).array_r.reshape(-1, config.gdim) * system.free[: config.n_owned]
     assert highest(config.comm, np.abs(left)) <= 1e-5 * scale + rounding

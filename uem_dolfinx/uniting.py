@@ -148,7 +148,7 @@ class ContactPair:
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective)."""
         if self.sliding == "finite":
-            self._nearest = self.target.project(self.points)
+            self._nearest = self._held_at_end(self.target.project(self.points))
             self.projection = self._in_corners(self._nearest)
         elif self._anchor is None:
             self._anchor = self.projection = self.target.project(self.points)
@@ -171,6 +171,19 @@ class ContactPair:
         if self.control is not None:
             self.control.follow(self.trial.active)
             self.gap = self.control.gaps(self.projection.gap)
+
+    def _held_at_end(self, nearest: Projection) -> Projection:
+        """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
+        if not isinstance(nearest, FacetProjection):
+            return nearest
+        assert isinstance(self.target, MeshTarget)
+        i = np.flatnonzero(self.trial.active & (self.trial.slips > 1) & (nearest.beyond * self.free != 0).any(axis=1))
+        t = np.einsum("kaf,kag->kfg", nearest.dN[i], nearest.x[i])
+        m = np.einsum("kfg,keg->kfe", t, t)
+        xi = nearest.xi[i] + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, nearest.beyond[i])[..., None])[..., 0]
+        tab = self.target.shape.tabulate(xi)
+        foot = np.einsum("ka,kag->kg", tab.N, nearest.x[i])
+        return nearest.with_rows(i, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     @property
     def _has_corners(self) -> bool:
