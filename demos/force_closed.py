@@ -37,7 +37,7 @@ E, nu, R, W = 1e6, 0.3, 3.0, 6.0
 # %%
 mesh, tags = uem.read_gmsh(
     common.MESHES / "force_closed.geo", comm, gdim=2,
-    parameters={"h": args.h, "ratio": args.ratio, "gap": args.gap, "R": R, "W": W},
+    parameters={"h": args.h, "ratio": args.ratio, "gap": args.gap, "R": R, "W": W, "order": args.degree},
 )  # fmt: skip
 V = compat.function_space(mesh, args.degree, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)

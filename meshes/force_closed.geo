@@ -9,7 +9,8 @@ DefineConstant[
   R = 3,         // radius of the disc
   W = 6,         // half the width, and height, of the block
   zone = 0.15,   // the contact zone reaches this far from the tip
-  growth = 6     // cells at distance r are growth * h * r large
+  growth = 6,    // cells at distance r are growth * h * r large
+  order = 1      // of the cells: 2 follows the arc with curved ones
 ];
 h_block = h * (ratio > 1 ? ratio : 1);
 h_disc = h / (ratio < 1 ? ratio : 1);
@@ -60,3 +61,4 @@ Physical Curve("block_top") = {3, 4, 5};
 Physical Curve("block_bottom") = {1};
 Physical Curve("disc_arc") = {11, 12, 13};
 Physical Curve("disc_top") = {14};
+Mesh.ElementOrder = order;

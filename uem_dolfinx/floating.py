@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from uem_dolfinx.errors import FloatingBodyError
+from uem_dolfinx.log import logger
 
 if TYPE_CHECKING:
     from uem_dolfinx.equations import UnitingEquations
@@ -25,8 +26,15 @@ Bools = npt.NDArray[np.bool_]
 
 #: A motion is open if conditions and contacts resist it with less than this part of its size.
 OPEN = 1e-5
-#: A motion is loaded if the forces along it exceed this part of all forces.
-LOADED = 1e-8
+#: Until contact has developed, motions that it resists with less than this part are held as well: a body that has touched ground
+#: with one or two nodes would else swing about them.
+HARDLY_HELD = 0.03
+#: A motion is loaded if the forces along it exceed this part of all forces; supports may be left with less.
+LOADED = 1e-6
+#: Forces up to this part of all forces take a body no farther than ``NUDGE`` of the model's size: on a single facet it would slide
+#: away as soon as the facet tilts in the least.
+BARELY_LOADED = 1e-3
+NUDGE = 0.01
 
 
 class FloatingBodies:
@@ -46,18 +54,15 @@ class FloatingBodies:
 
     def __init__(self, config: Configuration, free: Bools, finite: bool):
         self.config, self.comm, self.free, self.finite = config, config.comm, free, finite
-        label, self.count = config.bodies
-        self._body = label
-        own = label[: config.n_owned]
-        X = config.X[: config.n_owned]
-        sums = np.zeros((self.count, config.gdim + 1))
-        np.add.at(sums, own, np.column_stack([np.ones(len(own)), X]))
-        sums = self.comm.allreduce(sums)
-        self.middle: Array = sums[:, 1:] / sums[:, :1]
+        self._body, self.count = config.bodies
+        own = self._body[: config.n_owned]
+        self.middle = self._middles()
         radius = np.zeros(self.count)
-        np.maximum.at(radius, own, np.linalg.norm(X - self.middle[own], axis=1))
+        np.maximum.at(radius, own, np.linalg.norm(config.X[: config.n_owned] - self.middle[own], axis=1))
         self.radius: Array = np.max(self.comm.allgather(radius), axis=0)
         self._pins: tuple[Array, Bools] | None = None
+        #: Part that the largest force along an open motion was of all forces when last asked for.
+        self.share = 0.0
         self.loose = self.open_motions(None).shape[1] > 0
 
     # -- motions ---------------------------------------------------------------------------------------------------------
@@ -66,6 +71,14 @@ class FloatingBodies:
     def _places(self) -> Array:
         """Where the owned nodes are that a motion takes along ``(n_owned, gdim)``."""
         return (self.config.x if self.finite else self.config.X)[: self.config.n_owned]
+
+    def _middles(self) -> Array:
+        """Means of the bodies' nodes ``(count, gdim)`` (collective)."""
+        own = self._body[: self.config.n_owned]
+        sums = np.zeros((self.count, self.config.gdim + 1))
+        np.add.at(sums, own, np.column_stack([np.ones(len(own)), self._places]))
+        sums = self.comm.allreduce(sums)
+        return np.asarray(sums[:, 1:] / sums[:, :1])
 
     def _modes(self, x: Array, body: Ints) -> Array:
         """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each of their own modes ``(n, n_modes, gdim)``."""
@@ -84,6 +97,11 @@ class FloatingBodies:
     def n_modes(self) -> int:
         """Rigid-body modes of one body."""
         return 3 if self.config.gdim == 2 else 6
+
+    @property
+    def every_motion(self) -> Array:
+        """All motions of all bodies ``(n_motions, n_motions)``."""
+        return np.eye(self.count * self.n_modes)
 
     def _spread(self, values: Array, body: Ints) -> Array:
         """Rows in all motions from rows in the modes of one body each ``(n, count * n_modes)``."""
@@ -104,8 +122,15 @@ class FloatingBodies:
         np.subtract.at(rows, equations.row, self._spread(terms, body))
         return rows
 
-    def open_motions(self, equations: UnitingEquations | None) -> Array:
-        """Orthonormal motions that neither conditions nor active equations resist ``(n_motions, k)`` (collective)."""
+    def open_motions(self, equations: UnitingEquations | None, resistance: float = OPEN) -> Array:
+        """Orthonormal motions that neither conditions nor active equations resist ``(n_motions, k)`` (collective).
+
+        Args:
+            equations: of all contactors, or None.
+            resistance: what counts as none, as part of the motion's size.
+        """
+        if self.finite:
+            self.middle = self._middles()
         i, c = np.nonzero(~self.free)
         body = self._body[i]
         held = self._spread(self._modes(self._places[i], body)[np.arange(len(i)), :, c], body)
@@ -114,7 +139,7 @@ class FloatingBodies:
             rows = self.rates(equations)[equations.active]
             resisted = resisted + rows.T @ rows
         values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
-        return vectors[:, values < OPEN**2]
+        return vectors[:, values < resistance**2]
 
     def load(self, motions: Array, residual: Array) -> Array:
         """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
@@ -129,6 +154,7 @@ class FloatingBodies:
         np.add.at(force, own, work)
         total, scale = (sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual).sum()))))
         along = motions.T @ total
+        self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
         force = motions @ np.where(np.abs(along) > LOADED * scale, along, 0.0)
         # bodies that are held stay where they are, to the last bit
         return np.where(np.abs(force) > OPEN**2 * np.abs(force).max(initial=0.0), force, 0.0)
@@ -200,8 +226,24 @@ class FloatingBodies:
         self._pins = motions, pins
         return pins
 
+    def reach(self, nudge: bool) -> float:
+        """How far the loads last asked for take a body, a length.
+
+        Args:
+            nudge: whether small ones do at all.
+        """
+        return np.inf if self.share > BARELY_LOADED else NUDGE * self.config.size if nudge else 0.0
+
+    def tell(self) -> None:
+        """Say so if supports carry more than rounding, at the end of a step."""
+        if self.share > LOADED:
+            logger.warning(
+                "a body that only contact holds is driven sideways by %.1g of the forces, and is held where it is: its contact does "
+                "not tell its place", self.share,
+            )  # fmt: skip
+
     def error(self, motion: Array) -> FloatingBodyError:
-        """What to tell about a loaded motion that nothing stops."""
+        """What to tell about a loaded motion that nothing stops: which body moves most, and how."""
         g = self.config.gdim
         parts = motion.reshape(self.count, self.n_modes)
         b = int(np.abs(parts).max(axis=1).argmax())

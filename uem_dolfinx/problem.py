@@ -129,7 +129,7 @@ class UnitedProblem:
         try:
             if ratio > 0.0:
                 self._predict(ratio)
-            self.system.settle()
+            self.system.land()
             history = solve_united(
                 self.system,
                 rtol=self.rtol,
@@ -140,6 +140,8 @@ class UnitedProblem:
             )
             for pair in self.system.pairs:
                 check_prescribed(pair)
+            if self.system.floating is not None:
+                self.system.floating.tell()
         except UEMError:
             self.restore()
             raise
@@ -161,9 +163,20 @@ class UnitedProblem:
             pair.restore()
             pair.project()
 
+    def _deformation(self, du: np.ndarray) -> np.ndarray:
+        """What an increment of the displacement holds besides rigid motions of bodies that only contact holds (collective)."""
+        floating = self.system.floating
+        if floating is None:
+            return du
+        n, g = self.config.n_owned, self.config.gdim
+        rest = fem.Function(self.config.V)
+        rest.x.array[: n * g] = du[: n * g] - floating.part(floating.every_motion, du[: n * g].reshape(n, g)).ravel()
+        rest.x.scatter_forward()
+        return np.asarray(rest.x.array)
+
     def _predict(self, ratio: float) -> None:
         """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
-        self.u.x.array[:] = self._committed + RIM * ratio * (self._committed - self._last)
+        self.u.x.array[:] = self._committed + RIM * ratio * self._deformation(self._committed - self._last)
         for pair in self.system.pairs:
             pair.project()
             pair.predict(ratio)

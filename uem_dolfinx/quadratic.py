@@ -166,7 +166,9 @@ def _family(config: Configuration, nodes: npt.NDArray[np.int32]) -> tuple[Ints, 
     """Places of the children, local nodes of the parents, weights, and whether a term leads from facet to edge, ``(k,)`` each."""
     place = np.full(config.n_local, -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
-    layout, cells = config.V.dofmap.dof_layout, compat.cell_dofs(config.V)
+    layout = config.V.dofmap.dof_layout
+    # also where a rank has no cell at all
+    cells = compat.cell_dofs(config.V).reshape(-1, layout.num_dofs)
     topology = compat.reference_topology(compat.cell_name(config.mesh))
     vertex = [layout.entity_dofs(0, v)[0] for v in range(len(topology[0]))]
     edge = [layout.entity_dofs(1, e)[0] for e in range(len(topology[1]))]

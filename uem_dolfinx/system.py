@@ -18,8 +18,8 @@ from uem_dolfinx import compat
 from uem_dolfinx.checks import check_initial
 from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.errors import NotFiniteError, SpaceError, agree
-from uem_dolfinx.floating import FloatingBodies
+from uem_dolfinx.errors import NotFiniteError, SpaceError
+from uem_dolfinx.floating import HARDLY_HELD, OPEN, FloatingBodies
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
@@ -126,6 +126,8 @@ class BodySystem:
         #: Bodies that contact must hold, if there are any.
         self.floating: FloatingBodies | None = None
         self._open: Array = np.zeros((0, 0))
+        #: Whether contact of bodies that only contact holds has yet to develop in this step.
+        self._landing = False
         self._factored: object = None
         self._stiffness: Any = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
@@ -188,22 +190,34 @@ class BodySystem:
                         pair.return_to_target(stiffness)
                 self.u.x.scatter_forward()
 
-    def settle(self) -> None:
+    def land(self) -> None:
+        """Begin a step: bodies that only contact holds fall until they touch (collective)."""
+        self._landing = self.floating is not None
+        self.settle()
+
+    def settle(self, fall: bool = True, nudge: bool = False) -> bool:
         """Let bodies that nothing holds move rigidly along their loads until contact holds them (collective).
+
+        Args:
+            fall: otherwise they only take hold of what they touch already.
+            nudge: follow small loads as well, to what is near.
+
+        Returns:
+            Whether any body has moved or touched something.
 
         Raises:
             FloatingBodyError: naming a body, and the motion that nothing stops.
         """
-        floating = self.floating
+        floating, changed = self.floating, False
         if floating is None:
-            return
+            return changed
         for _ in range(MOST_STATIONS):
             self.place(returning=False)
             self.assemble_residual()
             motions = floating.open_motions(self._equations())
             motion = floating.load(motions, self.residual.array_r.reshape(-1, self.config.gdim))
-            if not motion.any():
-                return
+            if not motion.any() or not floating.reach(nudge):
+                return changed
             motion /= np.linalg.norm(motion)
             closing, distance = [], np.inf
             for pair in self.pairs:
@@ -213,11 +227,15 @@ class BodySystem:
                 way = np.where(rate < -CLOSING, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, CLOSING), np.inf)
                 distance = min(distance, float(way.min(initial=np.inf)))
             distance = min(self.comm.allgather(distance))
-            agree(self.comm, floating.error(motion) if np.isinf(distance) else None)
-            # on curved surfaces the touch may come later than it seems; then the next station is nearer
             if not any([pair.land(c) for pair, c in zip(self.pairs, closing)]):
+                if not fall or floating.reach(nudge) < distance:
+                    return changed
+                if np.isinf(distance):
+                    raise floating.error(motion)
+                # on curved surfaces the touch may come later than it seems; then the next station is nearer
                 floating.move(distance * motion)
-        agree(self.comm, floating.error(motion))
+            changed = True
+        raise floating.error(motion)
 
     # -- residual and uniting equations ------------------------------------------------------------------------------
 
@@ -239,6 +257,10 @@ class BodySystem:
 
     def unite(self, cautious: bool) -> United:
         """Contact forces, activation and release, and the uniting equations that follow."""
+        if self._stiffness is None and self.pairs:
+            # what tells tension from rounding
+            self.tangent.update()
+            self._stiffness = self.tangent.K.getDiagonal()
         F, rounding = self.residual, self.rounding()
         with timed("uniting equations"):
             restriction, resolution = self._restrict()
@@ -251,10 +273,15 @@ class BodySystem:
             if changed:
                 for pair in self.pairs:
                     pair.refresh_corners()
-                if self.floating is not None:
-                    # a body that has been let go comes to rest anew
-                    self.settle()
-                    F = self.residual
+            if self.floating is not None and self._landing and settled and not changed:
+                # go on if more was held than must be
+                self._landing = False
+                changed = self._open.shape[1] > self.floating.open_motions(self._equations()).shape[1]
+            if changed or settled:
+                # a body that has lost its hold on the way falls only when the others have come to rest
+                changed |= self.settle(fall=not changed, nudge=not changed)
+            if changed:
+                F = self.residual
                 restriction, _ = self._restrict()
                 y = restriction.pass_on(F)
             residual = restriction.reduce(y)
@@ -289,7 +316,7 @@ class BodySystem:
         parts = [pair.equations(chords) for pair in self.pairs]
         equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
         if self.floating is not None:
-            self._open = self.floating.open_motions(equations)
+            self._open = self.floating.open_motions(equations, HARDLY_HELD if self._landing else OPEN)
             free = free & ~self.floating.supports(self._open, equations)
         if self.contestable:
             mutual = np.repeat([pair.mutual for pair in self.pairs], [len(part) for part in parts]).astype(bool)

@@ -1,0 +1,327 @@
+"""Two bodies meet in any way: turned, finer or coarser, overlapping, node on vertex to the last bit; always lawful, never in a cycle.
+
+Two tests to read first: ``test_overlap_is_an_approach`` (an interference is the same as pushing the bodies together by it) and
+``test_contactor_next_to_a_vertex`` (nothing happens when a node crosses a vertex of the target).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import at, blocks, box, clamp, complementary, highest, linear, modulus, scene, st_venant
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+COMM = MPI.COMM_WORLD
+NU = 0.3
+#: Oedometric modulus over Young's modulus.
+M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))
+LAWS = {"linear": linear, "finite": st_venant}
+#: Newton iterations of all steps together that no scene here may exceed.
+PATIENCE = 40
+
+few = settings(max_examples=8, deadline=None, derandomize=True)
+
+
+@dataclass
+class Meeting:
+    """A solved scene.
+
+    Attributes:
+        u: displacements in the drawing's order.
+        force: on the contactors.
+        active: number of active contactors.
+        energy: half of the work of the prescribed displacements, which is the strain energy of linear bodies.
+        iterations: of all steps.
+        contact: the contact.
+    """
+
+    u: np.ndarray
+    force: np.ndarray
+    active: int
+    energy: float
+    iterations: int
+    contact: uem.Contact
+
+
+def lawful(problem, contact, history, size, stress):
+    """Complementarity, action = reaction, and equilibrium read from the residual itself."""
+    g = problem.config.gdim
+    complementary(contact, 2e-13 * problem.config.size, 1e-10 * stress * size ** (g - 1))
+    balance = contact.balance()
+    assert balance.force <= 1e-12 and balance.moment <= 1e-12
+    force = np.linalg.norm(contact.resultant().force)
+    # places are rounded, and so are the forces that follow from them
+    rounding = 1e-14 * stress * size ** (g - 1)
+    assert not history[-1].changed and history[-1].residual * force <= problem.rtol * force + rounding
+    problem.system.assemble_residual()
+    n = problem.config.n_owned
+    r = problem.system.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
+    free = problem.system.free[:n]
+    assert highest(COMM, np.abs(r[free])) <= 1e-9 * force + rounding
+
+
+def meet(
+    cell="triangle", n=(3, 4), *, law="linear", gap=0.0, d=0.02, slide=0.0, overhang=0.5, pose=None, turn=None, length=1.0,
+    stress=1.0, E=(1.0, 2.0), shuffle=None, held=False, steps=1, **how,
+):  # fmt: skip
+    """A block led by its top onto a wider one.
+
+    Args:
+        gap: between them, an overlap when negative.
+        d: way of the top downwards, sideways ``slide``.
+        pose: bends the drawing before it is turned and scaled.
+        turn: rotation matrix.
+        held: between rollers instead, as in an oedometer.
+        how: see ``Contact``.
+    """
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    R = np.eye(g) if turn is None else turn
+    bend = pose or (lambda x: x)
+    b = blocks(COMM, cell, *n, gap=gap, overhang=overhang, pose=lambda x: length * bend(x) @ R.T, shuffle=shuffle)
+    way = np.array([slide, *[0.0] * (g - 2), -d])
+    bcs = b.oedometer(d) if held else [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=length * R @ way)]
+    contact = uem.Contact(b.high, b.low, max_penetration=0.5 * length, **how)
+    F = LAWS[law](b.u, modulus(b.scene, stress * E[0], stress * E[1]))
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
+    iterations = 0
+    for step in uem.load_steps(problem, steps):
+        lawful(problem, contact, step.iterations, length, stress)
+        assert step.cuts == 0
+        iterations += step.newton_iterations
+    assert iterations <= PATIENCE
+    problem.system.assemble_residual()
+    work = problem.system.residual.array_r @ problem.config.displacement[: problem.config.n_owned].ravel()
+    energy = 0.5 * float(COMM.allreduce(work)) / (stress * length**g)
+    force = contact.resultant().force @ R / (stress * length ** (g - 1))
+    return Meeting(b.scene.gather(b.u) @ R / length, force, contact.n_active, energy, iterations, contact)
+
+
+def curved(height):
+    """Bend the lower block's top, an arch for a positive height and a bowl for a negative one; the crown is at x = 0.45."""
+
+    def pose(x):
+        y = x.copy()
+        depth = np.where(x[:, -1] <= 1e-12, x[:, -1] + 1, 0.0)
+        y[:, -1] -= height * depth * (x[:, 0] - 0.45) ** 2
+        return y
+
+    return pose
+
+
+def rotation(g, angle):
+    R = np.eye(g)
+    R[0, 0] = R[-1, -1] = np.cos(angle)
+    R[-1, 0], R[0, -1] = np.sin(angle), -np.sin(angle)
+    return R
+
+
+# -- poses, units, numbering -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("height", [0.0, 0.3, -0.2])
+@few
+@given(angle=st.floats(-3.2, 3.2), size=st.floats(-9, 6), stiff=st.floats(-3, 11), seed=st.integers(0, 99))
+def test_force_turns_with_the_scene(law, height, angle, size, stiff, seed):
+    """In any pose, unit and numbering the scene is the same scene."""
+    how = dict(law=law, gap=0.05, d=0.12, slide=0.03, pose=curved(height))
+    there = meet(**how, turn=rotation(2, angle), length=10.0**size, stress=10.0**stiff)
+    here = meet(**how)
+    assert there.active == here.active > 0
+    assert np.abs(there.force - here.force).max() < 1e-8
+    assert np.abs(there.u - here.u).max() < 1e-8
+    other = meet(**how, shuffle=seed)
+    assert np.abs(other.force - here.force).max() < 1e-9 and other.active == here.active
+
+
+@settings(max_examples=3, deadline=None, derandomize=True)
+@given(angle=st.floats(-3.2, 3.2), cell=st.sampled_from(["tetrahedron", "hexahedron"]))
+def test_force_turns_with_the_scene_in_3d(angle, cell):
+    how = dict(cell=cell, n=(3, 2), gap=0.05, d=0.12, slide=0.03, pose=curved(0.3))
+    here, there = meet(**how), meet(**how, turn=rotation(3, angle))
+    assert there.active == here.active > 0
+    assert np.abs(there.force - here.force).max() < 1e-9 and np.abs(there.u - here.u).max() < 1e-9
+
+
+# -- meshes --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+@few
+@given(n_low=st.integers(1, 5), n_high=st.integers(1, 5), ratio=st.sampled_from([0.1, 1.0, 10.0]))
+def test_any_two_meshes(cell, n_low, n_high, ratio):
+    """Force and energy of uniform compression: exact for nested meshes, else within the error of a single pass."""
+    d = 0.01
+    m = meet(cell, (n_low, n_high), E=(1.0, ratio), d=d, overhang=0.0, held=True)
+    force = M * d * ratio / (1 + ratio)
+    assert m.active >= 1
+    if n_high % n_low == 0:
+        assert m.force[1] == pytest.approx(force, rel=1e-10)
+        assert m.energy == pytest.approx(force * d / 2, rel=1e-10)
+    elif n_high > n_low:
+        assert m.force[1] == pytest.approx(force, rel=0.05)
+    else:
+        # few contactors on a finer body dig in, the more so the harder they are
+        assert 0.3 * force < m.force[1] < 1.02 * force
+    # small strains, but contactors that follow facets which have turned a little
+    assert m.energy == pytest.approx(m.force[1] * d / 2, rel=1e-5)
+
+
+def test_energy_falls_to_its_limit():
+    """Finer contactors and targets together: the energy of a block pressed on a wider one converges."""
+    energies = [meet("quadrilateral", (2 * n, n), d=0.02).energy for n in (2, 4, 8, 16)]
+    assert (np.diff(energies) < 0).all()
+    steps = -np.diff(energies)
+    assert (steps[1:] < 0.75 * steps[:-1]).all()
+
+
+# -- overlaps ------------------------------------------------------------------------------------------------------------------
+
+
+def overlapping(cell, n, overlap):
+    """The same interference as a drawing and as a way of the top."""
+    drawn = meet(cell, n, gap=-overlap, d=0.0)
+    pushed = meet(cell, n, gap=0.0, d=overlap)
+    high = np.arange(len(drawn.u)) >= len(drawn.u) - (n[1] + 1) ** drawn.u.shape[1]
+    u = drawn.u.copy()
+    u[high, -1] -= overlap
+    # rounding of places, 1e-13 of the scene
+    tol = 1e-8 * overlap + 1e-12
+    assert np.abs(u - pushed.u).max() < tol
+    assert np.abs(drawn.force - pushed.force).max() < 10 * tol
+    assert drawn.force[-1] > 0.3 * overlap
+
+
+@pytest.mark.parametrize("cell,n", [("triangle", (3, 4)), ("quadrilateral", (4, 4)), ("triangle", (5, 2))])
+@few
+@given(exponent=st.floats(-12, np.log10(0.125)))
+@example(exponent=np.log10(0.125))
+@example(exponent=-12.0)
+def test_overlap_is_an_approach(cell, n, exponent):
+    """Bodies that are drawn into each other press each other apart as if they had been pushed together by as much."""
+    overlapping(cell, n, 10.0**exponent)
+
+
+@pytest.mark.parametrize("overlap", [0.25, 1e-5, 1e-11])
+def test_overlap_is_an_approach_in_3d(overlap):
+    overlapping("hexahedron", (2, 2), overlap)
+
+
+# -- to the last bit -------------------------------------------------------------------------------------------------------------
+
+#: Shifts of a contactor from a vertex, as parts of an element; the smallest is the last bit of its place.
+NUDGES = [4 * np.spacing(0.5), -4 * np.spacing(0.5), 1e-12, -1e-12, 1e-9, -1e-9, 1e-6, -1e-6]
+
+
+def nudged(nudge, *, height=0.0, cell="triangle", normals="facet", law="finite", gap=0.0, fitted=False):
+    """Meshes that match but for the nudge: every contactor above a vertex of the target, or on it when ``fitted``.
+
+    Returns:
+        Force, displacements, iterations.
+    """
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    m = 4 if g == 2 else 2
+    low = box(cell, [-0.5] * (g - 1) + [-1.0], [1.5] * (g - 1) + [0.0], [2 * m] * (g - 1) + [m])
+    high = box(cell, [0.0] * (g - 1) + [gap], [1.0] * (g - 1) + [1.0 + gap], [m] * g)
+
+    def pose(x):
+        y = curved(height)(x)
+        if not fitted:
+            y[len(low.x) :] = x[len(low.x) :]
+        y[len(low.x) :, 0] += nudge / m
+        return y
+
+    s = scene(COMM, cell, [low, high], pose=pose)
+    V = compat.function_space(s.mesh, 1, (g,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("high", 1, at(g - 1, gap)), s.tag("low", 0, at(g - 1, 0.0)), normals=normals, max_penetration=0.5)
+    bcs = clamp(V, s.tag("bottom", 0, at(g - 1, -1.0)))
+    bcs += clamp(V, s.tag("top", 1, at(g - 1, 1.0 + gap)), value=[0.0] * (g - 1) + [-0.03 - gap])
+    problem = uem.UnitedProblem(LAWS[law](u, modulus(s, 1.0, 2.0)), u, bcs=bcs, contacts=[contact], rtol=1e-10)
+    count = 0
+    for step in uem.load_steps(problem, 2):
+        lawful(problem, contact, step.iterations, 1.0, 1.0)
+        assert step.cuts == 0
+        count += step.newton_iterations
+    assert count <= PATIENCE
+    return contact.resultant().force, s.gather(u), count
+
+
+@pytest.mark.parametrize(
+    "cell,normals,height,law",
+    [
+        ("triangle", "facet", 0.0, "linear"), ("triangle", "averaged", 0.0, "finite"), ("quadrilateral", "facet", 0.0, "finite"),
+        ("triangle", "averaged", 0.3, "finite"), ("triangle", "facet", -0.2, "finite"), ("quadrilateral", "averaged", -0.2, "linear"),
+        ("hexahedron", "facet", 0.0, "linear"),
+    ],
+)  # fmt: skip
+def test_contactor_next_to_a_vertex(cell, normals, height, law):
+    """On it, a bit to the left, a bit to the right: the answer changes by as little as the scene does."""
+    how = dict(cell=cell, normals=normals, height=height, law=law, gap=0.06 if height < 0 else 0.0)
+    force, u, count = nudged(0.0, **how)
+    assert force[-1] > 0.01
+    for nudge in NUDGES if cell != "hexahedron" else NUDGES[1:3]:
+        there = nudged(nudge, **how)
+        assert np.abs(there[0] - force).max() <= 0.2 * abs(nudge) + 1e-9
+        assert np.abs(there[1] - u).max() <= 1.0 * abs(nudge) + 1e-9
+        # neither in circles nor by another way
+        assert abs(there[2] - count) <= 5
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_contactor_next_to_a_ridge(law):
+    """On a convex polygon facet normals jump, and which side of a ridge a contactor comes to rest on is no matter of much force."""
+    force, _, _ = nudged(0.0, height=0.3, law=law, fitted=True)
+    for nudge in NUDGES:
+        there = nudged(nudge, height=0.3, law=law, fitted=True)
+        assert there[0][1] == pytest.approx(force[1], rel=0.02)
+        # sideways by no more than the slopes of the two sides about it
+        assert np.abs(there[0][0] - force[0]) <= 0.3 * 0.25 * force[1]
+
+
+# -- hardly touching -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("cell,n", [("triangle", 4), ("quadrilateral", 3), ("tetrahedron", 2), ("hexahedron", 2)])
+def test_coincident_nodes(cell, n, law):
+    """Meshes that match node for node: all contactors touch from the start, and a uniform pressure passes."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    m = meet(cell, (n, n), law=law, overhang=0.0, held=True, d=0.02, E=(1.0, 1.0))
+    assert m.active == (n + 1) ** (g - 1)
+    e = 0.01
+    force = M * e if law == "linear" else M * e * (1 - e) * (2 - e) / 2
+    assert m.force[-1] == pytest.approx(force, rel=1e-9)
+    assert highest(COMM, np.abs(m.contact.pressures / force - 1)) < 1e-8
+    # one matching interface is none: the field is that of one block
+    assert m.iterations <= 5
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("cell,n", [("triangle", (4, 4)), ("quadrilateral", (2, 5)), ("hexahedron", (1, 2))])
+def test_touching_without_force(cell, n, law):
+    """Nothing pushes: it is done at once, nothing has moved and no force is there."""
+    m = meet(cell, n, law=law, d=0.0, steps=2)
+    assert m.iterations == 0
+    assert np.abs(m.u).max() == 0.0 and np.abs(m.force).max() == 0.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("gap", [0.25, 0.1, 1 / 3])
+@pytest.mark.parametrize("more", [-1e-6, 0.0, 1e-6])
+def test_coming_down_to_touch(gap, law, more):
+    """Brought to the target and no further, a little less far and a little further: no force, or as little as it takes."""
+    m = meet("triangle", (3, 4), law=law, gap=gap, d=gap + more)
+    if more <= 0.0:
+        assert np.abs(m.force).max() < 1e-12 and np.abs(m.u[:, 0]).max() < 1e-12
+    else:
+        assert 0.3 * more < m.force[1] < 2 * more

@@ -1,0 +1,450 @@
+"""Contactors of degree 2: control gaps and control forces instead of nodal ones.
+
+Two tests to read first: ``test_nonnegative_control_gaps_leave_no_overlap`` (the reason for them) and ``test_rim_of_a_contact_zone``
+(where nodal forces of a positive pressure have the wrong sign).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from helpers import CELLS, at, blocks, box, clamp, complementary, highest, linear, lowest, modulus, run, scene, st_venant
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from petsc4py import PETSc
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.surfaces import tributary_areas
+
+COMM = MPI.COMM_WORLD
+MESHES = Path(__file__).parent.parent / "meshes"
+NU = 0.3
+#: Oedometric modulus over Young's modulus.
+M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))
+
+
+def lawful(contact, size=1.0, force=1.0):
+    """Complementarity of control gaps and control forces, action = reaction, and no control force that pulls."""
+    complementary(contact, 1e-12 * size, 1e-10 * force)
+    assert lowest(COMM, contact.pressures) >= -1e-10 * force
+    control = np.sum(contact.config.comm.allgather(contact.pair.trial.lam.sum()))
+    nodal = np.sum(contact.config.comm.allgather(contact.pair.trial.nodal.sum()))
+    assert control == pytest.approx(nodal, rel=1e-9, abs=1e-12 * force)
+    balance = contact.balance()
+    if balance is not None:
+        assert balance.force <= 1e-12 and balance.moment <= 1e-12
+
+
+def factors(history):
+    """``r1 / r0^2`` of all neighbours among the residuals with one and the same active set: bounded when Newton is quadratic."""
+    r, steady = [i.residual for i in history], [not i.changed for i in history]
+    pairs = [(a, b) for a, b, s in zip(r[:-1], r[1:], steady[1:]) if s and a < 0.1 and b > 1e-9]
+    return [b / a**2 for a, b in pairs]
+
+
+# -- closed forms ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("finer", ["upper", "lower"])
+@pytest.mark.parametrize("cell", CELLS)
+def test_patch(cell, finer):
+    """Nested meshes, the finer side the contactor: uniform pressure, every displacement the closed form's, all forces press."""
+    d, ratio = 0.01, 3.0
+    n_low, n_high = (1, 2) if finer == "upper" else (2, 1)
+    b = blocks(COMM, cell, n_low, n_high, degree=2)
+    contact = uem.Contact(*((b.high, b.low) if finer == "upper" else (b.low, b.high)))
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, ratio)), b.u, bcs=b.oedometer(d), contacts=[contact])
+    run(problem)
+    low, high = d * ratio / (1 + ratio), d / (1 + ratio)
+    force, side = M * low, 1.0 if finer == "upper" else -1.0
+    assert contact.resultant().force[-1] == pytest.approx(side * force, rel=1e-10)
+    assert highest(COMM, np.abs(contact.pressures / force - 1)) < 1e-8
+    x, u = problem.config.X, problem.config.displacement
+    z = x[:, -1]
+    exact = np.where(z > 0, -low - high * z, -low * (z + 1))
+    assert highest(COMM, np.abs(u[:, -1] - exact)) < 1e-12 * max(1.0, d)
+    assert highest(COMM, np.abs(u[:, :-1])) < 1e-12
+    # every node of the finer side, in the middle of facets, too, where cells have nodes there
+    assert contact.n_active == 5 ** (b.gdim - 1)
+    assert lowest(COMM, contact.pair.trial.lam) > 0
+    assert np.sum(COMM.allgather(contact.pair.trial.lam.sum())) == pytest.approx(force, rel=1e-10)
+    lawful(contact, force=force)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_floating_block_of_degree_two(cell, tilt):
+    """It falls on a rigid plane, lies down on it if need be, and carries its load uniformly."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    n, R = (3 if g == 2 else 2), np.eye(g)
+    R[0, 0] = R[-1, -1] = np.cos(tilt)
+    R[-1, 0], R[0, -1] = np.sin(tilt), -np.sin(tilt)
+    s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], pose=lambda x: x @ R.T + 0.1 * np.eye(g)[-1])
+    V = compat.function_space(s.mesh, 2, (g,))
+    u = fem.Function(V)
+    top = compat.surface_measure(s.mesh, s.tag("top", 0, at(g - 1, 1.0)).entities)
+    F = st_venant(u, fem.Constant(s.mesh, PETSc.ScalarType(1.0)), 0.0) + 0.02 * ufl.TestFunction(V)[g - 1] * top
+    contact = uem.Contact(s.tag("bottom", 0, at(g - 1, 0.0)), uem.RigidPlane([0.0] * g, np.eye(g)[-1]))
+    uem.UnitedProblem(F, u, contacts=[contact], rtol=1e-10).solve()
+    lawful(contact)
+    assert contact.n_active == (2 * n + 1) ** (g - 1)
+    assert contact.resultant().force[-1] == pytest.approx(0.02, rel=1e-9)
+    assert highest(COMM, np.abs(contact.pressures / 0.02 - 1)) < 1e-8
+
+
+# -- control gaps ------------------------------------------------------------------------------------------------------------
+
+
+class Top:
+    """Top of a box over a rigid plane far below its base, with any gap: the pair of a contact of degree 2."""
+
+    def __init__(self, cell, comm=COMM):
+        g = self.g = 2 if cell in ("triangle", "quadrilateral") else 3
+        s = scene(comm, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)])
+        V = compat.function_space(s.mesh, 2, (g,))
+        self.u = fem.Function(V)
+        self.tag = s.tag("top", 0, at(g - 1, 1.0))
+        plane = uem.RigidPlane([0.0] * (g - 1) + [1.0], -np.eye(g)[-1])
+        self.contact = uem.Contact(self.tag, plane, max_penetration=9.0)
+        F = linear(self.u, fem.Constant(s.mesh, PETSc.ScalarType(1.0)))
+        base = clamp(V, s.tag("base", 0, at(g - 1, 0.0)))
+        self.problem = uem.UnitedProblem(F, self.u, bcs=base, contacts=[self.contact])
+        self.config, self.pair = self.problem.config, self.contact.pair
+        self.facets = [fem.locate_dofs_topological(V, g - 1, np.array([f], np.int32), False) for f in self.tag.entities]
+        self.X = self.config.X[:, :-1]
+        # a pressure that is zero on a part of the surface
+        self.S = compat.function_space(s.mesh, 2)
+        self.wave = fem.Constant(s.mesh, np.zeros(7))
+        x, c = ufl.SpatialCoordinate(s.mesh), self.wave
+        wave = sum(c[i] * ufl.sin(c[2 + i] * x[i] + c[4 + i]) for i in range(g - 1)) + c[6]
+        measure = compat.surface_measure(s.mesh, self.tag.entities, {"quadrature_degree": 6})
+        self.push = compat.form(ufl.conditional(ufl.gt(wave, 0.0), wave, 0.0) * ufl.TestFunction(self.S) * measure)
+
+    def open(self, gap, active=False):
+        """Give the local nodes these gaps ``(n_local,)`` and project."""
+        self.config.displacement[:, -1] = -gap
+        self.u.x.scatter_forward()
+        self.pair.trial = replace(self.pair.trial, active=np.full(len(self.pair.nodes), active))
+        self.pair.project()
+
+    def powers(self, x):
+        """Monomials of the facets' polynomials ``(n, k)``."""
+        if self.g == 2:
+            return np.column_stack([x[:, 0] ** i for i in range(3)])
+        quads = len(self.facets[0]) == 9 if self.facets else False
+        return np.column_stack([x[:, 0] ** i * x[:, 1] ** j for i in range(3) for j in range(3) if quads or i + j <= 2])
+
+    def sampled(self, values, seed):
+        """Smallest value of the polynomials through nodal values on each of this rank's facets, at random places."""
+        rng, smallest = np.random.default_rng(seed), np.inf
+        for nodes in self.facets:
+            # centred, so that monomials can tell nodes apart
+            x = self.X[nodes] - self.X[nodes].mean(axis=0)
+            c = np.linalg.solve(self.powers(x), values[nodes])
+            if len(nodes) == 9:
+                at_ = x.min(axis=0) + rng.random((300, 2)) * np.ptp(x, axis=0)
+            else:
+                # corners are the nodes that are in the middle of no others
+                i = [
+                    k
+                    for k in range(len(x))
+                    if not any(np.allclose(2 * x[k], x[a] + x[b]) for a in range(len(x)) for b in range(a))
+                ]
+                at_ = rng.dirichlet(np.ones(len(i)), 300) @ x[i]
+            smallest = min(smallest, (self.powers(at_) @ c).min())
+        return smallest
+
+
+@pytest.fixture(scope="module", params=CELLS)
+def top(request):
+    return Top(request.param)
+
+
+def place_hash(X, seed):
+    """Random numbers in [0, 1) that belong to places, alike on all ranks."""
+    return np.modf(np.abs(np.sin(X @ np.array([12.9898, 78.233, 37.719])[: X.shape[1]] + seed) * 43758.5453))[0]
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 1000), zeros=st.floats(0.0, 0.9))
+def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
+    """Where no control gap is negative no point of the surface is inside the target; nodal gaps cannot promise that."""
+    config, control = top.config, top.pair.control
+    wanted = place_hash(np.round(config.X, 6), seed)
+    wanted = 0.01 * np.where(wanted < zeros, 0.0, wanted)
+    # nodal gaps from control gaps, ancestors first: vertices, edges, facets
+    nodal = np.array(wanted)
+    middle_of_facet = np.isin(control.child, control.child[control._of_facet])
+    for k in (~middle_of_facet, middle_of_facet):
+        more = np.zeros(config.n_local)
+        np.add.at(more, top.pair.nodes[control.child[k]], control.weight[k] * nodal[control.parent[k]])
+        nodal += more
+        # ghosts take their owners' values
+        top.u.x.array.reshape(-1, top.g)[:, -1] = nodal
+        top.u.x.scatter_forward()
+        nodal = np.array(top.u.x.array.reshape(-1, top.g)[:, -1])
+    top.open(nodal)
+    assert COMM.allreduce(int((~control.shared).sum())) == 0
+    assert highest(COMM, np.abs(top.pair.gap - wanted[top.pair.nodes])) < 1e-15
+    assert lowest(COMM, [top.sampled(nodal, seed)]) >= -1e-15
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 1000), share=st.floats(0.05, 1.0))
+def test_control_forces_of_a_pressure_press(top, seed, share):
+    """Any pressure >= 0, even one that acts on a part of a facet, has control forces >= 0 that add up to it."""
+    config, control = top.config, top.pair.control
+    top.open(np.zeros(config.n_local), active=True)
+    rng = np.random.default_rng(seed)
+    top.wave.value[:] = np.concatenate([rng.normal(size=2), rng.uniform(1, 7, 2), rng.uniform(0, 6, 2), [share]])
+    b = compat.create_vector(top.S)
+    compat.assemble_vector(b, top.push)
+    f = np.array(b.array_r)[top.pair.nodes]
+    lam, nodal = control.forces(f, np.ones(len(f), bool))
+    total = float(COMM.allreduce(f.sum()))
+    assert lowest(COMM, lam) >= -1e-15 * max(total, 1e-300)
+    assert COMM.allreduce(lam.sum()) == pytest.approx(total, rel=1e-12, abs=1e-300)
+    # closed gaps unite the nodes themselves, whose forces these are
+    assert highest(COMM, np.abs(nodal - f)) <= 1e-15 * max(total, 1e-300)
+
+
+def test_areas(top):
+    """Positive, and together the surface's, where those of the shape functions are zero or negative at vertices."""
+    top.open(np.zeros(top.config.n_local), active=True)
+    plain = tributary_areas(top.config, top.tag)[top.pair.nodes]
+    areas = top.pair.control.areas(plain)
+    assert lowest(COMM, areas) > 0.01
+    assert COMM.allreduce(areas.sum()) == pytest.approx(1.0, rel=1e-12)
+    if top.g == 3 and len(np.unique(COMM.allreduce([len(f) for f in top.facets]))) == 1:
+        corner = np.linalg.norm(np.abs(top.X[top.pair.nodes] - 0.5) - 0.5, axis=1) < 1e-9
+        assert highest(COMM, plain[corner]) < highest(COMM, areas[corner])
+
+
+# -- Newton ------------------------------------------------------------------------------------------------------------------
+
+
+def arched(x):
+    """Bend the top of the lower block into an arch."""
+    y = x.copy()
+    y[:, -1] -= 0.3 * (x[:, -1] <= 1e-12) * (x[:, -1] + 1) * (x[:, 0] - 0.5) ** 2
+    return y
+
+
+def on_an_arch(cell, comm=COMM, **options):
+    """A block pressed askew onto an arch of degree 2."""
+    # no contactor stands above a vertex
+    b = blocks(comm, cell, 5 if cell in ("triangle", "quadrilateral") else 3, 2, degree=2, gap=0.1, overhang=0.5, pose=arched)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.1, *[0.0] * (b.gdim - 2), -0.2])]
+    contact = uem.Contact(b.high, b.low, max_penetration=1.0)
+    problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], **options)
+    return b, contact, problem
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_united_tangent_is_the_derivative_of_the_residual(cell):
+    """``K - sum lambda grad^2 g`` against differences of ``F - sum lambda grad g``, on facets curved by the displacement."""
+    b, contact, problem = on_an_arch(cell)
+    system, pair, g = problem.system, contact.pair, b.gdim
+    x = problem.config.X
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    direction = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+    pair.trial = replace(pair.trial, active=np.ones(len(lam), bool), lam=lam, nodal=lam)
+
+    def residual(u):
+        problem.u.x.array[:] = u.ravel()
+        system.place(returning=False)
+        system.assemble_residual()
+        pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
+        r = system.residual
+        r.axpy(-1.0, compat.petsc_vector(contact.force))
+        return r
+
+    residual(smooth)
+    facets = pair.projection.facet.copy()
+    system.tangent.update()
+    A = system.tangent.K.copy()
+    curvature = system._curvature()
+    du = A.createVecRight()
+    du.array[:] = direction[: problem.config.n_owned].ravel()
+    plain = A * du
+    full, h = plain + curvature * du, 1e-5
+    ahead = residual(smooth + h * direction)
+    assert highest(COMM, np.abs(pair.projection.facet - facets)) == 0
+    difference = ahead - residual(smooth - h * direction)
+    difference.scale(0.5 / h)
+    assert (difference - full).norm() < 1e-8 * plain.norm()
+    assert (difference - plain).norm() > 1e-3 * plain.norm()
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
+def test_pressed_on_an_arch(cell):
+    """Every step is lawful, Newton ends quadratically, and each rank alone finds the same answer in as many iterations."""
+    answers = []
+    for comm in (COMM, MPI.COMM_SELF):
+        b, contact, problem = on_an_arch(cell, comm, rtol=1e-11)
+        seen, counts = [], []
+        for step in uem.load_steps(problem, 2):
+            lawful(contact)
+            seen += factors(step.iterations)
+            counts.append(step.newton_iterations)
+        assert len(seen) >= 2 and max(seen) < 20
+        answers.append((contact.resultant().force, contact.n_active, counts))
+    (force, active, counts), (alone, active_alone, counts_alone) = answers
+    assert np.abs(force - alone).max() < 1e-9 * np.abs(alone).max()
+    assert active == active_alone > 1 and counts == counts_alone
+
+
+# -- the rim -----------------------------------------------------------------------------------------------------------------
+
+
+def indented(cell, n, d=0.02, comm=COMM, kind="paraboloid", **options):
+    """Quarter (half) of a block of degree 2 under a rigid indenter of radius 1/2, with symmetry planes and a fixed base."""
+    g = len(n)
+    body = box(cell, [0.0] * (g - 1) + [-1.0], [1.0] * (g - 1) + [0.0], n)
+    s = scene(comm, cell, [body], pose=lambda x: np.sign(x) * np.abs(x) ** 2)
+    V = compat.function_space(s.mesh, 2, (g,))
+    u = fem.Function(V)
+    bcs = clamp(V, s.tag("base", 0, at(g - 1, -1.0)))
+    for c in range(g - 1):
+        bcs += clamp(V, s.tag("symmetry", 0, at(c, 0.0)), c)
+    up = np.eye(g)[-1]
+    target = uem.RigidParaboloid(-d * up, up, 0.5) if kind == "paraboloid" else uem.RigidSphere((0.5 - d) * up, 0.5)
+    contact = uem.Contact(s.tag("top", 0, at(g - 1, 0.0)), target, max_penetration=1.0)
+    law = options.pop("law", linear)
+    problem = uem.UnitedProblem(law(u, fem.Constant(s.mesh, PETSc.ScalarType(10.0))), u, bcs=bcs, contacts=[contact], **options)
+    return s, contact, problem
+
+
+@pytest.mark.parametrize("kind", ["paraboloid", "sphere"])
+@pytest.mark.parametrize(
+    "cell,n", [("triangle", (9, 6)), ("quadrilateral", (8, 6)), ("tetrahedron", (4, 4, 3)), ("hexahedron", (3, 3, 2))]
+)
+def test_rim_of_a_contact_zone(cell, n, kind):
+    """Pressures >= 0 up to the rim, which moves over the mesh with the depth; the force grows with it, and nothing cycles."""
+    forces = []
+    for d in (0.007, 0.013, 0.02, 0.03):
+        _, contact, problem = indented(cell, n, d, kind=kind, rtol=1e-10)
+        for step in uem.load_steps(problem):
+            assert step.cuts == 0 and step.newton_iterations <= 20
+        lawful(contact, force=10.0)
+        assert contact.n_active >= 1
+        forces.append(-contact.resultant().force[-1])
+    assert (np.diff(forces) > 0).all()
+
+
+@pytest.mark.parametrize("cell,n", [("triangle", (9, 6)), ("tetrahedron", (4, 4, 3))])
+def test_rim_is_the_same_on_any_number_of_ranks(cell, n):
+    """Force, pressures and active contactors, against the same scene on one rank."""
+    answers = []
+    for comm in (COMM, MPI.COMM_SELF):
+        _, contact, problem = indented(cell, n, comm=comm, law=st_venant, rtol=1e-11)
+        history = [i for step in run(problem) for i in step.iterations]
+        lawful(contact, force=10.0)
+        assert max(factors(history), default=0.0) < 20
+        pair = contact.pair
+        rows = np.column_stack([problem.config.X[pair.nodes], pair.trial.active, contact.pressures, pair.gap])
+        rows = np.concatenate(comm.allgather(rows))
+        answers.append((rows[np.lexsort(np.round(rows[:, : len(n) - 1], 9).T)], len(history)))
+    (rows, count), (alone, count_alone) = answers
+    assert np.abs(rows - alone).max() < 1e-8 and count == count_alone
+
+
+def test_hertz_on_curved_cells():
+    """Degree-2 cells that follow the arc, coarse: peak pressure and half width of Hertz at the computed force."""
+    E, R = 1e6, 3.0
+    mesh, tags = uem.read_gmsh(MESHES / "hertz_cylinder.geo", COMM, gdim=2, parameters={"h": 1 / 30, "order": 2})
+    V = compat.function_space(mesh, 2, (2,))
+    u = fem.Function(V)
+    bcs = [*clamp(V, tags["symmetry"], 0), *clamp(V, tags["block_bottom"], 1), *clamp(V, tags["disc_top"], 1, value=-0.006)]
+    contact = uem.Contact(tags["disc_arc"], tags["block_top"])
+    problem = uem.UnitedProblem(linear(u, fem.Constant(mesh, PETSc.ScalarType(E))), u, bcs=bcs, contacts=[contact], rtol=1e-10)
+    for _ in uem.load_steps(problem, 2):
+        lawful(contact, force=E)
+    P = 2 * contact.resultant().force[1]
+    E_star = E / (2 * (1 - NU**2))
+    p0 = np.sqrt(P * E_star / (np.pi * R))
+    a = 2 * P / (np.pi * p0)
+    assert contact.max_pressure() == pytest.approx(p0, rel=0.05)
+    x = contact.pair.points[:, 0]
+    assert highest(COMM, x[contact.pair.trial.active]) == pytest.approx(a, abs=1 / 30)
+    # moment of the half profile about the axis: the integral of p x
+    assert contact.resultant().moment[0] == pytest.approx(p0 * a**2 / 3, rel=0.03)
+
+
+# -- curved geometry -----------------------------------------------------------------------------------------------------------
+
+
+def curved_blocks(cell, comm=COMM):
+    """A block over an arch, both in cells of degree 2 whose nodes lie on the arch; none of the contactors is above a vertex."""
+    # nodes of the cells of degree 2 in Gmsh's order, on a grid of half cells
+    ring = [(0, 0), (2, 0), (2, 2), (0, 2)]
+    if cell == "quadrilateral":
+        kinds = [[*ring, (1, 0), (2, 1), (1, 2), (0, 1), (1, 1)]]
+    else:
+        kinds = [[(0, 0), (2, 0), (2, 2), (1, 0), (2, 1), (1, 1)], [(0, 0), (2, 2), (0, 2), (1, 1), (1, 2), (0, 1)]]
+    points, cells, first = [], [], 0
+    for lo, hi, n in (((-0.5, -1.0), (1.5, 0.0), (5, 2)), ((0.0, 0.1), (1.0, 1.1), (3, 3))):
+        grid = box("quadrilateral", lo, hi, (2 * n[0], 2 * n[1]))
+        stride = np.array([2 * n[1] + 1, 1])
+        corner = np.stack(np.meshgrid(2 * np.arange(n[0]), 2 * np.arange(n[1]), indexing="ij"), axis=-1).reshape(-1, 2) @ stride
+        cells += [first + corner[:, None] + np.array(k) @ stride for k in kinds]
+        points.append(arched(grid.x))
+        first += len(grid.x)
+    x, cells = np.concatenate(points), np.concatenate(cells).astype(np.int64)
+    given_ = slice(None) if comm.rank == 0 else slice(0)
+    used = np.unique(cells)
+    place = np.zeros(len(x), np.int64)
+    place[used] = np.arange(len(used))
+    mesh = compat.create_mesh(comm, place[cells][given_], x[used][given_], cell, 2)
+    for a, b in ((1, 0), (1, 2)):
+        mesh.topology.create_connectivity(a, b)
+
+    def tag(name, where):
+        return uem.Tag(name, 1, 1, mesh, dmesh.locate_entities_boundary(mesh, 1, where).astype(np.int32))
+
+    tags = [
+        tag("bottom", lambda x: np.abs(x[1] + 1) < 1e-9), tag("low", lambda x: np.abs(x[1] + 0.3 * (x[0] - 0.5) ** 2) < 1e-9),
+        tag("high", lambda x: np.abs(x[1] - 0.1) < 1e-9), tag("top", lambda x: np.abs(x[1] - 1.1) < 1e-9),
+    ]  # fmt: skip
+    return mesh, tags
+
+
+@pytest.mark.parametrize("arch_presses", [False, True])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_arch_of_curved_cells(cell, arch_presses):
+    """The arch as target and as contactor: lawful, quadratic, alike on any number of ranks, and first touched at its crown."""
+    answers = []
+    for comm in (COMM, MPI.COMM_SELF):
+        mesh, (bottom, low, high, top) = curved_blocks(cell, comm)
+        V = compat.function_space(mesh, 2, (2,))
+        u, lid = fem.Function(V), fem.Function(V)
+        contact = uem.Contact(*((low, high) if arch_presses else (high, low)), max_penetration=0.2)
+        dofs = fem.locate_dofs_topological(V, 1, top.entities)
+
+        def load(factor, lid=lid):
+            lid.x.array.reshape(-1, 2)[:, 1] = -0.1 - 0.05 * factor
+
+        problem = uem.UnitedProblem(
+            st_venant(u, fem.Constant(mesh, PETSc.ScalarType(1.0))), u, bcs=[*clamp(V, bottom), fem.dirichletbc(lid, dofs)],
+            contacts=[contact], load=load, rtol=1e-11,
+        )  # fmt: skip
+        seen = []
+        for step in uem.load_steps(problem, 3):
+            lawful(contact)
+            seen += factors(step.iterations)
+        assert len(seen) >= 2 and max(seen) < 20
+        answers.append(contact.resultant().force)
+        centre = contact.resultant().moment[0] / contact.resultant().force[1]
+        # the pressure's middle is the crown's
+        assert centre == pytest.approx(0.5, abs=0.02)
+    assert np.abs(answers[0] - answers[1]).max() < 1e-9 * np.abs(answers[1]).max()
