@@ -168,8 +168,8 @@ def test_initial_penetration_beyond_the_bound():
     assert "high on low" in str(error)
 
 
-def test_initial_penetration_below_the_bound_is_resolved():
-    """An interference fit: the overlap becomes pressure, and the gap is closed."""
+def test_initial_penetration_below_the_bound_is_resolved(caplog):
+    """An interference fit: the overlap is told, becomes pressure, and the gap is closed."""
     b = blocks(COMM, "quadrilateral", 2, 4, gap=-0.02)
     bcs = b.oedometer(0.0)
     contact = uem.Contact(b.high, b.low, max_penetration=0.03)
@@ -178,6 +178,8 @@ def test_initial_penetration_below_the_bound_is_resolved():
     M = 0.7 / (1.3 * 0.4)
     assert contact.resultant().force[1] == pytest.approx(M * 0.01, rel=1e-9)
     assert contact.max_gap() < 1e-15
+    assert contact.initial_overlap == pytest.approx(0.02)
+    assert COMM.rank or "5 contactors start up to 0.02 inside the target" in caplog.text
 
 
 def test_deep_default_bound():

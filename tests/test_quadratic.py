@@ -23,6 +23,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.shapes import facet_shape
 from uem_dolfinx.surfaces import tributary_areas
 
 COMM = MPI.COMM_WORLD
@@ -448,3 +449,31 @@ def test_arch_of_curved_cells(cell, arch_presses):
         # the pressure's middle is the crown's
         assert centre == pytest.approx(0.5, abs=0.02)
     assert np.abs(answers[0] - answers[1]).max() < 1e-9 * np.abs(answers[1]).max()
+
+
+def test_chords_change_the_way_but_not_the_answer():
+    """Straight pieces in P alone [UEM, 4.5]: the same state to rounding, after more iterations."""
+    found = {}
+    for chords in (False, True):
+        pose = lambda x: x + np.array([0.0, -0.2]) * ((x[:, :1] - 0.5) ** 2) * (x[:, 1:] <= 1e-12) * (x[:, 1:] + 1)  # noqa: E731
+        b = blocks(COMM, "triangle", 5, 4, gap=0.02, degree=2, overhang=0.25, pose=pose)
+        contact = uem.Contact(b.high, b.low, chords=chords)
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.03, -0.06])]
+        problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
+        steps = run(problem, 2)
+        found[chords] = contact.resultant().force, sum(s.newton_iterations for s in steps), contact.n_active
+        complementary(contact, 1e-12, 1e-10)
+    assert np.allclose(found[True][0], found[False][0], rtol=1e-8)
+    assert found[True][2] == found[False][2] > 2
+    assert found[True][1] > found[False][1]
+
+
+@pytest.mark.parametrize("kind", ["interval", "triangle", "quadrilateral"])
+def test_chords_interpolate_between_neighbouring_nodes(kind):
+    shape, rng = facet_shape(kind, 2), np.random.default_rng(4)
+    xi = rng.random((200, shape.dim))
+    xi = np.concatenate([xi[shape.contains(xi)], shape.nodes])
+    w = shape.chords(xi)
+    assert w.min() >= 0.0 and np.abs(w.sum(axis=1) - 1).max() < 1e-15
+    assert np.abs(w @ shape.nodes - xi).max() < 1e-15
+    assert np.abs(w[-len(shape.nodes) :] - np.eye(len(shape.nodes))).max() < 1e-15
