@@ -255,8 +255,9 @@ class FloatingBodies:
         if np.abs(turn).max() > 1e-6:
             axis = "" if g == 2 else " about (" + ", ".join(f"{c:.3g}" for c in np.array([turn[2], -turn[1], turn[0]])) + ")"
             ways.append("turns" + axis)
-        where = "(" + ", ".join(f"{c:.4g}" for c in self.middle[b]) + ")"
+        middle = np.where(np.abs(self.middle[b]) > 1e-9 * self.config.size, self.middle[b], 0.0)
+        where = "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
         return FloatingBodyError(
-            f"body {b} of {self.count}, with its middle at {where}, {' and '.join(ways)} under its loads and no contact stops it: "
+            f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
             "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on"
         )

@@ -118,6 +118,16 @@ class FacetProjection:
             updates[name][which] = value
         return replace(self, **updates)
 
+    def reaching_out(self, which: Ints, shape: FacetShape) -> FacetProjection:
+        """Copy in which some facets are continued past the target's open end, as far as their points lie beyond it."""
+        t = np.einsum("kaf,kag->kfg", self.dN[which], self.x[which])
+        m = np.einsum("kfg,keg->kfe", t, t)
+        step = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, self.beyond[which])[..., None])[..., 0]
+        xi = self.xi[which] + step
+        tab = shape.tabulate(xi)
+        foot = np.einsum("ka,kag->kg", tab.N, self.x[which])
+        return self.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
+
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
 

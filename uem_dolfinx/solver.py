@@ -116,7 +116,7 @@ class UnitedSolver:
             K: tangent matrix without boundary conditions.
             curvature: second derivatives of the gaps times contact forces, or None.
         """
-        key = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
+        key: object = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
         reuse = key == self._key and self.A is not None
         with timed("united matrix P'KP"):
             if restriction.M is None:
@@ -134,7 +134,11 @@ class UnitedSolver:
                 self._P = restriction.P
                 self.A = K.PtAP(self._P)
             if curvature is not None:
-                self.A.axpy(1.0, curvature.PtAP(self._P), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+                # an equation that depends on others acts on nodes that P does not join
+                pattern = PETSc.Mat.Structure
+                fits = pattern.DIFFERENT_NONZERO_PATTERN if restriction.stacked else pattern.SUBSET_NONZERO_PATTERN
+                self.A.axpy(1.0, curvature.PtAP(self._P), fits)
+                key = None if restriction.stacked else key
             diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
             idle = ~restriction.used.ravel()
             diagonal.array[idle] = stiffness.array_r[idle]

@@ -178,12 +178,7 @@ class ContactPair:
             return nearest
         assert isinstance(self.target, MeshTarget)
         i = np.flatnonzero(self.trial.active & (self.trial.slips > 1) & (nearest.beyond * self.free != 0).any(axis=1))
-        t = np.einsum("kaf,kag->kfg", nearest.dN[i], nearest.x[i])
-        m = np.einsum("kfg,keg->kfe", t, t)
-        xi = nearest.xi[i] + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, nearest.beyond[i])[..., None])[..., 0]
-        tab = self.target.shape.tabulate(xi)
-        foot = np.einsum("ka,kag->kg", tab.N, nearest.x[i])
-        return nearest.with_rows(i, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
+        return nearest.reaching_out(i, self.target.shape)
 
     @property
     def _has_corners(self) -> bool:
