@@ -172,8 +172,8 @@ def test_any_two_meshes(cell, n_low, n_high, ratio):
     else:
         # few contactors on a finer body dig in, the more so the harder they are
         assert 0.3 * force < m.force[1] < 1.02 * force
-    # small strains, but contactors that follow facets which have turned a little
-    assert m.energy == pytest.approx(m.force[1] * d / 2, rel=1e-5)
+    # small strains, but contactors that follow facets which have turned: to the second order of the strain
+    assert m.energy == pytest.approx(m.force[1] * d / 2, rel=d**2)
 
 
 def test_energy_falls_to_its_limit():
