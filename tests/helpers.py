@@ -7,7 +7,7 @@ look at the same scene in many poses and on any number of ranks.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import Any
 
@@ -297,3 +297,43 @@ def lowest(comm: MPI.Comm, values: npt.ArrayLike) -> float:
 def highest(comm: MPI.Comm, values: npt.ArrayLike) -> float:
     """Largest value over all ranks; NaN anywhere makes it NaN, -inf stands for no value (collective)."""
     return float(np.max(comm.allgather(np.max(np.asarray(values, dtype=float), initial=-np.inf))))
+
+
+def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> tuple[PETSc.Vec, PETSc.Vec, PETSc.Vec]:
+    """Change of ``F - sum lambda grad g`` along a smooth direction, all contactors active and contact forces held (collective).
+
+    Returns:
+        By differences, by ``K - sum lambda grad^2 g``, and by K alone.
+    """
+    system, pair, g, comm = problem.system, contact.pair, problem.config.gdim, problem.comm
+    x = problem.config.X
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    direction = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+    pair.trial = replace(pair.trial, active=np.ones(len(lam), bool), lam=lam, nodal=lam)
+
+    def residual(u: Array) -> PETSc.Vec:
+        problem.u.x.array[:] = u.ravel()
+        system.place(returning=False)
+        system.assemble_residual()
+        pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
+        r = system.residual
+        r.axpy(-1.0, compat.petsc_vector(contact.force))
+        return r
+
+    residual(smooth)
+    facets = pair.projection.facet.copy()
+    system.tangent.update()
+    A = system.tangent.K.copy()
+    curvature = system._curvature()
+    assert curvature is not None
+    du = A.createVecRight()
+    du.array[:] = direction[: problem.config.n_owned].ravel()
+    plain = A * du
+    full = plain + curvature * du
+    h = 1e-5
+    ahead = residual(smooth + h * direction)
+    assert highest(comm, np.abs(pair.projection.facet - facets)) == 0
+    difference = ahead - residual(smooth - h * direction)
+    difference.scale(0.5 / h)
+    return difference, full, plain

@@ -5,15 +5,13 @@ Two tests to read first: ``test_united_tangent_is_the_derivative_of_the_residual
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, highest, modulus, run, scene, st_venant
+from helpers import at, blocks, box, clamp, modulus, run, scene, st_venant, tangent_by_differences
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -168,38 +166,8 @@ def contact_scene(cell, target="mesh", **options):
 )
 def test_united_tangent_is_the_derivative_of_the_residual(cell, target):
     """``K - sum lambda grad^2 g`` against differences of ``F - sum lambda grad g`` with the contact forces lambda held."""
-    b, contact, problem = contact_scene(cell, target)
-    system, pair, g = problem.system, contact.pair, b.gdim
-    x = problem.config.X
-    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
-    direction = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
-    lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
-    pair.trial = replace(pair.trial, active=np.ones(len(lam), bool), lam=lam, nodal=lam)
-
-    def residual(u):
-        problem.u.x.array[:] = u.ravel()
-        system.place(returning=False)
-        system.assemble_residual()
-        pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
-        r = system.residual
-        r.axpy(-1.0, compat.petsc_vector(contact.force))
-        return r
-
-    residual(smooth)
-    facets = pair.projection.facet.copy()
-    system.tangent.update()
-    A = system.tangent.K.copy()
-    curvature = system._curvature()
-    assert curvature is not None
-    du = A.createVecRight()
-    du.array[:] = direction[: problem.config.n_owned].ravel()
-    plain = A * du
-    full = plain + curvature * du
-    h = 1e-5
-    ahead = residual(smooth + h * direction)
-    assert highest(COMM, np.abs(pair.projection.facet - facets)) == 0
-    difference = ahead - residual(smooth - h * direction)
-    difference.scale(0.5 / h)
+    _, contact, problem = contact_scene(cell, target)
+    difference, full, plain = tangent_by_differences(problem, contact)
     scale = plain.norm()
     assert (difference - full).norm() < 1e-8 * scale
     # and the term matters

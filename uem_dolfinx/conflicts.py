@@ -13,7 +13,7 @@ Rows that depend on others end as zeros and are left out: what they ask for hold
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.equations import MOSTLY_PRESCRIBED, ROUNDING, UnitingEquations
 
 if TYPE_CHECKING:
     from uem_dolfinx.surfaces import Configuration
@@ -33,8 +33,6 @@ Bools = npt.NDArray[np.bool_]
 #: A row that has lost all but this part of its length depends on the others; the rows of surfaces that bend under load do so
 #: only to the first order of their strain.
 DEPENDENT = 0.05
-#: Coefficients below it are rounding.
-ROUNDING = 1e-12
 #: A contactor's own component is eliminated unless another coefficient is larger by this factor.
 OWN_FIRST = 1.5
 
@@ -45,23 +43,13 @@ class Group:
 
     Attributes:
         origin: rank and place of each contested equation ``(m, 2)``.
-        pivot: global node of each independent equation ``(k,)``.
-        direction: of its elimination ``(k, gdim)``.
-        gap: ``(k,)``.
-        row: its terms ``(t,)``, as in ``UnitingEquations``.
-        followed: ``(t,)``.
-        coefficients: ``(t, gdim)``.
+        independent: equations of global nodes, which may live on any rank ``(k,)``.
         shares: forces of the contested equations from those of the independent ones ``(m, k)``.
         redundant: contested equations that were left out ``(m,)``.
     """
 
     origin: Ints
-    pivot: Ints
-    direction: Array
-    gap: Array
-    row: Ints
-    followed: Ints
-    coefficients: Array
+    independent: UnitingEquations
     shares: Array
     redundant: Bools
 
@@ -79,7 +67,7 @@ class Resolution:
 
     Attributes:
         equations: the independent ones.
-        redundant: which of the given equations were left out because they depend on others ``(m,)``.
+        redundant: which of the given equations were left out because they depend on others ``(m,)``, known after ``forces``.
         found: whether any equation on any rank was contested.
     """
 
@@ -131,24 +119,15 @@ class Resolution:
     def _take_home(self, plain: UnitingEquations, groups: list[Group]) -> UnitingEquations:
         """Send every independent equation to the rank that owns the node it eliminates."""
         comm, config = self.comm, self.config
-        outgoing: list[list[tuple[Ints, Array, Array, Ints, Ints, Array]]] = [[] for _ in range(comm.size)]
+        outgoing: list[list[UnitingEquations]] = [[] for _ in range(comm.size)]
         self._sent: list[list[tuple[int, Ints]]] = [[] for _ in range(comm.size)]
         for k, group in enumerate(groups):
-            owner = config.owner_of(group.pivot)
+            owner = config.owner_of(group.independent.node)
             for r in np.unique(owner):
-                rows = np.flatnonzero(owner == r)
-                terms = np.isin(group.row, rows)
-                outgoing[r].append(
-                    (group.pivot[rows], group.direction[rows], group.gap[rows], np.searchsorted(rows, group.row[terms]),
-                     group.followed[terms], group.coefficients[terms])
-                )  # fmt: skip
-                self._sent[r].append((k, rows))
-        received = [part for parts in comm.alltoall(outgoing) for part in parts]
+                outgoing[r].append(group.independent.select(owner == r))
+                self._sent[r].append((k, np.flatnonzero(owner == r)))
         first = config.index_map.local_range[0]
-        solved = [
-            UnitingEquations((p - first).astype(np.int32), d, gap, np.ones(len(p), bool), row, followed, coefficients)
-            for p, d, gap, row, followed, coefficients in received
-        ]
+        solved = [replace(p, node=(p.node - first).astype(np.int32)) for parts in comm.alltoall(outgoing) for p in parts]
         return UnitingEquations.join([plain, *solved], config.gdim)
 
     def forces(self, multipliers: Array) -> Array:
@@ -166,7 +145,7 @@ class Resolution:
         answers = comm.gather(multipliers[n:], root=self._home)
         back: list[list[tuple[Ints, Array, Bools]]] = [[] for _ in range(comm.size)]
         if answers is not None:
-            mu = [np.zeros(len(group.pivot)) for group in self._groups]
+            mu = [np.zeros(len(group.independent)) for group in self._groups]
             for values, sent in zip(answers, self._sent):
                 start = 0
                 for k, rows in sent:
@@ -259,4 +238,7 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, origin: I
     # what is left of the pivot's own block is across the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot[k]] -= direction[k]
     row, column = np.nonzero((np.abs(terms) > ROUNDING).any(axis=2))
-    return Group(origin, node[pivot[k]], direction[k], -h[k], row, node[column], -terms[row, column], shares, rest)
+    independent = UnitingEquations(
+        node[pivot[k]], direction[k], -h[k], np.ones(len(k), bool), row, node[column], -terms[row, column]
+    )
+    return Group(origin, independent, shares, rest)

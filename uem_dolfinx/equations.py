@@ -16,6 +16,8 @@ Bools = npt.NDArray[np.bool_]
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
 MOSTLY_PRESCRIBED = 1e-6
+#: Coefficients below it are rounding.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class UnitingEquations:
         coefficients: of its displacement ``(k, gdim)``.
     """
 
-    node: npt.NDArray[np.int32]
+    node: npt.NDArray[np.integer]
     direction: Array
     gap: Array
     active: Bools

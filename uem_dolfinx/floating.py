@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.log import logger
+from uem_dolfinx.rigid import rotation_matrix
+from uem_dolfinx.surfaces import rigid_velocities
 
 if TYPE_CHECKING:
     from uem_dolfinx.equations import UnitingEquations
@@ -82,16 +83,7 @@ class FloatingBodies:
 
     def _modes(self, x: Array, body: Ints) -> Array:
         """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each of their own modes ``(n, n_modes, gdim)``."""
-        g = x.shape[1]
-        arm = (x - self.middle[body]) / self.radius[body][:, None]
-        turns = []
-        for i in range(g):
-            for j in range(i + 1, g):
-                v = np.zeros_like(arm)
-                v[:, i], v[:, j] = -arm[:, j], arm[:, i]
-                turns.append(v)
-        shifts = np.broadcast_to(np.eye(g), (len(x), g, g))
-        return np.concatenate([shifts, np.stack(turns, axis=1)], axis=1)
+        return rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
 
     @property
     def n_modes(self) -> int:
@@ -182,17 +174,9 @@ class FloatingBodies:
             return
         x = config.x
         for b in np.flatnonzero(np.abs(parts).max(axis=1) > 0):
-            turn = self._turn(parts[b, g:] / self.radius[b])
+            turn = rotation_matrix(_turn(parts[b, g:] / self.radius[b]))
             here = body == b
             u[here] += (x[here] - self.middle[b]) @ (turn - np.eye(g)).T + parts[b, :g]
-
-    def _turn(self, angles: Array) -> Array:
-        """Rotation matrix of the rotations that ``_modes`` lists."""
-        if self.config.gdim == 2:
-            c, s = np.cos(angles[0]), np.sin(angles[0])
-            return np.array([[c, -s], [s, c]])
-        # in the planes xy, xz, yz
-        return np.asarray(Rotation.from_rotvec([angles[2], -angles[1], angles[0]]).as_matrix())
 
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 
@@ -253,7 +237,7 @@ class FloatingBodies:
         if np.abs(shift).max() > 1e-6:
             ways.append("moves along (" + ", ".join(f"{c:.3g}" for c in shift / np.linalg.norm(shift)) + ")")
         if np.abs(turn).max() > 1e-6:
-            axis = "" if g == 2 else " about (" + ", ".join(f"{c:.3g}" for c in np.array([turn[2], -turn[1], turn[0]])) + ")"
+            axis = "" if g == 2 else " about (" + ", ".join(f"{c:.3g}" for c in _turn(turn)) + ")"
             ways.append("turns" + axis)
         middle = np.where(np.abs(self.middle[b]) > 1e-9 * self.config.size, self.middle[b], 0.0)
         where = "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
@@ -261,3 +245,8 @@ class FloatingBodies:
             f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
             "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on"
         )
+
+
+def _turn(angles: Array) -> Array:
+    """Angle ``(1,)`` or rotation vector ``(3,)`` from rotations in the planes that ``rigid_velocities`` lists."""
+    return angles if len(angles) == 1 else np.array([angles[2], -angles[1], angles[0]])

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from uem_dolfinx.equations import MOSTLY_PRESCRIBED
+from uem_dolfinx.equations import MOSTLY_PRESCRIBED, ROUNDING
 from uem_dolfinx.errors import ConflictError, agree
 
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ Bools = npt.NDArray[np.bool_]
 
 #: Stacks of bodies higher than this are taken for a cycle.
 LONGEST_CHAIN = 16
-#: Coefficients below it are rounding.
-ROUNDING = 1e-12
 
 
 class Restriction:

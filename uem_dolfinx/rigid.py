@@ -131,9 +131,7 @@ class RigidSurface:
         if turn.shape != ((1,) if g == 2 else (3,)):
             expected = "an angle" if g == 2 else "a rotation vector of 3 numbers"
             raise ValueError(f"{self.name}: rotation {rotation!r} in {g}D: expected {expected}")
-        c, s = np.cos(turn[0]), np.sin(turn[0])
-        Q = np.array([[c, -s], [s, c]]) if g == 2 else Rotation.from_rotvec(turn).as_matrix()
-        self.motion = Motion(t, Q, centre)
+        self.motion = Motion(t, rotation_matrix(turn), centre)
         return self
 
     def reference(self, gdim: int) -> Array:
@@ -294,6 +292,14 @@ class RigidParaboloid(RigidSurface):
             name="rigid paraboloid",
             reference=o,
         )
+
+
+def rotation_matrix(turn: Array) -> Array:
+    """Rotation by an angle ``(1,)`` in 2D, counter-clockwise, or by a rotation vector ``(3,)``: ``(gdim, gdim)``."""
+    if len(turn) == 3:
+        return np.asarray(Rotation.from_rotvec(turn).as_matrix())
+    c, s = np.cos(turn[0]), np.sin(turn[0])
+    return np.array([[c, -s], [s, c]])
 
 
 def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Array:

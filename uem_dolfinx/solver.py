@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.log import timed
+from uem_dolfinx.surfaces import rigid_velocities
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -210,11 +211,4 @@ def _ones_like(K: PETSc.Mat) -> PETSc.Vec:
 
 def rigid_body_modes(config: Configuration) -> list[Array]:
     """Translations and linearised rotations of the current configuration, each ``(n_owned, gdim)``."""
-    g, x = config.gdim, config.x[: config.n_owned]
-    modes = [np.tile(e, (len(x), 1)) for e in np.eye(g)]
-    for i in range(g):
-        for j in range(i + 1, g):
-            m = np.zeros_like(x)
-            m[:, i], m[:, j] = -x[:, j], x[:, i]
-            modes.append(m)
-    return modes
+    return list(rigid_velocities(config.x[: config.n_owned]).transpose(1, 0, 2))

@@ -117,7 +117,7 @@ class Configuration:
         """First global node of every rank, and one past the last."""
         return np.array([*self.comm.allgather(self.index_map.local_range[0]), self.index_map.size_global], dtype=np.int64)
 
-    def owner_of(self, nodes: Ints) -> Ints:
+    def owner_of(self, nodes: npt.NDArray[np.integer]) -> Ints:
         """Ranks that own global nodes."""
         return np.searchsorted(self._first_nodes, nodes, side="right") - 1
 
@@ -319,6 +319,22 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.i
                 row += list(layout.entity_dofs(dim, i))
         rows.append(row)
     return np.array(rows, dtype=np.int32)
+
+
+def rigid_velocities(arm: Array) -> Array:
+    """Velocities of points at ``arm (n, gdim)`` from a pole in the modes of a rigid body ``(n, n_modes, gdim)``.
+
+    Translations first, then the linearised rotations in the planes xy, xz and yz.
+    """
+    n, g = arm.shape
+    shifts = np.broadcast_to(np.eye(g), (n, g, g))
+    turns = []
+    for i in range(g):
+        for j in range(i + 1, g):
+            v = np.zeros_like(arm)
+            v[:, i], v[:, j] = -arm[:, j], arm[:, i]
+            turns.append(v)
+    return np.concatenate([shifts, np.stack(turns, axis=1)], axis=1)
 
 
 def find_bodies(config: Configuration) -> tuple[Ints, int]:

@@ -65,7 +65,7 @@ class Tangent:
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
         #: Whether K is the same for every u.
         self.linear: bool = u not in J.coefficients()
-        self._inputs = [c for c in (*J.coefficients(), *J.constants()) if c is not u]
+        self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
         with timed("compile forms"):
             self._form = compat.form(J)
@@ -78,7 +78,7 @@ class Tangent:
         values = [np.array(c.x.array if isinstance(c, fem.Function) else c.value) for c in self._inputs]
         same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
         comm = self.K.comm.tompi4py()
-        if self.linear and comm.allreduce(int(same)) == comm.size:
+        if comm.allreduce(int(same)) == comm.size:
             return
         with timed("assemble tangent"):
             compat.assemble_matrix(self.K, self._form)

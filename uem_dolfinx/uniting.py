@@ -178,7 +178,7 @@ class ContactPair:
             return nearest
         assert isinstance(self.target, MeshTarget)
         i = np.flatnonzero(self.trial.active & (self.trial.slips > 1) & (nearest.beyond * self.free != 0).any(axis=1))
-        return nearest.reaching_out(i, self.target.shape)
+        return nearest.reaching_out(i, self.target.shape) if len(i) else nearest
 
     @property
     def _has_corners(self) -> bool:
@@ -311,15 +311,19 @@ class ContactPair:
         self._update_control()
 
     @property
+    def _ahead(self) -> Ints:
+        """Contactors in front of the target that are not active."""
+        return np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+
+    @property
     def approach(self) -> UnitingEquations:
         """The equations that all contactors in front of the target would have, of those that are not active."""
-        p = self.projection
-        i = np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+        p, i = self.projection, self._ahead
         return UnitingEquations.along(self.nodes[i], p.normal[i], p.nodes[i], p.weights[i], p.gap[i], np.ones(len(i), bool))
 
     def land(self, closing: Bools) -> bool:
         """Activate the contactors among those of ``approach`` that close and touch (collective): whether there are any."""
-        i = np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+        i = self._ahead
         touching = i[closing & (self.projection.gap[i] <= TOUCHING * self.config.size)]
         active = self.trial.active.copy()
         active[touching] = True
