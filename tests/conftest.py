@@ -47,18 +47,18 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def every_converged_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check what ``UnitedProblem.solve`` ends with (collective)."""
-    solve = uem.UnitedProblem.solve
+    """Check every state that ``UnitedProblem.attempt`` finds (collective)."""
+    attempt = uem.UnitedProblem.attempt
     largest: dict[uem.UnitedProblem, float] = {}
 
     def checked(self: uem.UnitedProblem, **how: Any) -> list[Any]:
-        history = solve(self, **how)
+        history = attempt(self, **how)
         # a step that unloads is in equilibrium against the forces that were there before
         largest[self] = max(largest.get(self, 0.0), self.system.residual.norm())
         check_state(self, largest[self])
         return history
 
-    monkeypatch.setattr(uem.UnitedProblem, "solve", checked)
+    monkeypatch.setattr(uem.UnitedProblem, "attempt", checked)
 
 
 def check_state(problem: uem.UnitedProblem, scale: float) -> None:

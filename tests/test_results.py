@@ -19,7 +19,7 @@ import pytest
 import ufl
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, results
+from uem_dolfinx import compat, pictures
 
 comm = MPI.COMM_WORLD
 
@@ -154,5 +154,5 @@ def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
     b = helpers.blocks(comm, cell)
     E = helpers.modulus(b.scene, 3.0, 7.0)
     S = compat.function_space(b.scene.mesh, 1)
-    values, cells = results.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
+    values, cells = pictures.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
     np.testing.assert_allclose(values[cells], np.where(b.scene.body == 0, 3.0, 7.0)[:, None] * np.ones(cells.shape[1]))

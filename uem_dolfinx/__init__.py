@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from uem_dolfinx import compat as _compat
 from uem_dolfinx.contact import Balance, Contact, Resultant
+from uem_dolfinx.energy import Energies, EnergyBook
 from uem_dolfinx.errors import (
     ConflictError,
     ConvergenceError,
     FloatingBodyError,
     InvertedElementError,
     LinearSolveError,
+    MassError,
     MeshError,
     MissingBackendError,
     MissingFileError,
@@ -22,10 +24,16 @@ from uem_dolfinx.errors import (
     SpaceError,
     SurfaceError,
     TagError,
+    TunnellingError,
     UEMError,
 )
+from uem_dolfinx.inertia import Dynamics, Scheme, generalised_alpha, newmark
+from uem_dolfinx.mass import Mass, consistent_mass, lumped_mass, nodal_mass
 from uem_dolfinx.materials import LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.mesh import Tag, read_gmsh
-from uem_dolfinx.problem import LoadStep, UnitedProblem, load_steps
-from uem_dolfinx.results import HistoryWriter, ResultsWriter, figure, plot_pressure, plot_scene
+from uem_dolfinx.pictures import figure, outline, plot_pressure, plot_scene
+from uem_dolfinx.plasticity import VonMises
+from uem_dolfinx.problem import UnitedProblem
+from uem_dolfinx.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
+from uem_dolfinx.steps import LoadStep, TimeStep, load_steps, time_steps

@@ -8,17 +8,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, agree
+from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, TunnellingError, agree
 from uem_dolfinx.log import logger
 
 if TYPE_CHECKING:
+    from uem_dolfinx.system import BodySystem
     from uem_dolfinx.uniting import ContactPair
 
 #: A body touches at the start when its gap is below this part of the model's size.
 TOUCHING = 1e-9
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 LEFT_OUT = 1e-6
+#: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
+PASSING = 0.1
+#: A step that would have to be looked at more often than this is too long.
+MOST_LOOKS = 256
 
 
 def check_finite(pair: ContactPair) -> None:
@@ -83,3 +89,46 @@ def check_prescribed(pair: ContactPair) -> None:
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
         )
     agree(pair.config.comm, error)
+
+
+def check_tunnelling(system: BodySystem, start: npt.NDArray[np.float64]) -> None:
+    """Refuse a step within which a contactor went through a target and out again (collective).
+
+    The straight way of every contactor is looked at in pieces no longer than the target's stride; most steps are shorter than
+    that and are not looked at.
+
+    Args:
+        system: at the end of the step.
+        start: displacement at its beginning ``(n_local incl. ghosts,)``.
+
+    Raises:
+        TunnellingError: naming the first such contactor.
+    """
+    u, config = system.u.x.array, system.config
+    end = np.array(u)
+    way = (end - start).reshape(-1, config.gdim)
+    for pair in system.pairs:
+        moves = [np.linalg.norm(way[pair.nodes], axis=1).max(initial=0.0), 0.0]
+        if pair.target.n_nodes:
+            moves[1] = np.linalg.norm(way, axis=1).max(initial=0.0)
+        length = float(np.max(config.comm.allgather(moves), axis=0).sum())
+        looks = min(np.ceil(length / pair.target.stride), MOST_LOOKS + 1.0)
+        error = None
+        if looks > MOST_LOOKS:
+            error = TunnellingError(
+                f"{pair.name}: the surfaces move by {length:.4g} within a step, {length / pair.target.stride:.3g} times what a contactor "
+                "may pass without being looked for: take smaller steps"
+            )
+        agree(config.comm, error)
+        for k in range(1, int(looks)):
+            u[:] = start + k / looks * (end - start)
+            p = pair.target.project(pair.points)
+            inside = ~pair.trial.active & (p.gap < -PASSING * pair.target.stride) & ~(p.beyond != 0).any(axis=1)
+            if inside.any():
+                i = int(np.argmin(np.where(inside, p.gap, np.inf)))
+                error = TunnellingError(
+                    f"{pair.name}: the contactor at {config.describe(int(pair.nodes[i]))} passes through the target within a step, "
+                    f"{-p.gap[i]:.4g} deep on its way: take smaller steps"
+                )
+            u[:] = end
+            agree(config.comm, error)

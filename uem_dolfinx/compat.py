@@ -156,6 +156,19 @@ def surface_measure(domain: Any, facets: npt.ArrayLike, metadata: Mapping[str, A
     return ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
 
 
+def cell_measure(domain: Any, cells: npt.ArrayLike) -> Any:
+    """Measure ``dx`` over the given cells only; a form may hold one of them, beside ``dx`` over all cells.
+
+    Args:
+        domain: the mesh.
+        cells: local indices, shape ``(n,)``; each rank integrates over those it owns.
+
+    Returns:
+        The UFL measure.
+    """
+    return ufl.Measure("dx", domain=domain, subdomain_data=mesh_tags(domain, domain.topology.dim, cells, 1))(1)
+
+
 # ---------------------------------------------------------------------------------------------- spaces and functions
 
 
@@ -194,6 +207,58 @@ def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any
     if len(shape) == 1:
         return fem.VectorFunctionSpace(domain, (family, degree), dim=shape[0])
     return fem.TensorFunctionSpace(domain, (family, degree), shape=shape)
+
+
+def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
+    """Space of functions known at quadrature points only, for forms integrated with the same degree.
+
+    Args:
+        domain: the mesh.
+        degree: of the quadrature, see :func:`quadrature_rule`.
+        shape: shape of the value: ``()`` scalar, ``(n,)`` vector.
+
+    Returns:
+        The function space; the d.o.f. of a cell are in the order of the rule's points.
+    """
+    if DOLFINX_VERSION >= (0, 7):
+        from basix.ufl import quadrature_element
+
+        element = quadrature_element(cell_name(domain), value_shape=tuple(shape), scheme="default", degree=degree)
+        return fem.functionspace(domain, element)
+    if shape == ():
+        element = ufl.FiniteElement("Quadrature", domain.ufl_cell(), degree, quad_scheme="default")
+    else:
+        element = ufl.VectorElement("Quadrature", domain.ufl_cell(), degree, dim=shape[0], quad_scheme="default")
+    return fem.FunctionSpace(domain, element)
+
+
+def quadrature_rule(domain: Any, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Quadrature on the reference cell that forms use by default.
+
+    Args:
+        domain: the mesh.
+        degree: of the polynomials integrated exactly.
+
+    Returns:
+        Points ``(n_points, tdim)`` and weights ``(n_points,)``.
+    """
+    points, weights = basix.make_quadrature(getattr(basix.CellType, cell_name(domain)), degree)
+    return np.asarray(points), np.asarray(weights)
+
+
+def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+    """Values of a compiled scalar or vector expression at its points of the given cells.
+
+    Args:
+        compiled: ``fem.Expression`` of rank 0 or 1.
+        domain: the mesh.
+        cells: local indices, shape ``(n,)``.
+
+    Returns:
+        Shape ``(n, n_points, size)``.
+    """
+    values = compiled.eval(cells) if DOLFINX_VERSION < (0, 7) else compiled.eval(domain, cells)
+    return values.reshape(len(cells), len(compiled.X()), int(np.prod(compiled.ufl_expression.ufl_shape)))
 
 
 def cell_dofs(V: Any) -> npt.NDArray[np.int32]:

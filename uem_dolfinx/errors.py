@@ -57,12 +57,20 @@ class FloatingBodyError(UEMError, RuntimeError):
     """A body moves as a rigid body under its loads, and neither conditions nor contacts can hold it."""
 
 
+class MassError(UEMError, ValueError):
+    """A mass cannot be what it is asked to be."""
+
+
 class NotFiniteError(UEMError, ArithmeticError):
     """The residual, the tangent or the increment holds NaN or infinity."""
 
 
 class InvertedElementError(UEMError, ArithmeticError):
     """The displacement turns a cell inside out."""
+
+
+class TunnellingError(UEMError, ArithmeticError):
+    """A contactor passes through a target within a step, where no step ends."""
 
 
 class MissingBackendError(UEMError, ImportError):

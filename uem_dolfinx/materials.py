@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import ufl
 
@@ -155,3 +155,22 @@ def green_lagrange(u: Any) -> Expr:
     """Green-Lagrange strain; ``F'F - I`` would lose strains below the rounding of 1."""
     G = ufl.grad(u)
     return (G + G.T + G.T * G) / 2
+
+
+class HistoryMaterial(Protocol):
+    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity."""
+
+    def stiffness(self, du: Any, v: Any) -> ufl.Form:
+        """What the derivative of the residual lacks: the stress's change with the displacement."""
+
+    def update(self) -> None:
+        """Stresses at the present displacement, from the committed history."""
+
+    def commit(self) -> None:
+        """Make the trial history the committed one."""
+
+    def energy(self) -> float:
+        """Stored energy (collective)."""
+
+    def dissipation(self) -> float:
+        """Energy dissipated since the start (collective)."""

@@ -1,11 +1,10 @@
-"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, solved step by step.
+"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, wired up and solved for one state after the other.
 
 Eighth step on the data's way, and the only file that knows all the others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,45 +12,46 @@ from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.checks import check_prescribed
-from uem_dolfinx.errors import ConvergenceError, InvertedElementError, LinearSolveError, NotFiniteError, UEMError
-from uem_dolfinx.log import logger
+from uem_dolfinx.errors import UEMError
 from uem_dolfinx.newton import Iteration, solve_united
 from uem_dolfinx.solver import UnitedSolver
 from uem_dolfinx.surfaces import Configuration
 from uem_dolfinx.system import BodySystem
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     import ufl
 
     from uem_dolfinx.contact import Contact
+    from uem_dolfinx.inertia import Dynamics
+    from uem_dolfinx.materials import HistoryMaterial
 
-#: A load step may be cut to this part of its nominal length.
-SHORTEST_LOAD_STEP = 1.0 / 1024
 #: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
 #: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
 RIM = 1.0 / (2.0**1.5 - 1.0)
-#: A step that needs no more iterations than this is easy: the next one may be longer again.
-EASY = 6
 
 
 class UnitedProblem:
-    """Statics of bodies in contact by the United Elements Method.
+    """Bodies in contact by the United Elements Method, in statics, or in dynamics where there is inertia.
 
     Solves ``F(u; v) = 0`` with the contactors of every contact united to their targets:
 
         du = P dq + c,    P'KP dq = P'(r - K c),    r = -F,    K = dF/du      [UEM, 6.6]
 
     Args:
-        F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``.
+        F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
+            forces are added by ``dynamics``.
         u: displacement, a Function of a vector Lagrange space; holds the solution.
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces; none is fine.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size.
         load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped, or
-            a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only.
+            a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only. Of time
+            steps it is a function of the time.
+        dynamics: mass, velocity and time integration; None is statics.
+        materials: laws with history in F, such as ``VonMises``.
         newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
         consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
         line_search: shorten steps that invert cells or do not reduce the residual's work.
@@ -76,6 +76,8 @@ class UnitedProblem:
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
         load: fem.Constant | Callable[[float], None] | None = None,
+        dynamics: Dynamics | None = None,
+        materials: Sequence[HistoryMaterial] = (),
         newton: str = "full",
         consistent_tangent: bool = True,
         line_search: bool = True,
@@ -90,18 +92,22 @@ class UnitedProblem:
         self.line_search, self.rtol, self.max_iterations, self.verbose = line_search, rtol, max_iterations, verbose
         self.config = Configuration(u)
         self.comm = self.config.comm
-        self.contacts = list(contacts)
+        self.contacts, self.dynamics, self.materials = list(contacts), dynamics, list(materials)
+        damping = dynamics.attach(self.config) if dynamics is not None else None
         self.system = BodySystem(
             self.config,
-            F,
+            F if damping is None else F + damping,
             bcs,
             UnitedSolver(self.config, petsc_options_prefix, petsc_options),
             newton=newton,
             consistent_tangent=consistent_tangent,
             check_inversion=check_inversion,
+            materials=self.materials,
+            dynamics=dynamics,
         )
         self.system.add_pairs([contact.attach(self.system) for contact in self.contacts])
-        self._committed = np.array(u.x.array)
+        #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
+        self.committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
         self._largest_forces = 0.0
 
@@ -109,6 +115,15 @@ class UnitedProblem:
 
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
+
+        Arguments, return value and errors are those of :meth:`attempt`.
+        """
+        history = self.attempt(start=start, fraction=fraction, ratio=ratio)
+        self.commit()
+        return history
+
+    def attempt(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+        """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
         Args:
             start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
@@ -122,7 +137,7 @@ class UnitedProblem:
             ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError: after
                 the committed state has been restored.
         """
-        start = self._committed if start is None else start
+        start = self.committed if start is None else start
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.system.bcs)
         self.system.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
@@ -145,20 +160,25 @@ class UnitedProblem:
         except UEMError:
             self.restore()
             raise
-        self.commit()
         return history
 
     def commit(self) -> None:
         """Keep the present displacement and contact state."""
-        self._last, self._committed = self._committed, np.array(self.u.x.array)
+        self._last, self.committed = self.committed, np.array(self.u.x.array)
         self._largest_forces = max(self._largest_forces, self.system.residual.norm())
+        for material in self.materials:
+            material.commit()
+        if self.dynamics is not None:
+            self.dynamics.commit()
         for pair in self.system.pairs:
             pair.commit()
             pair.project()
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
-        self.u.x.array[:] = self._committed
+        self.u.x.array[:] = self.committed
+        for material in self.materials:
+            material.update()
         for pair in self.system.pairs:
             pair.restore()
             pair.project()
@@ -176,81 +196,8 @@ class UnitedProblem:
 
     def _predict(self, ratio: float) -> None:
         """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
-        self.u.x.array[:] = self._committed + RIM * ratio * self._deformation(self._committed - self._last)
+        self.u.x.array[:] = self.committed + RIM * ratio * self._deformation(self.committed - self._last)
         for pair in self.system.pairs:
             pair.project()
             pair.predict(ratio)
-        self.u.x.array[:] = self._committed
-
-
-@dataclass(frozen=True)
-class LoadStep:
-    """A converged load step.
-
-    Attributes:
-        number: counted from 1.
-        factor: load factor reached, 1 at the end.
-        iterations: history of the Newton loop.
-        cuts: how often the step had to be shortened.
-    """
-
-    number: int
-    factor: float
-    iterations: list[Iteration]
-    cuts: int
-
-    @property
-    def newton_iterations(self) -> int:
-        """Number of linear solves."""
-        return len(self.iterations) - 1
-
-
-def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
-    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length.
-
-    Args:
-        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
-        steps: nominal number of equal steps.
-
-    Yields:
-        Every converged step.
-
-    Raises:
-        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
-    """
-    nominal = 1.0 / steps
-    length, done, last, number, cuts = nominal, 0.0, 0.0, 0, 0
-    start = np.array(problem.u.x.array)
-    while done < 1.0:
-        factor = min(done + length, 1.0)
-        if 1.0 - factor < 1e-9:
-            factor = 1.0
-        fraction = _apply_load(problem, factor)
-        try:
-            iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
-        except (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError) as error:
-            cuts += 1
-            length *= 0.5
-            if length < SHORTEST_LOAD_STEP * nominal:
-                _apply_load(problem, done)
-                # the targets that the load moves are back, too
-                problem.restore()
-                raise
-            logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
-            continue
-        last, done, number = factor - done, factor, number + 1
-        yield LoadStep(number, factor, iterations, cuts)
-        cuts = 0
-        if len(iterations) - 1 <= EASY:
-            length = min(2.0 * length, nominal)
-
-
-def _apply_load(problem: UnitedProblem, factor: float) -> float:
-    """Set the load; returns how far the Dirichlet values are to be ramped."""
-    if callable(problem.load) and not isinstance(problem.load, fem.Constant):
-        problem.load(factor)
-        return 1.0
-    if problem.load is not None:
-        problem.load.value = factor
-    return factor
+        self.u.x.array[:] = self.committed

@@ -83,6 +83,7 @@ class RigidSurface:
         hessian: its second derivative ``(n, gdim, gdim)``; None takes differences of the gradient.
         name: for messages.
         reference: point about which it turns and its moment is taken ``(gdim,)``; None is the origin.
+        stride: how far a contactor may move past it in a time step unseen, a length; infinite if it has no other side.
 
     Raises:
         ValueError: if ``reference`` is not finite.
@@ -97,7 +98,9 @@ class RigidSurface:
         hessian: Callable[[Array], Array] | None = None,
         name: str = "rigid surface",
         reference: npt.ArrayLike | None = None,
+        stride: float = np.inf,
     ):
+        self.stride = stride
         self.distance, self.gradient, self.hessian, self.name = distance, gradient, hessian, name
         self.motion: Motion | None = None
         self._reference = None if reference is None else finite_point(reference, f"{name}: reference")
@@ -236,6 +239,7 @@ class RigidSphere(RigidSurface):
             hessian,
             name="rigid sphere",
             reference=c,
+            stride=radius,
         )
 
 
@@ -265,6 +269,7 @@ class RigidCylinder(RigidSurface):
             hessian,
             name="rigid cylinder",
             reference=p,
+            stride=radius,
         )
 
 

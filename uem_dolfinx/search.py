@@ -68,9 +68,15 @@ class Projection(Protocol):
 
 
 class Target(Protocol):
-    """Anything that points can be projected onto, meshed or rigid."""
+    """Anything that points can be projected onto, meshed or rigid.
+
+    Attributes:
+        n_nodes: that a contactor follows; 0 if the target is rigid.
+        stride: how far a contactor may move past it unseen, a length.
+    """
 
     n_nodes: int
+    stride: float
 
     def project(self, points: Array) -> Projection:
         """Closest points in the current configuration (collective)."""
@@ -179,6 +185,9 @@ class MeshTarget:
         self.comm: MPI.Comm = facets.config.comm
         self.n_nodes = facets.dofs.shape[1]
         counts = self.comm.allgather(len(facets.dofs))
+        corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        self.stride = float(min(self.comm.allgather(sides.min(initial=np.inf))))
         self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
     def project(self, points: Array) -> FacetProjection:

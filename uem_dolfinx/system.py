@@ -29,6 +29,8 @@ from uem_dolfinx.surfaces import followed_nodes
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uem_dolfinx.inertia import Dynamics
+    from uem_dolfinx.materials import HistoryMaterial
     from uem_dolfinx.solver import UnitedSolver
     from uem_dolfinx.surfaces import Configuration
     from uem_dolfinx.uniting import ContactPair
@@ -49,22 +51,28 @@ CLOSED = 1e-13
 
 
 class Tangent:
-    """K = dF/du, assembled when it has changed.
+    """K = dF/du, with the mass's part of it in dynamics, assembled when it has changed.
 
     Args:
         F: UFL residual.
         u: displacement.
+        materials: whose stresses in F are no expressions of u; they add their stiffness.
+        dynamics: whose inertia forces depend on u, or None.
 
     Raises:
         SpaceError: if F does not depend on u.
     """
 
-    def __init__(self, F: ufl.Form, u: fem.Function):
-        J = ufl.algorithms.expand_derivatives(ufl.derivative(F, u))
+    def __init__(self, F: ufl.Form, u: fem.Function, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None):
+        J = ufl.derivative(F, u)
+        for material in materials:
+            J += material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0])
+        J = ufl.algorithms.expand_derivatives(J)
         if J.empty():
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
         #: Whether K is the same for every u.
         self.linear: bool = u not in J.coefficients()
+        self._dynamics, self._factor = dynamics, 0.0
         self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
         with timed("compile forms"):
@@ -76,18 +84,22 @@ class Tangent:
     def update(self) -> None:
         """Assemble K unless nothing it depends on has changed (collective)."""
         values = [np.array(c.x.array if isinstance(c, fem.Function) else c.value) for c in self._inputs]
+        factor = self._dynamics.factor if self._dynamics is not None else 0.0
         same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
+        same &= factor == self._factor
         comm = self.K.comm.tompi4py()
         if comm.allreduce(int(same)) == comm.size:
             return
         with timed("assemble tangent"):
             compat.assemble_matrix(self.K, self._form)
-        self._values = values
+            if self._dynamics is not None and factor:
+                self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        self._values, self._factor = values, factor
         self.number += 1
 
 
 class BodySystem:
-    """Implements ``newton.UnitedSystem`` for bodies in statics.
+    """Implements ``newton.UnitedSystem`` for bodies in statics and dynamics.
 
     Args:
         config: configuration of the displacement.
@@ -97,6 +109,8 @@ class BodySystem:
         newton: ``"full"`` or ``"modified"``.
         consistent_tangent: whether the curvature of the contact is added to K.
         check_inversion: whether to look for cells turned inside out.
+        materials: with history, whose stresses are brought up to date before the residual is assembled.
+        dynamics: inertia, or None in statics.
     """
 
     def __init__(
@@ -109,10 +123,13 @@ class BodySystem:
         newton: str,
         consistent_tangent: bool,
         check_inversion: bool | None,
+        materials: Sequence[HistoryMaterial] = (),
+        dynamics: Dynamics | None = None,
     ):
+        self.materials, self.dynamics = list(materials), dynamics
         self.config, self.comm, self.u, self.bcs, self.solver = config, config.comm, config.u, list(bcs), solver
         self.newton, self.consistent_tangent = newton, consistent_tangent
-        self.tangent = Tangent(F, self.u)
+        self.tangent = Tangent(F, self.u, self.materials, dynamics)
         with timed("compile forms"):
             self._F = compat.form(F)
         self._b = compat.create_vector(config.V)
@@ -141,8 +158,13 @@ class BodySystem:
         chained = any(pair.control is not None and pair.control.chained for pair in pairs)
         self.stacked = any(self.comm.allgather(chained or any(followed[pair.nodes].any() for pair in pairs)))
         self._find_mutual(self.pairs)
+        if self.dynamics is not None:
+            self.dynamics.weigh(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
         if self.pairs:
-            floating = FloatingBodies(self.config, self.free[: self.config.n_owned], finite=not self.tangent.linear)
+            free = self.free[: self.config.n_owned]
+            # what has mass does not float: its inertia holds it
+            loose = free & ~self.dynamics.massy if self.dynamics is not None else free
+            floating = FloatingBodies(self.config, loose, finite=not self.tangent.linear)
             self.floating = floating if floating.loose else None
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
         shared = len(np.unique(contactors)) < len(contactors)
@@ -241,8 +263,15 @@ class BodySystem:
 
     def assemble_residual(self) -> bool:
         """Residual ``F(u)`` at the present displacement; whether it is finite on all ranks."""
+        try:
+            for material in self.materials:
+                material.update()
+        except NotFiniteError:
+            return False
         with timed("assemble residual"):
             compat.assemble_vector(self._b, self._F)
+            if self.dynamics is not None:
+                self._b.array[:] += self.dynamics.load().array_r
         return bool(np.isfinite(self._b.norm()))
 
     @property
@@ -251,6 +280,13 @@ class BodySystem:
         F = self._du_like()
         F.array[:] = self._b.array_r
         return F
+
+    def accelerate(self) -> None:
+        """Find the acceleration that the bodies start with (collective)."""
+        if self.dynamics is not None and not self.dynamics.accelerated:
+            self.place(returning=False)
+            self.assemble_residual()
+            self.dynamics.accelerate(self._restrict()[0], self.residual)
 
     def _du_like(self) -> PETSc.Vec:
         return PETSc.Vec().createMPI(self._b.getSizes(), bsize=self.config.gdim, comm=self.comm)
@@ -449,7 +485,7 @@ class BodySystem:
     @property
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement."""
-        return self.tangent.linear
+        return self.tangent.linear and not self.materials
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
         """``P'F`` at the present displacement, with the active set of ``state``.

@@ -1,0 +1,361 @@
+"""Motion in time: accuracy of the integration rules, balances of energy and momentum, impact, its instants, and what is refused.
+
+Two tests to read first: ``test_bar_hits_wall`` (the closed form of an impact) and ``test_ranks_see_the_same_motion``.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, box, clamp, highest, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+COMM = MPI.COMM_WORLD
+
+
+class Bar:
+    """A bar ``[0, 1] x [gap, gap + 10]`` of linear material, E = 900 and density 1, above a rigid wall at y = 0."""
+
+    def __init__(
+        self, n=50, gap=5.0, v=-10.0, comm=COMM, cell="quadrilateral", law=uem.LinearElastic, unit=1.0, mass=uem.lumped_mass,
+        wall=True, held=False, **how,
+    ):  # fmt: skip
+        g = 2 if cell in ("triangle", "quadrilateral") else 3
+        across = [[0.0] * (g - 1), [unit] * (g - 1), [1] * (g - 1)]
+        body = box(cell, [*across[0], gap * unit], [*across[1], (gap + 10) * unit], [*across[2], n])
+        self.s = s = scene(comm, cell, [body])
+        self.V = compat.function_space(s.mesh, 1, (g,))
+        self.u, w = fem.Function(self.V), ufl.TestFunction(self.V)
+        self.tip = s.tag("tip", 0, at(g - 1, gap * unit, 1e-9 * unit))
+        material = law(900.0, 0.0, kind="plane_stress" if g == 2 else "3d")
+        self.stored = material.energy(self.u) * ufl.dx
+        self.contact = uem.Contact(self.tip, uem.RigidPlane([0.0] * g, [*[0.0] * (g - 1), 1.0]), name="wall")
+        velocity = [*[0.0] * (g - 1), v * unit] if np.isscalar(v) else self.field(v)
+        self.dynamics = uem.Dynamics(mass(self.V, 1.0 / unit**2), velocity=velocity, **how)
+        self.problem = uem.UnitedProblem(
+            material.residual(self.u, w) * ufl.dx, self.u, contacts=[self.contact] if wall else [], dynamics=self.dynamics,
+            bcs=clamp(self.V, self.tip) if held else [],
+        )  # fmt: skip
+        self.book = uem.EnergyBook(self.problem, self.stored)
+        self.forces, self.steps = [], []
+
+    def field(self, f):
+        """Function with the values ``f(X) (n, gdim)`` at the nodes."""
+        field = fem.Function(self.V)
+        values = field.x.array.reshape(-1, self.V.mesh.geometry.dim)
+        values[:] = f(self.V.tabulate_dof_coordinates()[: len(values), : values.shape[1]])
+        return field
+
+    def run(self, dt, end, **how):
+        """Step to the end, with the contact force ``(n, 2)`` over time."""
+        for step in uem.time_steps(self.problem, dt, end, **how):
+            self.steps.append(step)
+            self.book.write(step)
+            self.forces.append((step.time, self.contact.resultant().force[-1] if self.problem.contacts else 0.0))
+        return np.array(self.forces)
+
+
+def first_mode(X):
+    """Velocity of a bar that is held at y = 0 and swings in its first mode."""
+    v = np.zeros_like(X)
+    v[:, -1] = np.sin(np.pi * X[:, -1] / 20)
+    return v
+
+
+# ---------------------------------------------------------------------------------------------- rules
+
+
+@pytest.mark.parametrize("scheme", [uem.newmark(), uem.newmark(0.3, 0.5), uem.generalised_alpha(0.5), uem.generalised_alpha(0.0)])
+def test_second_order(scheme):
+    """The swing of a held bar converges like dt^2 to the mode of the lumped chain, whose frequency is known."""
+    n = 20
+    h, c = 10.0 / n, 30.0
+    omega = 2 * c / h * np.sin(np.pi * h / 40)
+    errors = []
+    for dt in (0.02, 0.01, 0.005):
+        bar = Bar(n, gap=0.0, v=first_mode, wall=False, held=True, scheme=scheme)
+        bar.run(dt, 1.0)
+        error = bar.u.x.array - np.sin(omega) / omega * bar.field(first_mode).x.array
+        errors.append(highest(COMM, np.abs(error)) * omega)
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert errors[-1] < 0.03 and np.all(orders > 1.8), (errors, orders)
+
+
+def test_energy_of_the_rules():
+    """The trapezoidal rule keeps the energy of linear bodies, generalised-alpha takes it from what the steps cannot resolve."""
+
+    def shock(X):
+        v = np.zeros_like(X)
+        v[:, 1] = X[:, 1] > 5
+        return v
+
+    ends = []
+    for scheme in (uem.newmark(), uem.generalised_alpha(1.0), uem.generalised_alpha(0.5)):
+        bar = Bar(20, gap=0.0, v=shock, wall=False, scheme=scheme)
+        bar.run(0.05, 2.0)
+        rows = bar.book.rows
+        ends.append((rows[-1].kinetic + rows[-1].stored) / rows[0].kinetic)
+    assert abs(ends[0] - 1) < 1e-12
+    assert abs(ends[1] - 1) < 0.1
+    assert ends[2] < 0.95 and np.isclose(bar.book.momenta[-1][1], bar.book.momenta[0][1], rtol=1e-12)
+
+
+def test_words_of_schemes():
+    for wrong in ({"beta": 0.0}, {"gamma": 0.4}):
+        with pytest.raises(ValueError, match="beta must be positive"):
+            uem.newmark(**wrong)
+    with pytest.raises(ValueError, match="rho_inf = 1.5"):
+        uem.generalised_alpha(1.5)
+
+
+# ---------------------------------------------------------------------------------------------- forces
+
+
+def test_free_fall_strains_nothing():
+    """Gravity and inertia cancel at every node, although the contactors' mass has been handed on."""
+    bar = Bar(gap=50.0, v=-2.0, gravity=(0.0, -10.0))
+    bar.run(0.05, 1.0)
+    assert np.allclose(bar.u.x.array.reshape(-1, 2)[:, 1], -2.0 - 5.0, rtol=1e-12)
+    rows = bar.book.rows
+    assert all(row.stored < 1e-20 * rows[-1].kinetic for row in rows)
+    assert np.isclose(rows[-1].external, 10.0 * 10.0 * 7.0, rtol=1e-12) and abs(rows[-1].defect) < 1e-9
+
+
+def test_first_acceleration():
+    """A bar in its weight's equilibrium stays there; one that is put down unstrained begins to sink."""
+    bar = Bar(20, gap=0.0, v=0.0, gravity=(0.0, -10.0))
+    bar.problem.solve()
+    u = np.array(bar.u.x.array)
+    force = bar.contact.resultant().force[1]
+    assert np.isclose(force, 100.0, rtol=1e-9)
+    forces = bar.run(0.01, 0.2)
+    assert np.abs(bar.u.x.array - u).max(initial=0.0) < 1e-9 * highest(COMM, np.abs(u))
+    assert np.allclose(forces[:, 1], 100.0, rtol=1e-8)
+    held = Bar(20, gap=0.0, v=0.0, gravity=(0.0, -10.0), wall=False, held=True)
+    held.run(1e-4, 1e-4)
+    a = held.dynamics.acceleration.x.array.reshape(-1, 2)[:, 1]
+    free = held.problem.system.free[:, 1]
+    assert np.allclose(a[free], -10.0, rtol=1e-2) and np.all(a[~free] == 0.0)
+
+
+@pytest.mark.parametrize("rate", [0.5, 20.0])
+def test_damping_form(rate):
+    """Damping in proportion to the mass slows a free bar down like exp(-rate t)."""
+
+    def damping(velocity):
+        w = ufl.TestFunction(velocity.ufl_operands[1].function_space)
+        return rate * ufl.inner(velocity, w) * ufl.dx
+
+    bar = Bar(10, gap=5.0, v=-1.0, wall=False, mass=uem.consistent_mass, damping=damping)
+    bar.run(0.01 / rate, 1.0 / rate)
+    assert np.isclose(bar.dynamics.momentum()[1] / -10.0, np.exp(-1.0), rtol=1e-4)
+    rows = bar.book.rows
+    assert abs(rows[-1].defect) < 1e-10 * rows[0].kinetic and np.isclose(
+        rows[-1].damped, rows[0].kinetic - rows[-1].kinetic, rtol=1e-9
+    )
+
+
+# ---------------------------------------------------------------------------------------------- impact
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron", "triangle"])
+@pytest.mark.parametrize("mass", [uem.lumped_mass, uem.consistent_mass])
+def test_bar_hits_wall(cell, mass):
+    """Pressure 300 from 0.5 to 1.1667 and rebound with the velocity of the impact; energy and momentum kept."""
+    bar = Bar(100, cell=cell, mass=mass)
+    f = bar.run(0.1 / 30, 1.5)
+    pressed = f[f[:, 1] > 0, 0]
+    assert abs(pressed[0] - 0.5) < 0.0101 and abs(pressed[-1] - 7 / 6) < 0.015
+    inside = (f[:, 0] > 0.55) & (f[:, 0] < 1.1)
+    assert np.abs(f[inside, 1] / 300 - 1).max() < 0.03
+    rows, p = bar.book.rows, np.array(bar.book.momenta)[:, -1]
+    total = np.array([row.kinetic + row.stored for row in rows])
+    assert np.abs(total / total[0] - 1).max() < 1e-3
+    assert np.isclose(p[-1], -p[0], rtol=0.03)
+    impulses = np.array([i[0][-1] for i in bar.book.impulses])
+    assert np.allclose(p - p[0], impulses, atol=1e-9 * abs(p[0]))
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e3])
+def test_units(unit):
+    """The same impact in nanometres and kilometres, with the density that keeps the wave's time."""
+    here, there = Bar(20), Bar(20, unit=unit)
+    a, b = here.run(0.01, 1.3), there.run(0.01, 1.3)
+    assert np.allclose(b[:, 1], a[:, 1] * unit, rtol=1e-6, atol=1e-6 * unit)
+    assert [s.newton_iterations for s in here.steps] == [s.newton_iterations for s in there.steps]
+
+
+def test_linear_flight_assembles_once():
+    """K is assembled once, and factored once, while nothing touches; so it is while the contact stays."""
+    bar = Bar(20)
+    bar.run(0.01, 0.45)
+    assert bar.problem.system.tangent.number == 1
+    bar.run(0.01, 1.1)
+    assert bar.problem.system.tangent.number == 1
+
+
+def test_massy_contactors_warn(caplog):
+    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+        bar = Bar(20, contactors="massy")
+    assert COMM.rank != 0 or "2 contactors have mass" in caplog.text
+    f = bar.run(0.5 / 60, 1.3)
+    rows = bar.book.rows
+    assert max(row.kinetic + row.stored for row in rows) > 1.5 * rows[0].kinetic
+    assert f[:, 1].max() > 600
+
+
+def test_massless_contactors_have_no_velocity_of_their_own():
+    """In contact with the wall they are at rest, and after it they move with the bar."""
+    bar = Bar(50)
+    bar.run(0.005, 0.8)
+    at_tip = fem.locate_dofs_topological(bar.V, 1, bar.tip.entities)
+    assert np.abs(bar.dynamics.velocity.x.array.reshape(-1, 2)[at_tip]).max(initial=0.0) < 1e-9
+    assert np.abs(bar.dynamics.acceleration.x.array.reshape(-1, 2)[at_tip]).max(initial=0.0) == 0.0
+    bar.run(0.005, 1.4)
+    v = bar.dynamics.velocity.x.array.reshape(-1, 2)[at_tip, 1]
+    assert np.all((v > 5) & (v < 15))
+
+
+def test_instants_are_found():
+    """A step begins at the touch and at the departure, to the tolerance asked for."""
+    bar = Bar(50, v=-10.0)
+    bar.run(0.02, 1.5, event_tolerance=1e-4)
+    touch = [s for s in bar.steps if s.touched]
+    leave = [s for s in bar.steps if s.left]
+    assert [s.touched for s in touch] == [("wall",)] and [s.left for s in leave] == [("wall",)]
+    assert abs(touch[0].start - 0.5) < 2e-6
+    fine = Bar(50, v=-10.0)
+    f = fine.run(0.001, 1.5)
+    assert abs(leave[0].start - f[f[:, 1] > 0, 0][-1]) < 0.02
+    # the grid of the steps goes on as if nothing had been
+    assert np.isclose(bar.steps[-1].time, 1.5, rtol=1e-14)
+    grid = [s.time for s in bar.steps if abs(s.time / 0.02 - round(s.time / 0.02)) < 1e-9]
+    assert len(grid) == 75
+
+
+# ---------------------------------------------------------------------------------------------- tunnelling
+
+
+def bullet(comm=COMM, size=0.05):
+    """A small block that flies with velocity 100 towards a thin plate that is held at its ends."""
+    plate = box("quadrilateral", [-1.0, -0.1], [1.0, 0.0], [20, 2])
+    block = box("quadrilateral", [0.013, 1.0], [0.013 + size, 1.0 + size], [4, 4])
+    s = scene(comm, "quadrilateral", [plate, block])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, w, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+    X = V.tabulate_dof_coordinates()
+    velocity.x.array.reshape(-1, 2)[:, 1] = np.where(X[: len(velocity.x.array) // 2, 1] > 0.5, -100.0, 0.0)
+    surface = s.tag("plate", 0, lambda x: np.isclose(x[:, 1], 0.0) | np.isclose(x[:, 1], -0.1))
+    ends = s.tag("ends", 0, lambda x: np.isclose(np.abs(x[:, 0]), 1.0))
+    contact = uem.Contact(s.tag("tip", 1, at(1, 1.0)), surface)
+    material = uem.StVenantKirchhoff(1e6, 0.3, kind="plane_strain")
+    problem = uem.UnitedProblem(
+        material.residual(u, w) * ufl.dx, u, bcs=clamp(V, ends), contacts=[contact],
+        dynamics=uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity),
+    )  # fmt: skip
+    return problem, contact, X
+
+
+def test_no_step_jumps_through_a_plate():
+    """A step of ten times the plate's thickness would end behind it; it is shortened until the block is stopped."""
+    problem, contact, X = bullet()
+    lowest, cuts, touched = 0.0, 0, False
+    for step in uem.time_steps(problem, 0.02, 0.06):
+        cuts += step.cuts
+        touched |= bool(step.touched)
+        block = X[: problem.config.n_owned, 1] > 0.5
+        y = problem.config.x[: problem.config.n_owned, 1][block]
+        lowest = min(COMM.allgather(float(y.min(initial=np.inf))) + [lowest])
+    assert touched and cuts > 0
+    assert lowest > -0.5
+
+
+def test_a_passage_that_no_step_resolves_is_named(monkeypatch):
+    """Where steps may not be shortened far enough the error names contact and contactor, and the last good state is kept."""
+    from uem_dolfinx import steps
+
+    monkeypatch.setattr(steps, "SHORTEST_STEP", 0.9)
+    problem, contact, _ = bullet()
+    with pytest.raises(uem.TunnellingError, match="tip on plate: the contactor at .* passes through the target within a step"):
+        list(uem.time_steps(problem, 0.02, 0.06))
+    assert problem.dynamics.time == 0.0 and not problem.u.x.array.any()
+
+
+# ---------------------------------------------------------------------------------------------- ranks, and what is refused
+
+
+def test_ranks_see_the_same_motion():
+    """Positions and forces of two colliding bodies on all ranks, and on one alone."""
+    found = []
+    for comm in (COMM, MPI.COMM_SELF):
+        low = box("quadrilateral", [0.0, 0.0], [2.0, 1.0], [8, 4])
+        high = box("quadrilateral", [0.43, 1.1], [1.27, 1.9], [5, 5])
+        s = scene(comm, "quadrilateral", [low, high])
+        V = compat.function_space(s.mesh, 1, (2,))
+        u, w = fem.Function(V), ufl.TestFunction(V)
+        material = uem.StVenantKirchhoff(100.0, 0.3, kind="plane_strain")
+        contact = uem.Contact(s.tag("tip", 1, at(1, 1.1)), s.tag("top", 0, at(1, 1.0)))
+        dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.0, 0.0), gravity=(0.2, -10.0))
+        problem = uem.UnitedProblem(
+            material.residual(u, w) * ufl.dx, u, bcs=clamp(V, s.tag("base", 0, at(1, 0.0))), contacts=[contact],
+            dynamics=dynamics, rtol=1e-11,
+        )  # fmt: skip
+        rows = [[*contact.resultant().force, *dynamics.momentum()] for _ in uem.time_steps(problem, 0.01, 0.4)]
+        found.append(np.array(rows))
+    assert found[0][:, 1].max() > 1.0
+    assert np.allclose(*found, rtol=1e-7, atol=1e-7 * np.abs(found[1]).max())
+
+
+def test_statics_has_no_mass():
+    bar = Bar(10, wall=False, held=True)
+    static = uem.UnitedProblem(
+        uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(bar.u, ufl.TestFunction(bar.V)) * ufl.dx, bar.u,
+        bcs=clamp(bar.V, bar.tip),
+    )  # fmt: skip
+    with pytest.raises(uem.SpaceError, match="time steps need inertia"):
+        next(uem.time_steps(static, 0.1, 1.0))
+    with pytest.raises(uem.SpaceError, match="energy book needs inertia"):
+        uem.EnergyBook(static)
+
+
+def test_what_is_refused():
+    bar = Bar(4)
+    with pytest.raises(ValueError, match="contactors = 'none'"):
+        uem.Dynamics(bar.dynamics.mass, contactors="none")
+    for wrong in ({"dt": 0.0}, {"dt": -1.0}, {"dt": 0.1, "event_tolerance": 2.0}):
+        with pytest.raises(ValueError, match="expected dt > 0"):
+            next(uem.time_steps(bar.problem, end=1.0, **wrong))
+    with pytest.raises(uem.SpaceError, match="make the mass with the function space"):
+        Bar(4, mass=lambda V, rho: uem.lumped_mass(Bar(5).V, rho))
+    with pytest.raises(uem.NotFiniteError, match="velocity at the start"):
+        Bar(4, v=np.nan)
+    with pytest.raises(ValueError, match="gravity"):
+        Bar(4, gravity=(1.0,))
+
+
+def test_a_body_without_mass_is_held_by_others():
+    """A massless block between a heavy one and the ground is a spring: the heavy one swings on it with a known frequency."""
+    low = box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [4, 4])
+    high = box("quadrilateral", [0.0, 1.0], [1.0, 2.0], [2, 2])
+    s = scene(COMM, "quadrilateral", [low, high])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, w = fem.Function(V), ufl.TestFunction(V)
+    density, E = (fem.Function(compat.dg0_space(s.mesh)) for _ in range(2))
+    middle = compat.dg0_space(s.mesh).tabulate_dof_coordinates()[:, 1]
+    density.x.array[:] = np.where(middle[: len(density.x.array)] > 1, 1.0, 0.0)
+    E.x.array[:] = np.where(middle[: len(density.x.array)] > 1, 1e6, 100.0)
+    contact = uem.Contact(s.tag("tip", 0, at(1, 1.0)), s.tag("bottom", 1, at(1, 1.0)))
+    dynamics = uem.Dynamics(uem.lumped_mass(V, density), velocity=(0.0, -1.0))
+    F = uem.LinearElastic(E, 0.0, kind="plane_stress").residual(u, w) * ufl.dx
+    problem = uem.UnitedProblem(F, u, bcs=clamp(V, s.tag("base", 0, at(1, 0.0))), contacts=[contact], dynamics=dynamics)
+    f = np.array([(step.time, contact.resultant(on="target").force[1]) for step in uem.time_steps(problem, 0.002, 0.25)])
+    # a quarter of a swing, while the spring is pressed
+    assert np.allclose(f[:, 1], 10.0 * np.sin(10.0 * f[:, 0]), atol=0.02)

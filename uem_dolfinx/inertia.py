@@ -1,0 +1,317 @@
+"""Inertia: velocities, accelerations and the forces they make, by Newmark's rule or the generalised-alpha method.
+
+It turns a static residual into a dynamic one: the solver adds its forces to the residual and its multiple of M to K.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.log import logger, timed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import ufl
+    from ufl.core.expr import Expr
+
+    from uem_dolfinx.mass import Mass
+    from uem_dolfinx.restriction import Restriction
+    from uem_dolfinx.surfaces import Configuration
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How displacement, velocity and acceleration of a step belong together.
+
+    With G the static residual without contact forces, a step from n to n + 1 of length dt obeys
+
+        (1 - alpha_f) G(n+1) + alpha_f G(n) + M ((1 - alpha_m) a(n+1) + alpha_m a(n)) = contact forces, averaged likewise
+        u(n+1) = u(n) + dt v(n) + dt^2 ((1/2 - beta) a(n) + beta a(n+1))
+        v(n+1) = v(n) + dt ((1 - gamma) a(n) + gamma a(n+1))
+
+    Contact conditions hold at n + 1.
+    """
+
+    beta: float
+    gamma: float
+    alpha_m: float = 0.0
+    alpha_f: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.beta > 0.0 and self.gamma >= 0.5):
+            raise ValueError(
+                f"beta = {self.beta:g}, gamma = {self.gamma:g}: beta must be positive, since contact needs an implicit rule, and gamma "
+                "at least 1/2, since less makes every motion grow"
+            )
+
+
+def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:
+    """Newmark's rule; by default the trapezoidal rule, which keeps the energy of linear bodies [UEM, 5].
+
+    Args:
+        beta: weight of the new acceleration in the displacement.
+        gamma: the same in the velocity; more than 1/2 damps, at the price of first order.
+
+    Raises:
+        ValueError: if beta is not positive or gamma below 1/2.
+    """
+    return Scheme(beta, gamma)
+
+
+def generalised_alpha(rho_inf: float) -> Scheme:
+    """Second-order rule that damps what the step cannot resolve (Chung and Hulbert, J. Appl. Mech. 60, 1993, 371-375).
+
+    Args:
+        rho_inf: what a step leaves of the fastest motions, from 0 to 1 (none lost).
+
+    Raises:
+        ValueError: if ``rho_inf`` is not between 0 and 1.
+    """
+    if not 0.0 <= rho_inf <= 1.0:
+        raise ValueError(f"rho_inf = {rho_inf:g}: expected the part of the fastest motions that a step keeps, from 0 to 1")
+    alpha_m, alpha_f = (2 * rho_inf - 1) / (rho_inf + 1), rho_inf / (rho_inf + 1)
+    return Scheme((1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, alpha_m, alpha_f)
+
+
+class Dynamics:
+    """What a problem needs to move in time; hand it to ``UnitedProblem`` and step by ``time_steps``.
+
+    Args:
+        mass: of all bodies; bodies without mass are allowed where others or supports hold them.
+        scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``.
+        velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
+        gravity: acceleration of free fall ``(gdim,)``; every node weighs what its mass does, so that free fall strains nothing.
+        damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual.
+        contactors: ``"massless"`` hands the contactors' mass on to the nodes around, so that impact itself loses no energy
+            [UEM, 5]; ``"massy"`` leaves it.
+        time: at the start.
+
+    Attributes:
+        velocity: a Function; at components without mass it is the mean over the last step.
+        acceleration: a Function; zero at components without mass.
+        time: of the committed state.
+        start: time at the start.
+    """
+
+    velocity: fem.Function
+    acceleration: fem.Function
+
+    def __init__(
+        self,
+        mass: Mass,
+        *,
+        scheme: Scheme | None = None,
+        velocity: fem.Function | npt.ArrayLike | None = None,
+        gravity: npt.ArrayLike | None = None,
+        damping: Callable[[Expr], ufl.Form] | None = None,
+        contactors: str = "massless",
+        time: float = 0.0,
+    ):
+        if contactors not in ("massless", "massy"):
+            raise ValueError(f"contactors = '{contactors}': expected 'massless' or 'massy'")
+        self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
+        self.time = self.start = self._until = float(time)
+        self.start_velocity, self.gravity = velocity, gravity
+        #: Factor of M in the tangent.
+        self.factor = 0.0
+        #: Whether the acceleration fits the forces yet.
+        self.accelerated = False
+
+    # -- set-up ------------------------------------------------------------------------------------------------------
+
+    def attach(self, config: Configuration) -> ufl.Form | None:
+        """Take in the problem's displacement; returns the damping form (collective).
+
+        Raises:
+            SpaceError: if mass or velocity belong to another space.
+            NotFiniteError: if the velocity or gravity is not finite.
+            ValueError: if they have the wrong shape.
+        """
+        self.config, g = config, config.gdim
+        self._n = g * config.n_owned
+        wanted = self._n, g * config.index_map.size_global
+        if tuple(self.mass.M.getSizes()[0]) != wanted:
+            raise SpaceError(
+                f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
+                "function space of the displacement"
+            )
+        self.velocity = fem.Function(config.V, name="velocity")
+        self.acceleration = fem.Function(config.V, name="acceleration")
+        self._set_velocity()
+        down = np.zeros(g) if self.gravity is None else np.asarray(self.gravity, dtype=float)
+        if down.shape != (g,) or not np.isfinite(down).all():
+            raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
+        self._down = down
+        self._u = np.array(config.u.x.array)
+        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+        #: Inertia forces of the committed state, which balance all others.
+        self.forces = fem.Function(config.V)
+        self._moving = False
+        #: Virtual work of the damping forces.
+        self.damping_form: ufl.Form | None = None
+        if self.damping is not None:
+            self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
+            self._past.x.array[:] = self.velocity.x.array
+            self.damping_form = self.damping(self._rate * config.u + self._past)
+        return self.damping_form
+
+    def _set_velocity(self) -> None:
+        v, g = self.start_velocity, self.config.gdim
+        if isinstance(v, fem.Function):
+            if v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array):
+                raise SpaceError("the velocity belongs to another space: make it with the function space of the displacement")
+            self.velocity.x.array[:] = v.x.array
+        elif v is not None:
+            if np.shape(v) != (g,):
+                raise ValueError(f"velocity = {v!r}: expected a Function of the displacement's space or {g} numbers")
+            self.velocity.x.array.reshape(-1, g)[:] = v
+        if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
+            raise NotFiniteError("the velocity at the start holds NaN or infinity")
+
+    def weigh(self, contactors: npt.NDArray[np.int32]) -> None:
+        """Take the mass of the contactors, this rank's nodes ``(n,)``, or warn that they keep it (collective).
+
+        Raises:
+            MassError: if the nodes around cannot carry it.
+        """
+        massy = int(self.config.comm.allreduce(int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
+        if massy and self.contactors == "massless":
+            self.mass = self.mass.without(contactors)
+        elif massy:
+            logger.warning(
+                "%d contactors have mass: impact will set them in vibration, and the trapezoidal rule then adds energy at every touch; "
+                "contactors='massless' avoids both",
+                massy,
+            )
+        #: Components that have mass, of the owned nodes ``(n_owned, gdim)``.
+        self.massy: Bools = self.mass.of_nodes > 0
+        self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
+
+    def _like(self, values: Array) -> PETSc.Vec:
+        vector = self.mass.M.createVecRight()
+        vector.array[:] = np.ravel(values)
+        return vector
+
+    # -- what the residual and the tangent get -----------------------------------------------------------------------
+
+    def begin(self, dt: float) -> None:
+        """Begin a step of length ``dt`` from the committed state."""
+        s = self.scheme
+        u, v, a = self._u, self._velocity, self._acceleration
+        self._until, self._moving = self.time + dt, True
+        # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
+        self._a_rate = 1.0 / (s.beta * dt**2)
+        self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
+        self._v_rate = s.gamma * dt * self._a_rate
+        self._v_past = v + dt * ((1.0 - s.gamma) * a + s.gamma * self._a_past)
+        self.factor = (1.0 - s.alpha_m) / (1.0 - s.alpha_f) * self._a_rate
+        if self.damping is not None:
+            self._rate.value = self._v_rate
+            self._past.x.array[:] = self._v_past - self._v_rate * u
+
+    def load(self) -> PETSc.Vec:
+        """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
+        load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
+        load.axpy(-1.0, self._weight)
+        return load
+
+    @property
+    def _increment(self) -> Array:
+        """How far the step has come ``(n_local incl. ghosts,)``."""
+        return np.asarray(self.config.u.x.array - self._u)
+
+    def _inertia(self) -> PETSc.Vec:
+        """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
+        s, n = self.scheme, self._n
+        a = (1.0 - s.alpha_m) * (self._a_rate * self._increment + self._a_past) + s.alpha_m * self._acceleration
+        inertia = self.mass.M * self._like(a[:n])
+        if s.alpha_f:
+            inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
+        inertia.scale(1.0 / (1.0 - s.alpha_f))
+        return inertia
+
+    # -- state -------------------------------------------------------------------------------------------------------
+
+    def accelerate(self, restriction: Restriction, F: PETSc.Vec) -> None:
+        """Acceleration at the start, of united bodies under the forces ``-F``: ``P'MP a = -P'F`` (collective).
+
+        Args:
+            restriction: of the contactors that touch at the start; c is not used.
+            F: static residual minus weight.
+
+        Raises:
+            LinearSolveError: if the masses are negative.
+        """
+        M = self.mass.M.PtAP(restriction.P)
+        rhs = restriction.reduce(restriction.pass_on(F))
+        diagonal = M.getDiagonal()
+        idle = diagonal.array_r <= 1e-12 * diagonal.max()[1]
+        diagonal.array[idle] = 1.0
+        M.setDiagonal(diagonal)
+        rhs.array[idle] = 0.0
+        ksp = PETSc.KSP().create(self.config.comm)
+        ksp.setType("cg")
+        ksp.getPC().setType("jacobi")
+        ksp.setTolerances(rtol=1e-13, max_it=10_000)
+        ksp.setOperators(M)
+        q = rhs.duplicate()
+        with timed("first acceleration"):
+            ksp.solve(-rhs, q)
+        if ksp.getConvergedReason() < 0:
+            raise LinearSolveError(
+                f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
+            )
+        a = restriction.expand(q)
+        self.acceleration.x.array[: self._n] = a.array_r * self.massy.ravel()
+        self.acceleration.x.scatter_forward()
+        self._acceleration = np.array(self.acceleration.x.array)
+        inertia = self.mass.M * self._like(self._acceleration[: self._n])
+        self.forces.x.array[: self._n] = inertia.array_r
+        self.forces.x.scatter_forward()
+        self.accelerated = True
+
+    def commit(self) -> None:
+        """Keep velocity and acceleration that belong to the present displacement."""
+        if self._moving:
+            n, dt = self._n, self._until - self.time
+            du, massy = self._increment[:n], self.massy.ravel()
+            self.forces.x.array[:n] = self._inertia().array_r
+            self.acceleration.x.array[:n] = np.where(massy, self._a_rate * du + self._a_past[:n], 0.0)
+            # what has no mass has no velocity of its own
+            self.velocity.x.array[:n] = np.where(massy, self._v_rate * du + self._v_past[:n], du / dt)
+            for field in (self.forces, self.acceleration, self.velocity):
+                field.x.scatter_forward()
+            self.time, self._moving = self._until, False
+        self.remember()
+
+    def remember(self) -> None:
+        """Take displacement, velocity and acceleration as they are for the start of the next step."""
+        self._u = np.array(self.config.u.x.array)
+        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+
+    def weight(self) -> PETSc.Vec:
+        """Forces of gravity."""
+        return self._weight.copy()
+
+    def momentum(self) -> Array:
+        """Momentum ``(gdim,)`` (collective)."""
+        p = self.mass.M * self._like(self.velocity.x.array[: self._n])
+        total = p.array_r.reshape(-1, self.config.gdim).sum(axis=0)
+        return np.asarray(self.config.comm.allreduce(total))
+
+    def kinetic_energy(self) -> float:
+        """``v'Mv / 2`` (collective)."""
+        v = self._like(self.velocity.x.array[: self._n])
+        return 0.5 * float(v.dot(self.mass.M * v))

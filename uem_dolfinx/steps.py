@@ -1,0 +1,253 @@
+"""Load steps and time steps: how a problem is led from state to state, shortened on failure and at instants of contact.
+
+Ninth step on the data's way; a step is committed when it has converged, and a run that fails keeps its last good state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx.checks import check_tunnelling
+from uem_dolfinx.errors import (
+    ConvergenceError,
+    InvertedElementError,
+    LinearSolveError,
+    NotFiniteError,
+    SpaceError,
+    TunnellingError,
+)
+from uem_dolfinx.log import logger
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from uem_dolfinx.newton import Iteration
+    from uem_dolfinx.problem import UnitedProblem
+
+#: A step may be cut to this part of its nominal length.
+SHORTEST_STEP = 1.0 / 1024
+#: A step that needs no more iterations than this is easy: the next one may be longer again.
+EASY = 6
+#: A remainder of a step below this part of it is rounding.
+NOTHING = 1e-9
+#: What a shorter step may mend.
+MENDABLE = (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError)
+
+
+@dataclass(frozen=True)
+class LoadStep:
+    """A converged load step.
+
+    Attributes:
+        number: counted from 1.
+        factor: load factor reached, 1 at the end.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+    """
+
+    number: int
+    factor: float
+    iterations: list[Iteration]
+    cuts: int
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of linear solves."""
+        return len(self.iterations) - 1
+
+
+def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
+    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length.
+
+    Args:
+        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
+        steps: nominal number of equal steps.
+
+    Yields:
+        Every converged step.
+
+    Raises:
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+    """
+    nominal = 1.0 / steps
+    length, done, last, number, cuts = nominal, 0.0, 0.0, 0, 0
+    start = np.array(problem.u.x.array)
+    while done < 1.0:
+        factor = min(done + length, 1.0)
+        if 1.0 - factor < NOTHING:
+            factor = 1.0
+        fraction = _apply_load(problem, factor)
+        try:
+            iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
+        except MENDABLE as error:
+            cuts += 1
+            length *= 0.5
+            if length < SHORTEST_STEP * nominal:
+                _apply_load(problem, done)
+                # the targets that the load moves are back, too
+                problem.restore()
+                raise
+            logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
+            continue
+        last, done, number = factor - done, factor, number + 1
+        yield LoadStep(number, factor, iterations, cuts)
+        cuts = 0
+        if len(iterations) - 1 <= EASY:
+            length = min(2.0 * length, nominal)
+
+
+def _apply_load(problem: UnitedProblem, factor: float) -> float:
+    """Set the load; returns how far the Dirichlet values are to be ramped."""
+    if callable(problem.load) and not isinstance(problem.load, fem.Constant):
+        problem.load(factor)
+        return 1.0
+    if problem.load is not None:
+        problem.load.value = factor
+    return factor
+
+
+@dataclass(frozen=True)
+class TimeStep:
+    """A converged time step.
+
+    Attributes:
+        number: counted from 1.
+        time: reached.
+        dt: length of the step.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+        touched: names of the contacts that had no active contactor before the step and have one now.
+        left: names of those that had one and have none now.
+    """
+
+    number: int
+    time: float
+    dt: float
+    iterations: list[Iteration]
+    cuts: int
+    touched: tuple[str, ...]
+    left: tuple[str, ...]
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of linear solves."""
+        return len(self.iterations) - 1
+
+    @property
+    def start(self) -> float:
+        """Time at which the step began; with ``event_tolerance`` the instant of the touches and departures in it."""
+        return self.time - self.dt
+
+
+def time_steps(problem: UnitedProblem, dt: float, end: float, *, event_tolerance: float | None = None) -> Iterator[TimeStep]:
+    """Step through time, with steps that end at multiples of ``dt`` after the start.
+
+    A step is halved when it does not converge, or when a contactor would pass through a target within it, and grown again on ease.
+
+    Args:
+        problem: with ``dynamics``; its ``load`` is called with the time.
+        dt: nominal length of the steps.
+        end: time to reach.
+        event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``: the step is parted there,
+            so that a step begins at the instant. None leaves steps as they are.
+
+    Yields:
+        Every converged step.
+
+    Raises:
+        ValueError: if ``dt`` is not positive or ``event_tolerance`` not between 0 and 1.
+        SpaceError: if the problem has no dynamics.
+        TunnellingError: if a contactor passes through a target even in the shortest step.
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+    """
+    dynamics = problem.dynamics
+    if dynamics is None:
+        raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
+    if not dt > 0.0 or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
+        raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
+    _set_time(problem, dynamics.time)
+    problem.system.accelerate()
+    number, cuts, longest = 0, 0, dt
+    before = _touching(problem)
+    while (remainder := end - dynamics.time) > NOTHING * dt:
+        # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
+        passed = (dynamics.time - dynamics.start) / dt
+        rest = min((np.floor(passed + NOTHING) + 1.0 - passed) * dt, remainder)
+        length = min(longest, dt if abs(rest - dt) <= NOTHING * dt else rest)
+        try:
+            length, iterations = _step(problem, length, before, event_tolerance and event_tolerance * dt)
+        except MENDABLE as error:
+            _set_time(problem, dynamics.time)
+            problem.restore()
+            cuts, longest = cuts + 1, 0.5 * length
+            if longest < SHORTEST_STEP * dt:
+                raise
+            logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, longest)
+            continue
+        problem.commit()
+        nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
+        if abs(dynamics.time - nearest) <= NOTHING * dt:
+            dynamics.time = float(nearest)
+        after, number = _touching(problem), number + 1
+        yield TimeStep(
+            number,
+            dynamics.time,
+            length,
+            iterations,
+            cuts,
+            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if now and not was),
+            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if was and not now),
+        )
+        before, cuts = after, 0
+        if len(iterations) - 1 <= EASY:
+            longest = min(2.0 * longest, dt)
+
+
+def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
+    """Attempt a step, or the part of it before the first touch or departure: its length and history (collective)."""
+    iterations = _attempt(problem, length)
+    if tolerance is None or length <= tolerance or _touching(problem) == before:
+        return length, iterations
+    # the first trial asks whether the step begins at the instant
+    low, high, trial = 0.0, length, tolerance
+    while high - low > tolerance:
+        problem.restore()
+        try:
+            _attempt(problem, trial)
+            same = _touching(problem) == before
+        except MENDABLE:
+            same = False
+        low, high = (trial, high) if same else (low, trial)
+        trial = 0.5 * (low + high)
+    problem.restore()
+    length = low or length
+    return length, _attempt(problem, length)
+
+
+def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
+    """Find the state at the end of a step of this length (collective)."""
+    assert problem.dynamics is not None
+    problem.dynamics.begin(length)
+    _set_time(problem, problem.dynamics.time + length)
+    iterations = problem.attempt()
+    check_tunnelling(problem.system, problem.committed)
+    return iterations
+
+
+def _touching(problem: UnitedProblem) -> list[bool]:
+    """Which contacts have active contactors (collective)."""
+    return [contact.n_active > 0 for contact in problem.contacts]
+
+
+def _set_time(problem: UnitedProblem, time: float) -> None:
+    """Set loads and Dirichlet values of an instant."""
+    if isinstance(problem.load, fem.Constant):
+        problem.load.value = time
+    elif problem.load is not None:
+        problem.load(time)
