@@ -26,6 +26,7 @@ import numpy as np
 import ufl
 from common import comm
 from dolfinx import fem
+from dolfinx.mesh import locate_entities_boundary
 from petsc4py import PETSc
 from scipy.interpolate import CubicHermiteSpline
 
@@ -85,8 +86,8 @@ mesh, tags = uem.read_gmsh(
 V = compat.function_space(mesh, 1, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 law = uem.VonMises(u, k * L / width, 0.3, Fy, kind="plane_stress", strain="green_lagrange")
-left = fem.locate_dofs_geometrical((V.sub(0), V.sub(0).collapse()[0]), lambda x: np.isclose(x[0], -width / 2))
-bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), left[0], V.sub(0))]
+left = locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[0], -width / 2))
+bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), fem.locate_dofs_topological(V.sub(0), 1, left), V.sub(0))]
 mass = uem.nodal_mass(V, lambda x: np.where(x[:, 1] > L / 2, 0.5, 0.0)[:, None] * [0.0, 1.0])
 ground = uem.Contact(contactor=tags["lower_bottom"], target=uem.RigidPlane((0.0, 0.0), (0.0, 1.0)), name="ground")
 problem = uem.UnitedProblem(
@@ -100,7 +101,7 @@ problem = uem.UnitedProblem(
 # used up, and the mass turns where its velocity vanishes: both within a step, by the cubic through its ends.
 
 # %%
-top = fem.locate_dofs_geometrical((V.sub(1), V.sub(1).collapse()[0]), lambda x: x[1] > L / 2)[0]
+top = fem.locate_dofs_topological(V.sub(1), 1, tags["lower_top"].entities)
 top = top[top < 2 * V.dofmap.index_map.size_local]
 
 

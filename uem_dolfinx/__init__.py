@@ -6,9 +6,11 @@ du = P dq + c,    P'KP dq = P'(r - K c)
 from __future__ import annotations
 
 from uem_dolfinx import compat as _compat
+from uem_dolfinx.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.contact import Balance, Contact, Resultant
 from uem_dolfinx.energy import Energies, EnergyBook
 from uem_dolfinx.errors import (
+    CheckpointError,
     ConflictError,
     ConvergenceError,
     FloatingBodyError,
@@ -36,4 +38,5 @@ from uem_dolfinx.plasticity import VonMises
 from uem_dolfinx.problem import UnitedProblem
 from uem_dolfinx.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
+from uem_dolfinx.state import State
 from uem_dolfinx.steps import LoadStep, TimeStep, load_steps, time_steps

@@ -104,6 +104,18 @@ def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
     return _cell_table(domain, dofmap)
 
 
+def original_cells(domain: Any) -> npt.NDArray[np.int64]:
+    """Number of every cell in the mesh's input.
+
+    Args:
+        domain: the mesh.
+
+    Returns:
+        Global input index, shape ``(n_cells incl. ghosts,)``; empty for a mesh that was made from another one.
+    """
+    return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+
+
 def vertex_nodes(domain: Any) -> npt.NDArray[np.int32]:
     """Geometry node of every vertex.
 
@@ -300,6 +312,30 @@ def lagrange_degree(V: Any) -> int | None:
     except (AttributeError, NotImplementedError):
         return None
     return int(element.degree) if lagrange else None
+
+
+def element_family(V: Any) -> tuple[str, int] | None:
+    """Which nodes or points a space has in a cell, for the spaces whose values are values at points.
+
+    Args:
+        V: a scalar, vector or tensor function space.
+
+    Returns:
+        ``"Lagrange"``, ``"Discontinuous Lagrange"`` or ``"Quadrature"``, and the degree; None if the space is anything else.
+    """
+    element = V.ufl_element()
+    if callable(getattr(element, "family", None)):
+        family = "Lagrange" if element.family() == "Q" else str(element.family())
+        family = "Discontinuous Lagrange" if family == "DQ" else family
+        return (family, int(element.degree())) if family in ("Lagrange", "Discontinuous Lagrange", "Quadrature") else None
+    try:
+        if element.has_custom_quadrature:
+            return "Quadrature", int(element.embedded_superdegree)
+        if element.element_family != basix.ElementFamily.P:
+            return None
+        return "Discontinuous Lagrange" if element.discontinuous else "Lagrange", int(element.degree)
+    except (AttributeError, NotImplementedError, ValueError):
+        return None
 
 
 def create_lagrange_element(cell: str, degree: int) -> Any:

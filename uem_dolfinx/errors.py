@@ -81,6 +81,12 @@ class LinearSolveError(UEMError, RuntimeError):
     """PETSc reports that the linear solver failed."""
 
 
+class CheckpointError(UEMError, OSError):
+    """A checkpoint cannot be written, or is missing, damaged, or of another run."""
+
+    __str__ = Exception.__str__
+
+
 class ConvergenceError(UEMError, RuntimeError):
     """The united Newton loop did not converge; the committed state has been restored.
 

@@ -210,6 +210,10 @@ class FloatingBodies:
         self._pins = motions, pins
         return pins
 
+    def release(self) -> None:
+        """Let the supports be chosen anew: a step must not depend on how those before it were found."""
+        self._pins = None
+
     def reach(self, nudge: bool) -> float:
         """How far the loads last asked for take a body, a length.
 

@@ -6,7 +6,7 @@ It turns a static residual into a dynamic one: the solver adds its forces to the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -103,6 +103,8 @@ class Dynamics:
         acceleration: a Function; zero at components without mass.
         time: of the committed state.
         start: time at the start.
+        number: of steps done.
+        longest: bound on the length of the next step, after steps that had to be cut.
     """
 
     velocity: fem.Function
@@ -124,6 +126,7 @@ class Dynamics:
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
+        self.number, self.longest = 0, np.inf
         #: Factor of M in the tangent.
         self.factor = 0.0
         #: Whether the acceleration fits the forces yet.
@@ -300,6 +303,19 @@ class Dynamics:
         """Take displacement, velocity and acceleration as they are for the start of the next step."""
         self._u = np.array(self.config.u.x.array)
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the Functions."""
+        names = ("time", "start", "number", "longest", "accelerated")
+        return {name: getattr(self, name) for name in names}
+
+    def resume(self, numbers: dict[str, Any]) -> None:
+        """Go on from the Functions as they are and the numbers of a checkpoint."""
+        for name in self.numbers:
+            setattr(self, name, numbers[name])
+        self._until, self._moving = self.time, False
+        self.remember()
 
     def weight(self) -> PETSc.Vec:
         """Forces of gravity."""

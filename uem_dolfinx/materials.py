@@ -158,7 +158,13 @@ def green_lagrange(u: Any) -> Expr:
 
 
 class HistoryMaterial(Protocol):
-    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity."""
+    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity.
+
+    Attributes:
+        history: committed Functions that the stress depends on, by name.
+    """
+
+    history: dict[str, Any]
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
         """What the derivative of the residual lacks: the stress's change with the displacement."""

@@ -15,6 +15,7 @@ from uem_dolfinx.checks import check_prescribed
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.newton import Iteration, solve_united
 from uem_dolfinx.solver import UnitedSolver
+from uem_dolfinx.state import State
 from uem_dolfinx.surfaces import Configuration
 from uem_dolfinx.system import BodySystem
 
@@ -182,6 +183,41 @@ class UnitedProblem:
         for pair in self.system.pairs:
             pair.restore()
             pair.project()
+
+    def state(self) -> State:
+        """What a checkpoint keeps of the problem; read back, the next step is the one that would have come (collective).
+
+        Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
+        added must differ from those here.
+        """
+        before, stiffness = fem.Function(self.config.V), fem.Function(self.config.V)
+        functions = {"displacement": self.u, "displacement before": before, "stiffness": stiffness}
+        if self.dynamics is not None:
+            d = self.dynamics
+            functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
+        for i, material in enumerate(self.materials, 1):
+            functions |= {f"{name} {i}": f for name, f in material.history.items()}
+        state = State(self.config.mesh, functions, self.contacts)
+
+        def collect() -> None:
+            before.x.array[:] = self._last
+            known = self.system.keep_stiffness(stiffness)
+            # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
+            self.system.forget()
+            state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
+            if self.dynamics is not None:
+                state.numbers |= self.dynamics.numbers
+
+        def restore() -> None:
+            self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
+            self._largest_forces = state.numbers["largest forces"]
+            self.system.recall_stiffness(stiffness if state.numbers["stiffness known"] else None)
+            if self.dynamics is not None:
+                self.dynamics.resume(state.numbers)
+
+        state.collect.append(collect)
+        state.restore.append(restore)
+        return state
 
     def _deformation(self, du: np.ndarray) -> np.ndarray:
         """What an increment of the displacement holds besides rigid motions of bodies that only contact holds (collective)."""

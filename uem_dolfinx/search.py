@@ -211,6 +211,35 @@ class MeshTarget:
         own = _unit_normals_of(projection)
         return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
 
+    def keys_of(self, facet: Ints) -> Ints:
+        """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
+        owners = self._owners(facet)
+        asked = self.comm.alltoall([facet[i] for i in owners])
+        answers = self.comm.alltoall([self.facets.keys[a - self.first[self.comm.rank]] for a in asked])
+        keys = np.full(len(facet), -1, dtype=np.int64)
+        for i, answer in zip(owners, answers):
+            keys[i] = answer
+        return keys
+
+    def facets_of(self, keys: Ints) -> Ints:
+        """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""
+        size, mine = self.comm.size, self.facets.keys
+        number = self.first[self.comm.rank] + np.arange(len(mine))
+        # keys and numbers meet on a home rank
+        told = self.comm.alltoall([(mine[mine % size == r], number[mine % size == r]) for r in range(size)])
+        known, numbers = (np.concatenate(part) for part in zip(*told))
+        order = np.argsort(known)
+        known, numbers = np.append(known[order], -1), np.append(numbers[order], -1)
+        homes = [np.flatnonzero((keys >= 0) & (keys % size == r)) for r in range(size)]
+        found = []
+        for wanted in self.comm.alltoall([keys[i] for i in homes]):
+            at = np.searchsorted(known[:-1], wanted)
+            found.append(np.where(known[at] == wanted, numbers[at], -1))
+        facet = np.full(len(keys), -1, dtype=np.int64)
+        for i, answer in zip(homes, self.comm.alltoall(found)):
+            facet[i] = answer
+        return facet
+
     def _owners(self, facet: Ints) -> list[Ints]:
         """Per rank, which of the facets it holds."""
         owner = np.searchsorted(self.first, facet, side="right") - 1

@@ -82,20 +82,30 @@ class UnitedSolver:
         size = config.gdim * config.index_map.size_global
         self.options = default_options(size, config.gdim) if options is None else dict(options)
         check_options(self.options)
-        self.ksp = PETSc.KSP().create(config.comm)
-        self.ksp.setOptionsPrefix(prefix)
-        self.ksp.setErrorIfNotConverged(False)
-        with self._in_database():
-            self.ksp.setFromOptions()
+        self._prefix = prefix
+        self.ksp = self._create_ksp()
         self._key: object = None
         self._P: PETSc.Mat | None = None
         self.A: Any = None
-        self._modes: list[Array] | None = None
+
+    def _create_ksp(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.config.comm)
+        ksp.setOptionsPrefix(self._prefix)
+        ksp.setErrorIfNotConverged(False)
+        with self._in_database():
+            ksp.setFromOptions()
+        return ksp
+
+    def forget(self) -> None:
+        """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
+        self._key = self._P = self.A = None
+        self.ksp.destroy()
+        self.ksp = self._create_ksp()
 
     @contextmanager
     def _in_database(self) -> Iterator[None]:
         """Show PETSc the options; levels of a multigrid read theirs only when they are set up."""
-        database, prefix = PETSc.Options(), self.ksp.getOptionsPrefix()
+        database, prefix = PETSc.Options(), self._prefix
         for key, value in self.options.items():
             database[prefix + key] = value
         try:

@@ -20,11 +20,13 @@ from uem_dolfinx.errors import (
     SpaceError,
     TunnellingError,
 )
-from uem_dolfinx.log import logger
+from uem_dolfinx.log import logger, progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from uem_dolfinx.checkpoint import Checkpoint
+    from uem_dolfinx.inertia import Dynamics
     from uem_dolfinx.newton import Iteration
     from uem_dolfinx.problem import UnitedProblem
 
@@ -144,8 +146,15 @@ class TimeStep:
         return self.time - self.dt
 
 
-def time_steps(problem: UnitedProblem, dt: float, end: float, *, event_tolerance: float | None = None) -> Iterator[TimeStep]:
-    """Step through time, with steps that end at multiples of ``dt`` after the start.
+def time_steps(
+    problem: UnitedProblem,
+    dt: float,
+    end: float,
+    *,
+    event_tolerance: float | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Iterator[TimeStep]:
+    """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
 
     A step is halved when it does not converge, or when a contactor would pass through a target within it, and grown again on ease.
 
@@ -155,13 +164,16 @@ def time_steps(problem: UnitedProblem, dt: float, end: float, *, event_tolerance
         end: time to reach.
         event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``: the step is parted there,
             so that a step begins at the instant. None leaves steps as they are.
+        checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
+            either here or, for writers that are to resume, already by ``checkpoint.begin(problem.state())``.
 
-    Yields:
-        Every converged step.
+    Returns:
+        An iterator of converged steps.
 
     Raises:
         ValueError: if ``dt`` is not positive or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
+        CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
@@ -171,32 +183,44 @@ def time_steps(problem: UnitedProblem, dt: float, end: float, *, event_tolerance
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
     if not dt > 0.0 or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
         raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
+    if checkpoint is not None and not checkpoint.begun:
+        checkpoint.begin(problem.state())
+    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt, checkpoint)
+    return iter(progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt))))
+
+
+def _time_steps(
+    problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
+) -> Iterator[TimeStep]:
+    """The steps of ``time_steps``."""
     _set_time(problem, dynamics.time)
     problem.system.accelerate()
-    number, cuts, longest = 0, 0, dt
-    before = _touching(problem)
+    cuts, before = 0, _touching(problem)
     while (remainder := end - dynamics.time) > NOTHING * dt:
         # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
         passed = (dynamics.time - dynamics.start) / dt
         rest = min((np.floor(passed + NOTHING) + 1.0 - passed) * dt, remainder)
-        length = min(longest, dt if abs(rest - dt) <= NOTHING * dt else rest)
+        length = min(dynamics.longest, dt if abs(rest - dt) <= NOTHING * dt else rest)
         try:
-            length, iterations = _step(problem, length, before, event_tolerance and event_tolerance * dt)
+            length, iterations = _step(problem, length, before, tolerance)
         except MENDABLE as error:
             _set_time(problem, dynamics.time)
             problem.restore()
-            cuts, longest = cuts + 1, 0.5 * length
-            if longest < SHORTEST_STEP * dt:
+            cuts, dynamics.longest = cuts + 1, 0.5 * length
+            if dynamics.longest < SHORTEST_STEP * dt:
                 raise
-            logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, longest)
+            logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, dynamics.longest)
             continue
         problem.commit()
         nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
         if abs(dynamics.time - nearest) <= NOTHING * dt:
             dynamics.time = float(nearest)
-        after, number = _touching(problem), number + 1
+        if len(iterations) - 1 <= EASY:
+            dynamics.longest *= 2.0
+        dynamics.number += 1
+        after = _touching(problem)
         yield TimeStep(
-            number,
+            dynamics.number,
             dynamics.time,
             length,
             iterations,
@@ -205,8 +229,10 @@ def time_steps(problem: UnitedProblem, dt: float, end: float, *, event_tolerance
             tuple(c.name for c, was, now in zip(problem.contacts, before, after) if was and not now),
         )
         before, cuts = after, 0
-        if len(iterations) - 1 <= EASY:
-            longest = min(2.0 * longest, dt)
+        if checkpoint is not None:
+            checkpoint.step()
+    if checkpoint is not None:
+        checkpoint.finish()
 
 
 def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:

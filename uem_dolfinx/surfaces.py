@@ -215,16 +215,22 @@ class TargetFacets:
         f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
         n_cells = mesh.topology.index_map(tdim).size_local
         sides = [(c, int(np.flatnonzero(c2f.links(c) == f)[0])) for f in tag.entities for c in f2c.links(f) if c < n_cells]
-        self.cells, local = np.array(sides, dtype=np.int32).reshape(-1, 2).T
+        self.cells, self.sides = np.array(sides, dtype=np.int32).reshape(-1, 2).T
         self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
         cell_dofs = compat.cell_dofs(config.V)
         table = _facet_closure(config, self.shape)
-        self.dofs = cell_dofs[self.cells[:, None], table[local]]
+        self.dofs = cell_dofs[self.cells[:, None], table[self.sides]]
         self.nodes = config.to_global(self.dofs)
         self._refuse_inner()
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
         self.open_nodes = self._open_nodes()
+
+    @cached_property
+    def keys(self) -> Ints:
+        """What tells each facet from all others in any partition, its cell in the mesh's input and its side of it ``(m,)``."""
+        n_sides = len(compat.reference_topology(compat.cell_name(self.config.mesh))[self.config.tdim - 1])
+        return compat.original_cells(self.config.mesh)[self.cells] * n_sides + self.sides
 
     def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""

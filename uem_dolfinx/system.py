@@ -215,6 +215,8 @@ class BodySystem:
     def land(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch (collective)."""
         self._landing = self.floating is not None
+        if self.floating is not None:
+            self.floating.release()
         self.settle()
 
     def settle(self, fall: bool = True, nudge: bool = False) -> bool:
@@ -394,6 +396,26 @@ class BodySystem:
         """Diagonal of K at the owned nodes ``(n_owned, gdim)``."""
         return self._stiffness.array_r.reshape(-1, self.config.gdim)
 
+    def forget(self) -> None:
+        """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
+        self._factored = None
+        self.solver.forget()
+
+    def keep_stiffness(self, u: fem.Function) -> bool:
+        """Write the diagonal of K, by which forces are told from rounding, into a Function; whether it is known yet (collective)."""
+        if self._stiffness is None:
+            return False
+        u.x.array[: self._stiffness.getLocalSize()] = self._stiffness.array_r
+        u.x.scatter_forward()
+        return True
+
+    def recall_stiffness(self, u: fem.Function | None) -> None:
+        """Go on from a diagonal of K that was kept, None if none was known."""
+        self._stiffness = None
+        if u is not None:
+            self._stiffness = self._du_like()
+            self._stiffness.array[:] = u.x.array[: self._stiffness.getLocalSize()]
+
     def active_set(self) -> int:
         """Fingerprint of the active set, the same on all ranks."""
         return hash(tuple(self.comm.allgather(zlib.crc32(b"".join(pair.trial.united_to for pair in self.pairs)))))
@@ -448,6 +470,8 @@ class BodySystem:
             comm=self.comm,
         )
         G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+        # a rank without nodes would not be told, and then assemble otherwise than the others
+        G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
         for nodes, blocks in parts:
             for row, block in zip(nodes.astype(PETSc.IntType), blocks):
                 G.setValuesBlocked(row, row, block, addv=PETSc.InsertMode.ADD)

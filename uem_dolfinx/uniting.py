@@ -19,6 +19,8 @@ from uem_dolfinx.quadratic import ControlGaps
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from uem_dolfinx.surfaces import Configuration
 
 Array = npt.NDArray[np.float64]
@@ -522,3 +524,29 @@ class ContactPair:
         """Go back to the committed state."""
         self.trial = self.committed
         self._corners = None
+
+    def keep(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self._reserved, "redundant": self.redundant}
+        for when, state in (("committed", self.committed), ("last", self.last_commit)):
+            kept |= {f"{when}_{f.name}": getattr(state, f.name) for f in fields(state)}
+            if isinstance(self.target, MeshTarget):
+                for name in (f"{when}_facet", f"{when}_held"):
+                    kept[name] = self.target.keys_of(kept[name].ravel()).reshape(kept[name].shape)
+        return kept
+
+    def recall(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what ``keep`` returned, to be followed by ``project`` (collective)."""
+
+        def state(when: str) -> PairState:
+            arrays = {f.name: np.array(kept[f"{when}_{f.name}"]) for f in fields(PairState)}
+            if isinstance(self.target, MeshTarget):
+                for name in ("facet", "held"):
+                    arrays[name] = self.target.facets_of(arrays[name].ravel()).reshape(arrays[name].shape)
+            return PairState(**arrays)
+
+        self._reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
+        self.committed, self.last_commit = state("committed"), state("last")
+        if self.sliding == "small":
+            self._anchor = None
+        self.restore()
