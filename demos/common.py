@@ -92,5 +92,7 @@ def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
 
 
 def show(value: object) -> str:
-    """Short text of a number."""
+    """Short text of a number, or of several."""
+    if isinstance(value, list):
+        return ", ".join(map(show, value))
     return f"{value:.5g}" if isinstance(value, float) else str(value)

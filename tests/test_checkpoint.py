@@ -225,7 +225,15 @@ def random_state(pair, seed):
     facets = by_place[np.floor(0.499 * (1 + r[:, :g]) * len(by_place)).astype(int)]
     counts = np.floor(9 * np.abs(r[:, g : g + 2])).astype(int)
     return PairState(
-        r[:, g + 2] > 0, r[:, g + 3], r[:, g + 4], r[:, g + 5 :], facets[:, 0], facets[:, 1:], counts[:, 0], counts[:, 1]
+        r[:, g + 2] > 0,
+        r[:, g + 3],
+        r[:, g + 4],
+        r[:, g + 5 :],
+        facets[:, 0],
+        facets[:, 1:],
+        counts[:, 0],
+        counts[:, 1],
+        r[:, 0] > 0,
     )
 
 

@@ -166,8 +166,15 @@ def test_damping_form(rate):
 # ---------------------------------------------------------------------------------------------- impact
 
 
-@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron", "triangle"])
-@pytest.mark.parametrize("mass", [uem.lumped_mass, uem.consistent_mass])
+@pytest.mark.parametrize(
+    ("cell", "mass"),
+    [
+        ("quadrilateral", uem.lumped_mass),
+        ("quadrilateral", uem.consistent_mass),
+        ("hexahedron", uem.consistent_mass),
+        ("triangle", uem.lumped_mass),
+    ],
+)
 def test_bar_hits_wall(cell, mass):
     """Pressure 300 from 0.5 to 1.1667 and rebound with the velocity of the impact; energy and momentum kept."""
     bar = Bar(100, cell=cell, mass=mass)

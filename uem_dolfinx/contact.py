@@ -59,17 +59,19 @@ class Contact:
     """A contactor surface that may touch a target.
 
     Args:
-        contactor: facets whose nodes are the contactors.
+        contactor: facets whose nodes are the contactors, or points, which have forces but no pressures.
         target: facets of the other body, or a rigid surface.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
+        thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
+            than this lies behind the body, not in it. None takes the body to have no back.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
 
     Raises:
-        ValueError: for an unknown word.
+        ValueError: for an unknown word, or a thickness that is not positive.
     """
 
     def __init__(
@@ -80,14 +82,17 @@ class Contact:
         sliding: str = "finite",
         normals: str = "facet",
         max_penetration: float | None = None,
+        thickness: float | None = None,
         chords: bool = False,
         name: str | None = None,
     ):
         for value, known in ((sliding, ("finite", "small", "fixed")), (normals, ("facet", "averaged"))):
             if value not in known:
                 raise ValueError(f"'{value}' is not known here: expected one of {', '.join(known)}")
+        if thickness is not None and not thickness > 0.0:
+            raise ValueError(f"thickness = {thickness}: expected a positive length, or None")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
-        self.max_penetration, self.chords = max_penetration, chords
+        self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
         target_name = getattr(target, "name", type(target).__name__)
         self.name = name or f"{contactor.name} on {target_name}"
         self._pair: ContactPair | None = None
@@ -97,7 +102,7 @@ class Contact:
         """Build the pair of this contact in a problem (collective).
 
         Raises:
-            TagError: if a tag is empty or not of facets.
+            TagError: if a tag is empty or of the wrong dimension.
             SpaceError: if a tag belongs to another mesh.
             SurfaceError: if contactor and target share nodes.
             OrientationError: if a target facet lies inside a body.
@@ -121,6 +126,7 @@ class Contact:
             name=self.name,
             sliding=self.sliding,
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
+            thickness=np.inf if self.thickness is None else self.thickness,
             chords=self.chords and config.degree == 2,
         )
         self._system = system

@@ -174,8 +174,10 @@ def read_gmsh(
         sizes = np.array([len(tag.entities) for tag in tags], dtype=np.int64)
         result = Tags(tags, comm.allreduce(sizes))
     logger.info("%s: %d %s cells of degree %d, %r", _label(source), comm.allreduce(len(cells)), cell, degree, result)
-    # what locating d.o.f. of facets needs, and newer DOLFINx no longer builds by itself
-    mesh.topology.create_connectivity(mesh.topology.dim - 1, mesh.topology.dim)
+    # what locating d.o.f. of tags needs, and newer DOLFINx no longer builds by itself
+    tdim = mesh.topology.dim
+    for dim in sorted({tdim - 1, *(group.dim for group in groups)} - {tdim}):
+        mesh.topology.create_connectivity(dim, tdim)
     return mesh, result
 
 

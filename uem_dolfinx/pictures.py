@@ -324,7 +324,9 @@ def _gather_contactors(contact: Contact, scale: float | None) -> tuple[Array, Ar
     """
     config, nodes = contact.config, contact.pair.nodes
     at = config.X[nodes] + (scale or 0.0) * config.displacement[nodes]
-    parts = config.comm.gather((at, contact.pair.trial.force, contact.pressures))
+    # points have no area; their forces stand for themselves
+    size = contact.pressures if contact.contactor.dim else contact.pair.trial.nodal
+    parts = config.comm.gather((at, contact.pair.trial.force, size))
     if parts is None:
         parts = [(at[:0], at[:0], np.zeros(0))]
     return tuple(np.concatenate(columns) for columns in zip(*parts))  # type: ignore[return-value]

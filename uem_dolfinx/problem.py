@@ -16,7 +16,7 @@ from uem_dolfinx.errors import UEMError
 from uem_dolfinx.newton import Iteration, solve_united
 from uem_dolfinx.solver import UnitedSolver
 from uem_dolfinx.state import State
-from uem_dolfinx.surfaces import Configuration
+from uem_dolfinx.surfaces import Configuration, surface_nodes
 from uem_dolfinx.system import BodySystem
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact import Contact
     from uem_dolfinx.inertia import Dynamics
     from uem_dolfinx.materials import HistoryMaterial
+    from uem_dolfinx.mesh import Tag
 
 #: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
 #: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
@@ -218,6 +219,19 @@ class UnitedProblem:
         state.collect.append(collect)
         state.restore.append(restore)
         return state
+
+    def reaction(self, tag: Tag) -> np.ndarray:
+        """Force with which the Dirichlet conditions act on the nodes of a tag: their sum ``(gdim,)`` (collective).
+
+        Args:
+            tag: entities of any dimension; components without Dirichlet condition count as zero.
+        """
+        self.system.assemble_residual()
+        nodes, shape = surface_nodes(self.config, tag), (-1, self.config.gdim)
+        force = self.system.residual.array_r.reshape(shape)[nodes]
+        for contact in self.contacts:
+            force = force - contact.force.x.array.reshape(shape)[nodes]
+        return np.sum(self.comm.allgather(np.where(self.system.free[nodes], 0.0, force).sum(axis=0)), axis=0)
 
     def _deformation(self, du: np.ndarray) -> np.ndarray:
         """What an increment of the displacement holds besides rigid motions of bodies that only contact holds (collective)."""

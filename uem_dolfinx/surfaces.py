@@ -151,26 +151,30 @@ class Configuration:
 
 
 def check_tag(config: Configuration, tag: Tag, role: str) -> None:
-    """Refuse tags that are not facets of this mesh (collective)."""
+    """Refuse tags that are not facets of this mesh, nor points of it that a contactor may be (collective)."""
     error: UEMError | None = None
     if tag.mesh is not config.mesh:
         error = SpaceError(f"{role} '{tag.name}' belongs to another mesh than the displacement: read both from one mesh")
-    elif tag.dim != config.tdim - 1:
-        error = TagError(f"{role} '{tag.name}' has dimension {tag.dim}: expected facets, dimension {config.tdim - 1}")
+    elif tag.dim != config.tdim - 1 and (tag.dim != 0 or role == "target"):
+        points = "" if role == "target" else ", or points, dimension 0"
+        error = TagError(f"{role} '{tag.name}' has dimension {tag.dim}: expected facets, dimension {config.tdim - 1}{points}")
     agree(config.comm, error)
     if config.comm.allreduce(len(tag.entities)) == 0:
-        raise TagError(f"{role} '{tag.name}' holds no facets: check the physical group in the gmsh model")
+        what = "facets" if tag.dim else "points"
+        raise TagError(f"{role} '{tag.name}' holds no {what}: check the physical group in the gmsh model")
 
 
 def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:
-    """Owned nodes on the closure of a tag's facets, sorted (collective)."""
+    """Owned nodes on the closure of a tag's facets, or at its points, sorted (collective)."""
     config.mesh.topology.create_connectivity(tag.dim, config.tdim)
     nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
     return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
 
 
 def tributary_areas(config: Configuration, tag: Tag) -> Array:
-    """Integral of each shape function over the reference surface, per local node ``(n_local,)`` (collective)."""
+    """Integral of each shape function over the reference surface, per local node; zero for points ``(n_local,)`` (collective)."""
+    if tag.dim == 0:
+        return np.zeros(config.n_local)
     S = compat.function_space(config.mesh, config.degree)
     v = ufl.TestFunction(S)
     b = compat.create_vector(S)

@@ -58,6 +58,7 @@ class PairState:
         held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
         changes: how often in this step it has changed facets across a bend ``(n,)``.
         slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
+        passed: has been past the target's end since it was last in front of it ``(n,)``.
     """
 
     active: Bools
@@ -68,6 +69,7 @@ class PairState:
     held: Ints
     changes: Ints
     slips: Ints
+    passed: Bools
 
     @property
     def united_to(self) -> bytes:
@@ -87,6 +89,7 @@ class ContactPair:
         name: for messages.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` at the start of every step, ``"fixed"`` once.
         max_penetration: bound on the initial penetration, a length.
+        thickness: of the target's body, a length: what has passed its end and is deeper than this lies behind it.
         chords: approximate curved facets by straight pieces in P, and there alone.
     """
 
@@ -100,10 +103,11 @@ class ContactPair:
         name: str,
         sliding: str,
         max_penetration: float,
+        thickness: float = np.inf,
         chords: bool = False,
     ):
         self.config, self.nodes, self.target, self.name = config, nodes, target, name
-        self.sliding, self.max_penetration, self.chords = sliding, max_penetration, chords
+        self.sliding, self.max_penetration, self.thickness, self.chords = sliding, max_penetration, thickness, chords
         #: Depth of the deepest contactor inside the target before the first step, a length.
         self.initial_overlap = 0.0
         n = len(nodes)
@@ -120,6 +124,7 @@ class ContactPair:
             np.full((n, config.gdim - 1), -1),
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
+            np.zeros(n, bool),
         )
         self.trial = self.last_commit = self.committed
         self.projection: Projection
@@ -280,13 +285,17 @@ class ContactPair:
 
     @property
     def off(self) -> Bools:
-        """Contactors that have slid past an open end of the target in a direction in which they can move ``(n,)``."""
+        """Contactors that have slid past an open end of the target in a direction in which they can move ``(n,)``.
+
+        Round the end of a thin target they come behind it, where a negative gap is no penetration.
+        """
         beyond = np.linalg.norm(self.projection.beyond * self.free, axis=1)
         if not isinstance(self.projection, FacetProjection):
             return beyond > 0
         x = self.projection.x
         limit = np.where(self.trial.slips > 1, END_HOLDS, SLID_OFF)
-        return beyond > limit * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+        behind = self.trial.passed & (self.projection.gap < -self.thickness)
+        return behind | (beyond > limit * np.linalg.norm(x[:, 0] - x[:, 1], axis=1))
 
     # -- activation and release ------------------------------------------------------------------------------------
 
@@ -359,6 +368,9 @@ class ContactPair:
         gap = self.gap
         release = state.active & ((state.lam < -force_rounding) | off | ~self.movable)
         enter = ~state.active & ~off & self.movable & (gap < -GAP_ROUNDING * self.config.size)
+        if self.thickness < np.inf and not settled:
+            # on the way to equilibrium a thin target sweeps past what has slid off it
+            enter &= state.slips == 0
         worst = [-np.min(gap[enter], initial=0.0), -np.min(state.lam[release], initial=0.0)]
         deepest, tension = np.max(comm.allgather(worst), axis=0)
         entering, touching = comm.allreduce(np.array([enter.sum(), state.active.sum()]))
@@ -370,7 +382,8 @@ class ContactPair:
             release &= off | (state.lam <= -tension) if settled and deepest == 0.0 else off
         active = (state.active | enter) & ~release
         slips = state.slips + (release & off)
-        self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips)
+        passed = (state.passed | (release & off)) & ~active
+        self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips, passed=passed)
         changed = bool(enter.any() or release.any())
         if self._has_corners:
             changed |= self._leave_corners(settled or not cautious)
@@ -514,7 +527,9 @@ class ContactPair:
     def commit(self) -> None:
         """Make the trial state the committed one."""
         slips = np.where(self.trial.active, self.trial.slips, 0)
-        self.last_commit, self.committed = self.committed, replace(self.trial, changes=np.zeros_like(slips), slips=slips)
+        passed = self.off | (self.trial.passed & (self.projection.gap < 0))
+        fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
+        self.last_commit, self.committed = self.committed, fresh
         self.trial = self.committed
         self._corners = None
         if self.sliding == "small":
