@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError, TunnellingError, agree
 from uem_dolfinx.log import logger
+from uem_dolfinx.search import MeshTarget
 
 if TYPE_CHECKING:
     from uem_dolfinx.system import BodySystem
@@ -92,43 +93,58 @@ def check_prescribed(pair: ContactPair) -> None:
 
 
 def check_tunnelling(system: BodySystem, start: npt.NDArray[np.float64]) -> None:
-    """Refuse a step within which a contactor went through a target and out again (collective).
+    """Refuse a step within which a contactor went through a target (collective).
 
-    The straight way of every contactor is looked at in pieces no longer than the target's stride; most steps are shorter than
-    that and are not looked at.
+    One that touches at the end must have come from in front of the facet it touches. Of one that does not, the straight way is looked
+    at in pieces no longer than the target's stride; most steps are shorter than that and are not looked at.
 
     Args:
         system: at the end of the step.
         start: displacement at its beginning ``(n_local incl. ghosts,)``.
 
     Raises:
-        TunnellingError: naming the first such contactor.
+        TunnellingError: naming the deepest such contactor of the first rank that has one.
     """
     u, config = system.u.x.array, system.config
     end = np.array(u)
-    way = (end - start).reshape(-1, config.gdim)
+    way = np.linalg.norm((end - start).reshape(-1, config.gdim), axis=1)
     for pair in system.pairs:
-        moves = [np.linalg.norm(way[pair.nodes], axis=1).max(initial=0.0), 0.0]
-        if pair.target.n_nodes:
-            moves[1] = np.linalg.norm(way, axis=1).max(initial=0.0)
-        length = float(np.max(config.comm.allgather(moves), axis=0).sum())
-        looks = min(np.ceil(length / pair.target.stride), MOST_LOOKS + 1.0)
+        target, stride = pair.target, pair.target.stride
+        moves = [
+            way[pair.nodes].max(initial=0.0),
+            way[target.facets.dofs].max(initial=0.0) if isinstance(target, MeshTarget) else 0.0,
+        ]
+        new = pair.trial.active & ~pair.committed.active
+        *moves, touches = np.max(config.comm.allgather([*moves, float(new.any())]), axis=0)
+        looks = np.ceil(sum(moves) / stride)
         error = None
         if looks > MOST_LOOKS:
             error = TunnellingError(
-                f"{pair.name}: the surfaces move by {length:.4g} within a step, {length / pair.target.stride:.3g} times what a contactor "
-                "may pass without being looked for: take smaller steps"
+                f"{pair.name}: the surfaces move by {sum(moves):.4g} within a step, {looks:.3g} times what a contactor may pass without "
+                "being looked for: take smaller steps"
             )
         agree(config.comm, error)
+        if touches:
+            u[:] = start
+            outside = target.project(pair.points).gap >= 0.0
+            before = target.follow(pair.points, pair.projection).gap
+            u[:] = end
+            _refuse_passage(pair, new & outside & (before < -PASSING * stride), before, "touches the target from behind after")
         for k in range(1, int(looks)):
             u[:] = start + k / looks * (end - start)
-            p = pair.target.project(pair.points)
-            inside = ~pair.trial.active & (p.gap < -PASSING * pair.target.stride) & ~(p.beyond != 0).any(axis=1)
-            if inside.any():
-                i = int(np.argmin(np.where(inside, p.gap, np.inf)))
-                error = TunnellingError(
-                    f"{pair.name}: the contactor at {config.describe(int(pair.nodes[i]))} passes through the target within a step, "
-                    f"{-p.gap[i]:.4g} deep on its way: take smaller steps"
-                )
+            p = target.project(pair.points)
             u[:] = end
-            agree(config.comm, error)
+            inside = ~pair.trial.active & (p.gap < -PASSING * stride) & ~(p.beyond != 0).any(axis=1)
+            _refuse_passage(pair, inside, p.gap, "passes through the target within")
+
+
+def _refuse_passage(pair: ContactPair, passed: npt.NDArray[np.bool_], gap: npt.NDArray[np.float64], how: str) -> None:
+    """Raise if a contactor passed (collective)."""
+    error = None
+    if passed.any():
+        i = int(np.argmin(np.where(passed, gap, np.inf)))
+        error = TunnellingError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} {how} a step, {-gap[i]:.4g} inside on its way: "
+            "take smaller steps"
+        )
+    agree(pair.config.comm, error)

@@ -183,7 +183,7 @@ class EnergyBook:
         panel.set_xlabel("time")
         panel.set_ylabel("energy")
         panel.grid(alpha=0.25)
-        panel.legend(frameon=False)
+        panel.legend(frameon=False, ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
     def close(self) -> None:
         """Close the file."""

@@ -187,7 +187,8 @@ class MeshTarget:
         counts = self.comm.allgather(len(facets.dofs))
         corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        self.stride = float(min(self.comm.allgather(sides.min(initial=np.inf))))
+        # half of what the thinnest body of one cell, or its shortest facet, measures
+        self.stride = 0.5 * float(min(self.comm.allgather(min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf)))))
         self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
     def project(self, points: Array) -> FacetProjection:

@@ -242,8 +242,11 @@ class TargetFacets:
         middle = np.tile(self.shape.middle, (len(self.dofs), 1))
         tab = self.shape.tabulate(middle)
         x = X[self.dofs]
-        inward = X[cell_dofs[self.cells]].mean(axis=1) - np.einsum("na,nag->ng", tab.N, x)
-        self.sign = np.where(np.einsum("ng,ng->n", unit_normals(tab, x), inward) > 0, -1.0, 1.0)
+        inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
+        height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
+        self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
+        #: How deep the cell behind each facet is, a length ``(m,)``.
+        self.depth: Array = np.abs(height).max(axis=1)
 
     def _refuse_inner(self) -> None:
         """Raise on facets that lie between two cells, wherever those cells live."""
