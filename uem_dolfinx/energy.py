@@ -138,7 +138,7 @@ class EnergyBook:
         """Energies kinetic, stored and dissipated (collective)."""
         stored = compat.assemble_scalar(self._stored, self.problem.comm) if self._stored is not None else 0.0
         stored += sum(material.energy() for material in self.problem.materials)
-        dissipated = sum(material.dissipation() for material in self.problem.materials)
+        dissipated = float(sum(material.dissipation() for material in self.problem.materials))
         return self.dynamics.kinetic_energy(), stored, dissipated
 
     def write(self, step: TimeStep | None = None) -> Energies:
