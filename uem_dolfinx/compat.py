@@ -425,7 +425,20 @@ def form(integrals: Any) -> Any:
     Returns:
         The DOLFINx form.
     """
-    return fem.form(integrals, dtype=np.float64)
+    return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
+
+
+def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
+    """The form with its tags at all integrals of a kind; DOLFINx 0.9 takes those over everything, which have none, for others."""
+    known = {i.integral_type(): i.subdomain_data() for i in F.integrals() if i.subdomain_data() is not None}
+    return ufl.Form(
+        [
+            i.reconstruct(subdomain_data=known[i.integral_type()])
+            if i.subdomain_data() is None and i.integral_type() in known
+            else i
+            for i in F.integrals()
+        ]
+    )
 
 
 def create_matrix(a: Any) -> PETSc.Mat:
