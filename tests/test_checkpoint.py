@@ -27,7 +27,7 @@ from helpers import CELLS, at, blocks, box, clamp, highest, modulus, scene, st_v
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, numbering
-from uem_dolfinx.uniting import PairState
+from uem_dolfinx.pair_state import PairState
 
 COMM = MPI.COMM_WORLD
 serial = pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")

@@ -6,7 +6,7 @@ that changes only after convergence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from uem_dolfinx.checks import TOUCHING, check_finite
 from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.pair_state import PairState
 from uem_dolfinx.quadratic import ControlGaps
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 
@@ -43,39 +44,6 @@ HOLD_AFTER = 2
 MOST_CHANGES = 8
 #: A corner holds a contactor if its free components keep this part of each of the corner's directions.
 FREE_ENOUGH = 1e-3
-
-
-@dataclass(frozen=True)
-class PairState:
-    """What a pair remembers of its contactors; frozen so that trial and committed never share an array by accident.
-
-    Attributes:
-        active: united to the target ``(n,)``.
-        lam: contact force along the normal, positive in compression ``(n,)``; on a degree-2 surface the control force.
-        nodal: contact force of the node along the normal ``(n,)``; the same as ``lam`` on a degree-1 surface.
-        force: contact force on the contactor ``(n, gdim)``.
-        facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
-        held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
-        changes: how often in this step it has changed facets across a bend ``(n,)``.
-        slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
-        passed: has been past the target's end since it was last in front of it ``(n,)``.
-    """
-
-    active: Bools
-    lam: Array
-    nodal: Array
-    force: Array
-    facet: Ints
-    held: Ints
-    changes: Ints
-    slips: Ints
-    passed: Bools
-
-    @property
-    def united_to(self) -> bytes:
-        """What tells this active set from others: who is active, and the corners that hold contactors."""
-        corner = np.where((self.held >= 0).any(axis=1), self.facet, -1)
-        return self.active.tobytes() + corner.tobytes() + self.held.tobytes()
 
 
 class ContactPair:
