@@ -333,13 +333,55 @@ def test_statics_has_no_mass():
         uem.EnergyBook(static)
 
 
+def test_a_failed_step_leaves_the_committed_state():
+    """Displacement, velocity, time, forces and residual are those of the last step that converged."""
+    bar = Bar(20, gap=0.5, v=-2.0, law=uem.StVenantKirchhoff, gravity=(0.0, -10.0))
+    bar.run(0.01, 0.3)
+    problem, dynamics = bar.problem, bar.dynamics
+    problem.system.assemble_residual()
+    before = [np.array(x) for x in (bar.u.x.array, dynamics.velocity.x.array, problem.system.residual.array_r)]
+    force, time = bar.contact.resultant().force, dynamics.time
+    problem.max_iterations = 0
+    with pytest.raises(uem.ConvergenceError):
+        next(uem.time_steps(problem, 0.01, 0.35))
+    problem.system.assemble_residual()
+    after = (bar.u.x.array, dynamics.velocity.x.array, problem.system.residual.array_r)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after))
+    assert dynamics.time == time and np.array_equal(bar.contact.resultant().force, force)
+    problem.max_iterations = 50
+    assert bar.run(0.01, 0.35)[-1, 1] > 50
+
+
+def test_prescribed_motion_in_time():
+    """A bar that is shaken at its foot: the supports do the work, and the book closes."""
+    bar = Bar(20, gap=0.0, v=0.0, wall=False, held=True)
+    foot = fem.Function(bar.V)
+    bcs = [fem.dirichletbc(foot, fem.locate_dofs_topological(bar.V, 1, bar.tip.entities))]
+
+    def load(time):
+        foot.x.array[1::2] = 0.1 * (1 - np.cos(2 * np.pi * time))
+
+    dynamics = uem.Dynamics(uem.lumped_mass(bar.V, 1.0))
+    material = uem.LinearElastic(900.0, 0.0, kind="plane_stress")
+    F = material.residual(bar.u, ufl.TestFunction(bar.V)) * ufl.dx
+    problem = uem.UnitedProblem(F, bar.u, bcs=bcs, dynamics=dynamics, load=load)
+    book = uem.EnergyBook(problem, material.energy(bar.u) * ufl.dx)
+    for _ in uem.time_steps(problem, 0.01, 0.5):
+        book.write()
+    at_foot = bar.u.x.array.reshape(-1, 2)[fem.locate_dofs_topological(bar.V, 1, bar.tip.entities), 1]
+    assert np.allclose(at_foot, 0.2, rtol=1e-12)
+    row = book.rows[-1]
+    assert row.external > 0.1 and abs(row.defect) < 1e-9 * max(r.kinetic for r in book.rows)
+
+
 def test_what_is_refused():
     bar = Bar(4)
     with pytest.raises(ValueError, match="contactors = 'none'"):
         uem.Dynamics(bar.dynamics.mass, contactors="none")
-    for wrong in ({"dt": 0.0}, {"dt": -1.0}, {"dt": 0.1, "event_tolerance": 2.0}):
+    for wrong in ({"dt": 0.0}, {"dt": np.inf}, {"dt": np.nan}, {"end": np.nan}, {"end": np.inf}, {"event_tolerance": 2.0}):
         with pytest.raises(ValueError, match="expected dt > 0"):
-            next(uem.time_steps(bar.problem, end=1.0, **wrong))
+            next(uem.time_steps(bar.problem, **({"dt": 0.1, "end": 1.0} | wrong)))
+    assert not list(uem.time_steps(bar.problem, 0.1, -1.0))
     with pytest.raises(uem.SpaceError, match="make the mass with the function space"):
         Bar(4, mass=lambda V, rho: uem.lumped_mass(Bar(5).V, rho))
     with pytest.raises(uem.NotFiniteError, match="velocity at the start"):

@@ -299,6 +299,10 @@ class Dynamics:
             self.time, self._moving = self._until, False
         self.remember()
 
+    def restore(self) -> None:
+        """Go back to the committed state."""
+        self._until, self._moving = self.time, False
+
     def remember(self) -> None:
         """Take displacement, velocity and acceleration as they are for the start of the next step."""
         self._u = np.array(self.config.u.x.array)
@@ -314,7 +318,7 @@ class Dynamics:
         """Go on from the Functions as they are and the numbers of a checkpoint."""
         for name in self.numbers:
             setattr(self, name, numbers[name])
-        self._until, self._moving = self.time, False
+        self.restore()
         self.remember()
 
     def weight(self) -> PETSc.Vec:

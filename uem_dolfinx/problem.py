@@ -181,6 +181,8 @@ class UnitedProblem:
         self.u.x.array[:] = self.committed
         for material in self.materials:
             material.update()
+        if self.dynamics is not None:
+            self.dynamics.restore()
         for pair in self.system.pairs:
             pair.restore()
             pair.project()

@@ -171,7 +171,7 @@ def time_steps(
         An iterator of converged steps.
 
     Raises:
-        ValueError: if ``dt`` is not positive or ``event_tolerance`` not between 0 and 1.
+        ValueError: if ``dt`` is not positive, ``end`` not finite or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
@@ -181,8 +181,10 @@ def time_steps(
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
-    if not dt > 0.0 or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
-        raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
+    if not 0.0 < dt < np.inf or not np.isfinite(end) or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
+        raise ValueError(
+            f"dt = {dt}, end = {end}, event_tolerance = {event_tolerance}: expected dt > 0, a finite end and a tolerance between 0 and 1"
+        )
     if checkpoint is not None and not checkpoint.begun:
         checkpoint.begin(problem.state())
     steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt, checkpoint)
