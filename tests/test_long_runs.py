@@ -102,7 +102,9 @@ def test_going_on(scheme, folder):
         if COMM.size == 1:
             assert rows == others
         else:
-            a, b = (np.array([[float(x or 0) for x in row] for row in r]) for r in (rows, others))
+            # iterations and gaps are those of rounding
+            told = [i for i, name in enumerate(head) if name not in ("newton_iterations", "max_gap")]
+            a, b = (np.array([[float(row[i]) for i in told] for row in r]) for r in (rows, others))
             assert np.allclose(a, b, rtol=1e-7, atol=1e-7 * np.abs(a).max(axis=0)), head
     if COMM.size == 1:
         assert all(np.array_equal(a, b) for a, b in zip(states(straight, law), states(parted, other)))
