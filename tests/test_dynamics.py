@@ -379,9 +379,8 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="contactors = 'none'"):
         uem.Dynamics(bar.dynamics.mass, contactors="none")
     for wrong in ({"dt": 0.0}, {"dt": np.inf}, {"dt": np.nan}, {"end": np.nan}, {"end": np.inf}, {"event_tolerance": 2.0}):
-        with pytest.raises(ValueError, match="expected dt > 0"):
+        with pytest.raises(ValueError, match="expected (dt > 0|a time)"):
             next(uem.time_steps(bar.problem, **({"dt": 0.1, "end": 1.0} | wrong)))
-    assert not list(uem.time_steps(bar.problem, 0.1, -1.0))
     with pytest.raises(uem.SpaceError, match="make the mass with the function space"):
         Bar(4, mass=lambda V, rho: uem.lumped_mass(Bar(5).V, rho))
     with pytest.raises(uem.NotFiniteError, match="velocity at the start"):

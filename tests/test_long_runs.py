@@ -1,15 +1,20 @@
-"""Long runs in time that are stopped, killed and gone on with: the states and the tables of a run that was never stopped.
+"""Long runs: what is interrupted and gone on from a checkpoint ends as if it had not been, tables included, and what is refused.
 
-Two tests to read first: ``test_going_on`` and ``test_killed_in_mid_run``.
+Two tests to read first: ``test_interrupted_is_uninterrupted`` (an elastic-plastic impact, bit for bit in serial) and
+``test_killed`` (kill -9 in mid-run).
 """
 
 from __future__ import annotations
 
+import atexit
 import csv
+import functools
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from mpi4py import MPI
@@ -18,168 +23,414 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, box, clamp, highest, scene
+from helpers import at, box, clamp, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.tables import CsvTable
 
 COMM = MPI.COMM_WORLD
-DT, END, EVERY = 0.01, 0.5, 10
+serial = pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
+DT, END, TOLERANCE, SIZE = 0.02, 0.2, 1e-2, 2.0
 
 
-def impact(comm=COMM, scheme=None, plastic=True):
-    """A plastic block falls askew onto an elastic one, slides and leaves: problem, contact, stored energy of the elastic part."""
-    low = box("quadrilateral", [0.0, 0.0], [2.0, 0.6], [8, 3])
-    high = box("quadrilateral", [0.43, 0.7], [1.27, 1.54], [6, 6])
-    s = scene(comm, "quadrilateral", [low, high])
-    V, S = compat.function_space(s.mesh, 1, (2,)), compat.dg0_space(s.mesh)
-    u, velocity = fem.Function(V), fem.Function(V)
-    falling = V.tabulate_dof_coordinates()[: len(velocity.x.array) // 2, 1] > 0.65
-    velocity.x.array.reshape(-1, 2)[falling] = [0.5, -2.0]
-    strength = fem.Function(S)
-    above = S.tabulate_dof_coordinates()[: len(strength.x.array), 1] > 0.65
-    strength.x.array[:] = np.where(above, 40.0, np.inf) if plastic else np.inf
-    law = uem.VonMises(u, 1000.0, 0.3, strength, 200.0, kind="plane_stress", strain="green_lagrange")
-    contact = uem.Contact(s.tag("foot", 1, at(1, 0.7)), s.tag("table", 0, at(1, 0.6)))
-    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, gravity=(0.0, -5.0), scheme=scheme)
-    problem = uem.UnitedProblem(
-        law.residual(ufl.TestFunction(V)), u, bcs=clamp(V, s.tag("base", 0, at(1, 0.0))), contacts=[contact], materials=[law],
-        dynamics=dynamics, rtol=1e-10,
-    )  # fmt: skip
-    return problem, contact, law
+class Impact:
+    """A plastic block that flies aslant onto a plastic one, which a moving foot and a growing load drive against it."""
 
-
-def run(folder, name, end, *, comm=COMM, scheme=None, wait=False):
-    """Step to the end, going on from a checkpoint if there is one; the problem at the end."""
-    problem, contact, law = impact(comm, scheme)
-    checkpoint = uem.Checkpoint(folder / f"{name}.uem", every=EVERY)
-    checkpoint.begin(problem.state())
-    with (
-        checkpoint,
-        uem.EnergyBook(problem, path=folder / f"{name}_energy.csv", resume=True) as book,
-        uem.HistoryWriter(folder / f"{name}.csv", problem, resume=True) as history,
+    def __init__(
+        self,
+        comm=COMM,
+        *,
+        scheme=None,
+        kind="plane_strain",
+        plastic=True,
+        moving=True,
+        dynamic=True,
+        max_iterations=4,
+        time=0.0,
     ):
-        for step in uem.time_steps(problem, DT, end, event_tolerance=1e-3, checkpoint=checkpoint):
-            book.write(step)
-            history.write(step)
-            if wait:
-                print(step.number, flush=True)
-    return problem, contact, law
+        cell = "quadrilateral"
+        low = box(cell, [0.0, 0.0], [2.0, 1.0], [6, 3])
+        high = box(cell, [0.43, 1.05], [1.27, 1.9], [4, 5])
+        self.s = s = scene(comm, cell, [low, high], shuffle=6)
+        self.V = V = compat.function_space(s.mesh, 1, (2,))
+        self.u, w, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+        X = V.tabulate_dof_coordinates()[: len(self.u.x.array) // 2]
+        velocity.x.array.reshape(-1, 2)[X[:, 1] > 1.02] = [0.3, -0.5]
+        self.foot, self.push = fem.Function(V), fem.Constant(s.mesh, 0.0)
+        base = fem.locate_dofs_topological(V, 1, s.tag("base", 0, at(1, 0.0)).entities)
+        self.bcs = [fem.dirichletbc(self.foot, base)] if moving else clamp(V, s.tag("base", 0, at(1, 0.0)))
+        self.law = uem.VonMises(self.u, 100.0, 0.3, 3.0 if plastic else np.inf, 5.0, kind=kind, strain="green_lagrange")
+        top = compat.surface_measure(s.mesh, s.tag("top", 1, at(1, 1.9)).entities)
+        self.external = -self.push * w[1] * top
+        self.contact = uem.Contact(s.tag("tip", 1, at(1, 1.05)), s.tag("face", 0, at(1, 1.0)), name="impact")
+        moves = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=scheme, velocity=velocity, gravity=(0.0, -1.0), time=time)
+        self.problem = uem.UnitedProblem(
+            self.law.residual(w) - self.external, self.u, bcs=self.bcs, contacts=[self.contact], materials=[self.law],
+            dynamics=moves if dynamic else None,
+            load=self.load, rtol=1e-10, max_iterations=max_iterations,
+        )  # fmt: skip
+
+    def load(self, t):
+        """The foot moves smoothly from rest, the push grows with time."""
+        self.foot.x.array.reshape(-1, 2)[:] = [0.0, 0.5 * t**2]
+        self.push.value = 0.2 + t
+
+    def run(self, folder, *, every=10**6, stop=None, end=END, tolerance=TOLERANCE, dt=DT):
+        """Step with tables ``energy.csv`` and ``history.csv`` and the checkpoint ``run`` in a folder; returns the steps."""
+        checkpoint, steps = uem.Checkpoint(folder / "run", every=every), []
+        checkpoint.begin(self.problem.state())
+        with (
+            uem.EnergyBook(self.problem, external=self.external, path=folder / "energy.csv", resume=True) as book,
+            uem.HistoryWriter(folder / "history.csv", self.problem, resume=True) as history,
+        ):
+            for step in uem.time_steps(self.problem, dt, end, event_tolerance=tolerance, checkpoint=checkpoint):
+                steps.append(step)
+                book.write(step)
+                history.write(step)
+                if step.number == stop:
+                    break
+        self.book = book
+        return steps
 
 
 def table(path):
-    """Columns and rows of a CSV file, as text, read alike on all ranks."""
+    """Rows of a CSV file as they are written."""
+    with Path(path).open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def numbers(path):
+    """The table as numbers, without its head."""
+    return np.array([[float(v) for v in row] for row in table(path)[1:]])
+
+
+def same_tables(one, other, bound=1e-9):
+    """Row by row the same numbers, relative to the largest of their column; gaps, which are zero, to the bodies' size."""
+    for name in ("energy.csv", "history.csv"):
+        head, a, b = table(one / name)[0], numbers(one / name), numbers(other / name)
+        assert head == table(other / name)[0] and a.shape == b.shape
+        scale = np.where([column.startswith("max_gap") for column in head], SIZE, np.abs(a).max(axis=0))
+        assert np.all(np.abs(a - b) <= bound * scale), (name, dict(zip(head, np.abs(a - b).max(axis=0))))
+
+
+def same_runs(one, other):
+    """Two folders tell the same run: tables to 1e-9, and in serial tables and checkpoint byte by byte."""
     COMM.barrier()
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        head, *rows = csv.reader(file)
-    return head, rows
+    same_tables(one, other)
+    for name in ("energy.csv", "history.csv", "run") if COMM.size == 1 else ():
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
-def states(problem, law):
-    fields = (problem.u, problem.dynamics.velocity, problem.dynamics.acceleration, problem.dynamics.forces, *law.history.values())
-    return [np.array(f.x.array) for f in fields]
+def close(a, b):
+    """End states of two runs to 1e-9, gathered in the order of the drawing."""
+    for f in (lambda i: i.u, lambda i: i.problem.dynamics.velocity):
+        x, y = a.s.gather(f(a)), b.s.gather(f(b))
+        assert np.abs(x - y).max() <= 1e-9 * np.abs(x).max()
+    x, y = (i.law.dissipation() for i in (a, b))
+    assert x > 0.0 and abs(x - y) <= 1e-9 * x
 
 
-def gathered(problem):
-    """Displacement by place of the node, on every rank."""
-    config = problem.config
-    parts = config.comm.allgather(np.column_stack([config.X, config.displacement])[: config.n_owned])
-    rows = np.concatenate(parts)
-    return rows[np.lexsort(np.round(rows[:, :2], 9).T)]
+@functools.cache
+def uninterrupted(rho=None):
+    """A run left alone: the impact, its steps and its folder (collective)."""
+    folder = Path(COMM.bcast(tempfile.mkdtemp() if COMM.rank == 0 else None))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    impact = Impact(scheme=None if rho is None else uem.generalised_alpha(rho))
+    return impact, impact.run(folder), folder
 
 
-@pytest.mark.parametrize("scheme", [None, uem.generalised_alpha(0.7)])
-def test_going_on(scheme, folder):
-    """A run stopped in mid-contact, after plastic flow, ends like one that was not: to the last bit where there is one rank."""
-    straight, _, law = run(folder, "straight", END, scheme=scheme)
-    run(folder, "parted", 0.17, scheme=scheme)
-    parted, _, other = run(folder, "parted", END, scheme=scheme)
-    assert law.dissipation() > 0.01 and parted.dynamics.number == straight.dynamics.number
-    assert parted.dynamics.time == straight.dynamics.time
-    for file in ("{}.csv", "{}_energy.csv"):
-        (head, rows), (_, others) = (table(folder / file.format(name)) for name in ("straight", "parted"))
-        assert len(rows) == len(others) > END / DT
-        if COMM.size == 1:
-            assert rows == others
+# -- going on --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [None, 0.6])
+def test_interrupted_is_uninterrupted(rho, folder):
+    """Left twice in mid-run, in flight before the touch and in contact after steps that were cut, and gone on with each time."""
+    scheme = None if rho is None else uem.generalised_alpha(rho)
+    whole, steps, alone = uninterrupted(rho)
+    assert any(s.touched for s in steps) and sum(s.cuts for s in steps) > 0 and len({s.dt for s in steps}) > 3
+    assert whole.contact.n_active > 0 and whole.book.rows[-1].dissipated > 0.05
+    done = []
+    for every, stop in ((2, 5), (4, 9)):
+        done += Impact(scheme=scheme).run(folder, every=every, stop=stop)
+    assert sum(s.cuts for s in done) > 0
+    last = Impact(scheme=scheme)
+    end = last.run(folder, every=3)
+    assert end[0].number == 9 and len(end) == len(steps) - 8
+    for a, b in zip(steps[8:], end):
+        assert (a.number, a.cuts, a.touched, a.left, a.newton_iterations) == (
+            b.number,
+            b.cuts,
+            b.touched,
+            b.left,
+            b.newton_iterations,
+        )
+        assert abs(a.time - b.time) <= 1e-9 * END and (COMM.size > 1 or a.time == b.time)
+    same_runs(alone, folder)
+    close(whole, last)
+
+
+def test_a_later_end(folder):
+    """A run that has come to its end goes on if the end is later, as if that had been the end from the beginning."""
+    Impact().run(folder, end=0.12)
+    assert Impact().run(folder, end=0.12) == []
+    Impact().run(folder)
+    # half a step ends at the end, or at the multiple of dt that is the same but for rounding
+    COMM.barrier()
+    same_tables(uninterrupted()[2], folder)
+
+
+@pytest.mark.parametrize("writer, reader", [(MPI.COMM_SELF, COMM), (COMM, MPI.COMM_SELF)], ids=["one to all", "all to one"])
+def test_ranks_change(writer, reader, folder):
+    """Written by one rank and read by all, and the reverse: velocities and plastic history find their places."""
+    whole, _, alone = uninterrupted()
+    mine = folder / ("first" if writer is COMM else f"first {COMM.rank}")
+    first = Impact(writer)
+    first.run(mine, every=8, stop=9)
+    COMM.barrier()
+    source = mine if writer is COMM else folder / "first 0"
+    # each reader that is alone has a folder of its own
+    target = folder / "second" if reader is COMM else folder / f"second {COMM.rank}"
+    if reader is MPI.COMM_SELF or COMM.rank == 0:
+        target.mkdir()
+        for name in ("run", "energy.csv", "history.csv"):
+            (target / name).write_bytes((source / name).read_bytes())
+    COMM.barrier()
+    last = Impact(reader)
+    assert last.run(target)[0].number == 9
+    COMM.barrier()
+    same_tables(alone, target)
+    x, y = whole.s.gather(whole.u), last.s.gather(last.u)
+    assert np.abs(x - y).max() <= 1e-9 * np.abs(x).max()
+
+
+@pytest.mark.parametrize(
+    "other, match",
+    [
+        ({"dynamic": False}, "for function 'velocity' expected nothing, found Lagrange 1"),
+        (
+            {"kind": "plane_stress"},
+            "for function 'plastic_strain 1' expected Quadrature 2, 3 components .* found Quadrature 2, 4",
+        ),
+    ],
+)
+def test_checkpoint_of_another_problem(other, match, folder):
+    """Statics and another kind of material do not go on from the file, and the problem stays as it was."""
+    Impact(moving=False).run(folder, end=0.04)
+    wrong = Impact(moving=False, **other)
+    checkpoint = uem.Checkpoint(folder / "run")
+    with pytest.raises(uem.CheckpointError, match=match) as caught:
+        if wrong.problem.dynamics is None:
+            checkpoint.begin(wrong.problem.state())
         else:
-            # iterations and gaps are those of rounding
-            told = [i for i, name in enumerate(head) if name not in ("newton_iterations", "max_gap")]
-            a, b = (np.array([[float(row[i]) for i in told] for row in r]) for r in (rows, others))
-            assert np.allclose(a, b, rtol=1e-7, atol=1e-7 * np.abs(a).max(axis=0)), head
-    if COMM.size == 1:
-        assert all(np.array_equal(a, b) for a, b in zip(states(straight, law), states(parted, other)))
-    else:
-        a, b = gathered(straight), gathered(parted)
-        assert np.abs(a - b).max() < 1e-9 * np.abs(a).max()
+            uem.time_steps(wrong.problem, DT, END, checkpoint=checkpoint)
+    assert len(set(COMM.allgather(str(caught.value)))) == 1
+    assert not wrong.u.x.array.any()
 
 
-def test_going_on_with_other_ranks(folder):
-    """Written by one rank, read by all; every rank goes on with a mesh parted anew."""
-    if COMM.rank == 0:
-        run(folder, "run", 0.2, comm=MPI.COMM_SELF)
-    COMM.barrier()
-    (problem, _, law), (alone, _, its_law) = run(folder, "run", 0.35), impact(MPI.COMM_SELF)
-    for _ in uem.time_steps(alone, DT, 0.35, event_tolerance=1e-3):
-        pass
-    a, b = gathered(alone), gathered(problem)
-    assert np.abs(a - b).max() < 1e-9 * np.abs(a).max()
-    assert np.isclose(law.dissipation(), its_law.dissipation(), rtol=1e-8) and its_law.dissipation() > 0.01
-
-
-def test_balance_of_the_whole():
-    """Energy of an impact with plastic flow, sliding and gravity: what is missing was dissipated."""
-    problem, contact, law = impact()
-    book = uem.EnergyBook(problem)
-    pressed = 0.0
-    for step in uem.time_steps(problem, 0.0025, 0.3):
-        row = book.write(step)
-        pressed = max(pressed, contact.resultant().force[1])
-    assert pressed > 5.0 and row.dissipated > 0.05 * book.rows[0].kinetic
-    assert abs(row.defect) < 1e-2 * book.rows[0].kinetic
-    assert abs(row.contact) < 2e-2 * book.rows[0].kinetic
-
-
-def test_checkpoint_of_another_run(folder):
-    """Without plastic flow there is the same state; another scheme of time is the script's; another mesh or statics is refused."""
-    run(folder, "run", 0.05)
-    problem, _, _ = impact()
-    static = uem.UnitedProblem(
-        uem.LinearElastic(1.0, 0.3, kind="plane_stress").residual(problem.u, ufl.TestFunction(problem.config.V)) * ufl.dx, problem.u,
-        bcs=problem.system.bcs,
-    )  # fmt: skip
-    with pytest.raises(uem.CheckpointError, match="run.uem"):
-        uem.Checkpoint(folder / "run.uem").begin(static.state())
+def test_checkpoint_of_statics(folder):
+    """Time steps do not go on from a static problem's file."""
+    static = Impact(dynamic=False)
+    uem.write_checkpoint(folder / "run", static.problem.state())
+    wrong = Impact()
+    with pytest.raises(uem.CheckpointError, match="for function 'velocity' expected Lagrange 1.*found nothing"):
+        uem.time_steps(wrong.problem, DT, END, checkpoint=uem.Checkpoint(folder / "run"))
 
 
 RUN = """
 import sys
 sys.path.insert(0, {tests!r})
-from pathlib import Path
-from test_long_runs import run
-run(Path({folder!r}), "run", {end}, wait=True)
+from test_long_runs import DT, END, TOLERANCE, Impact
+import uem_dolfinx as uem
+
+impact = Impact()
+with uem.Checkpoint({path!r}, every={every}) as checkpoint:
+    for step in uem.time_steps(impact.problem, DT, END, event_tolerance=TOLERANCE, checkpoint=checkpoint):
+        print(step.number, flush=True)
 """
 
 
-@pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_killed_in_mid_run(how, folder):
-    """A run that is killed loses no more than the last interval, and ends like one that was not."""
-    script = RUN.format(tests=str(Path(__file__).parent), folder=str(folder), end=END)
-    environment = dict(os.environ, PYTHONPATH=os.pathsep.join([str(Path(uem.__file__).parents[1]), *sys.path]))
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
-    assert process.stdout is not None
-    last = 0
-    for line in process.stdout:
-        last = int(line)
-        if last >= 2 * EVERY + 3:
-            process.send_signal(how)
-            break
-    assert process.wait(60) == (-signal.SIGKILL if how == signal.SIGKILL else 143)
-    begun, _, _ = impact()
-    assert uem.Checkpoint(folder / "run.uem").begin(begun.state())
-    assert begun.dynamics.number >= (last // EVERY) * EVERY
-    problem, _, law = run(folder, "run", END)
-    straight, _, its_law = run(folder, "straight", END)
-    assert all(np.array_equal(a, b) for a, b in zip(states(problem, law), states(straight, its_law)))
-    assert table(folder / "run_energy.csv") == table(folder / "straight_energy.csv")
-    assert highest(COMM, [problem.dynamics.time]) == END
+def start(path, every):
+    """A process that runs the impact, told from this one's MPI."""
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    script = RUN.format(tests=str(Path(__file__).parent), path=str(path), every=every)
+    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
+
+
+@serial
+def test_killed(folder):
+    """kill -9 in mid-run, twice: no more than the interval is lost, and the run ends in the very state of one that was left alone."""
+    _, steps, alone = uninterrupted()
+    path, last, n = folder / "run", 0, len(steps)
+    for count in (4, 4):
+        process = start(path, 3)
+        lines = [int(process.stdout.readline()) for _ in range(count)]
+        process.kill()
+        lines += [int(line) for line in process.stdout.read().split()]
+        assert process.wait() == -signal.SIGKILL
+        assert lines[0] == last + 1
+        there = Impact()
+        uem.read_checkpoint(path, there.problem.state())
+        last = there.problem.dynamics.number
+        assert lines[-1] - 3 <= last <= lines[-1] < n
+    process = start(path, 3)
+    lines = [int(line) for line in process.stdout.read().split()]
+    assert process.wait() == 0 and lines[0] == last + 1 and lines[-1] == n
+    assert path.read_bytes() == (alone / "run").read_bytes()
+
+
+@serial
+def test_terminated(folder):
+    """SIGTERM in mid-run: the step is finished and written, the status is 143, and the run goes on to the same end."""
+    _, steps, alone = uninterrupted()
+    path, n = folder / "run", len(steps)
+    process = start(path, 10**6)
+    for _ in range(4):
+        process.stdout.readline()
+    process.send_signal(signal.SIGTERM)
+    lines = [4, *map(int, process.stdout.read().split())]
+    assert process.wait() == 143
+    there = Impact()
+    uem.read_checkpoint(path, there.problem.state())
+    # the signal may come between a step's end and its print
+    assert lines[-1] <= there.problem.dynamics.number <= lines[-1] + 1 < n
+    process = start(path, 10**6)
+    assert int(process.stdout.read().split()[-1]) == n and process.wait() == 0
+    assert path.read_bytes() == (alone / "run").read_bytes()
+
+
+# -- what is refused, and what stays after errors ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "dt, end, match",
+    [
+        (np.nan, 1.0, "dt = nan.*expected dt > 0"),
+        (np.inf, 1.0, "dt = inf.*expected dt > 0"),
+        (0.1, np.nan, "end = nan: expected a time that is not before the start, 3"),
+        (0.1, np.inf, "end = inf"),
+        (0.1, 2.9, "end = 2.9: expected a time that is not before the start, 3"),
+        (1e-14, 3.1, "dt = 1e-14: too short to be told from rounding of the times from 3 to 3.1"),
+    ],
+)
+def test_times_that_are_none(dt, end, match):
+    """Refused before anything is done, on all ranks."""
+    impact = Impact(time=3.0)
+    with pytest.raises(ValueError, match=match):
+        uem.time_steps(impact.problem, dt, end)
+    with pytest.raises(ValueError, match="time = nan"):
+        Impact(time=np.nan)
+
+
+def test_times_far_from_zero():
+    """Steps of a millionth of the time still end at its multiples, without a last step that is rounding alone."""
+    impact = Impact(time=1e5, moving=False)
+    impact.problem.load = None
+    steps = list(uem.time_steps(impact.problem, 0.01, 1e5 + 0.1))
+    assert len(steps) == 10 and steps[-1].time == 1e5 + 0.1 and {s.dt for s in steps[:-1]} == {0.01}
+
+
+def test_errors_leave_the_last_step(monkeypatch):
+    """After a step that fails for good, and after a load that raises, forces are those of the last step, and it goes on from it."""
+    impact = Impact(moving=False)
+    list(uem.time_steps(impact.problem, DT, 0.04))
+    problem, system = impact.problem, impact.problem.system
+
+    def residual():
+        system.assemble_residual()
+        return system.residual.array_r.copy()
+
+    before, u = residual(), impact.u.x.array.copy()
+
+    def fail(*how, **more):
+        raise uem.ConflictError("two conditions disagree")
+
+    def no_load(t):
+        impact.load(t)
+        if t > 0.041:
+            raise RuntimeError("no load")
+
+    with monkeypatch.context() as patch, pytest.raises(uem.ConflictError):
+        patch.setattr(problem, "attempt", fail)
+        next(uem.time_steps(problem, DT, END))
+    assert np.array_equal(residual(), before) and np.isclose(impact.push.value, 0.24)
+    problem.load = no_load
+    with pytest.raises(RuntimeError, match="no load"):
+        next(uem.time_steps(problem, DT, END))
+    impact.load(0.04)
+    assert np.array_equal(residual(), before) and np.array_equal(impact.u.x.array, u)
+    problem.load = impact.load
+    step = next(uem.time_steps(problem, DT, END))
+    assert step.number == 3 and np.isclose(step.time, 0.06, rtol=1e-14)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_table_that_cannot_be_written(resume, folder):
+    """A file stands where the folder should be, or a folder where the file should: the same error on all ranks."""
+    if COMM.rank == 0:
+        (folder / "out").write_text("in the way")
+        (folder / "energy.csv").mkdir()
+    COMM.barrier()
+    impact = Impact(moving=False)
+    for path in (folder / "out" / "energy.csv", folder / "energy.csv"):
+        with pytest.raises(OSError, match="out|energy.csv"):
+            uem.EnergyBook(impact.problem, path=path, resume=resume)
+
+
+def test_tables_go_on(folder, caplog):
+    """Half a row goes, what is later goes, another table is refused and stays, and a hole is told about."""
+
+    def create(columns, at):
+        return CsvTable(folder / "t.csv", COMM, columns, at)
+
+    with create(["time", "x"], None) as t:
+        for k in range(4):
+            t.write([0.1 * k, 1.0 / 3 + k])
+    COMM.barrier()
+    if COMM.rank == 0:
+        with (folder / "t.csv").open("a", newline="") as file:
+            file.write("0.35,4.3")
+    COMM.barrier()
+    with create(["time", "x"], 10.0) as t:
+        assert t.first == {"time": 0.0, "x": 1 / 3} and t.last == {"time": 0.1 * 3, "x": 1 / 3 + 3}
+    with create(["time", "x"], 0.1) as t:
+        assert t.last == {"time": 0.1, "x": 1 / 3 + 1}
+        t.write([0.2, 7.0])
+    COMM.barrier()
+    assert table(folder / "t.csv") == [["time", "x"], ["0.0", repr(1 / 3)], ["0.1", repr(1 / 3 + 1)], ["0.2", "7.0"]]
+    with pytest.raises(uem.CheckpointError, match="t.csv belongs to another run: expected the columns time, y, found time,x"):
+        create(["time", "y"], 0.2)
+    with pytest.raises(ValueError, match="t.csv is closed"):
+        t.write([0.3, 8.0])
+    assert len(table(folder / "t.csv")) == 4
+    COMM.barrier()
+    if COMM.rank == 0:
+        with (folder / "t.csv").open("a", newline="") as file:
+            file.write("soon,4.3\r\n")
+    COMM.barrier()
+    with pytest.raises(ValueError, match="soon"):
+        create(["time", "x"], 10.0)
+    impact = Impact(moving=False)
+    uem.EnergyBook(impact.problem, path=folder / "e.csv").close()
+    list(uem.time_steps(impact.problem, DT, 0.02))
+    COMM.barrier()
+    uem.EnergyBook(impact.problem, path=folder / "e.csv", resume=True).close()
+    assert COMM.rank > 0 or "e.csv ends at time 0 and is gone on with at 0.02" in caplog.text
+
+
+def test_what_dynamics_refuse():
+    """A load that is not finite, the dynamics of another problem, and a velocity that is another space's on one rank alone."""
+    impact = Impact(moving=False)
+    impact.problem.load = lambda t: setattr(impact.push, "value", np.nan)
+    with pytest.raises(uem.NotFiniteError, match="forces at the start, time 0, hold NaN"):
+        next(uem.time_steps(impact.problem, DT, END))
+    F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(impact.u, ufl.TestFunction(impact.V)) * ufl.dx
+    with pytest.raises(uem.SpaceError, match="dynamics belong to another problem"):
+        uem.UnitedProblem(F, impact.u, dynamics=impact.problem.dynamics)
+    # one rank has a Function of the right size by chance
+    lone = fem.Function(compat.function_space(Impact(MPI.COMM_SELF).s.mesh, 2, (2,)))
+    fits = fem.Function(impact.V)
+    velocity = fits if COMM.rank == 0 and COMM.size > 1 else lone
+    with pytest.raises(uem.SpaceError, match="velocity belongs to another space"):
+        uem.UnitedProblem(F, impact.u, dynamics=uem.Dynamics(uem.lumped_mass(impact.V, 1.0), velocity=velocity))

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.log import logger
 from uem_dolfinx.results import contact_suffixes
+from uem_dolfinx.steps import set_time
 from uem_dolfinx.tables import CsvTable
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ class EnergyBook:
 
     Raises:
         SpaceError: if the problem has no dynamics.
+        CheckpointError, OSError: see ``CsvTable``.
     """
 
     def __init__(
@@ -102,13 +105,21 @@ class EnergyBook:
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
         self._impulse = np.array([[begin.get(f"impulse_{a}{s}", 0.0) for a in axes] for s in suffixes])
         self._impulse = self._impulse.reshape(len(suffixes), len(axes))
+        if begin and begin["time"] != self.dynamics.time:
+            logger.warning(
+                "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
+                path, begin["time"], self.dynamics.time,
+            )  # fmt: skip
+        # the work of the first step begins with the load of this instant
+        set_time(problem, self.dynamics.time)
         self._look()
         # the sum at the start, from which the defect is counted
-        self._first = sum(begin.get(n, 0.0) for n in ("kinetic", "stored", "dissipated", "damped"))
-        self._first -= sum(begin.get(n, 0.0) for n in ("external", "contact", "defect"))
-        if not begin:
-            self._first = sum(self._held())
-            self._enter(self._held())
+        if self.table is not None and begin:
+            self._first = sum(self.table.first[name] for name in ("kinetic", "stored", "dissipated"))
+        else:
+            held = self._held()
+            self._first = sum(held)
+            self._enter(held)
 
     def _look(self) -> None:
         """Take the forces and the displacement of this instant (collective)."""

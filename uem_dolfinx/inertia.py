@@ -14,7 +14,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
-from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError, agree
 from uem_dolfinx.log import logger, timed
 
 if TYPE_CHECKING:
@@ -123,10 +123,13 @@ class Dynamics:
     ):
         if contactors not in ("massless", "massy"):
             raise ValueError(f"contactors = '{contactors}': expected 'massless' or 'massy'")
+        if not np.isfinite(time):
+            raise ValueError(f"time = {time}: expected a number")
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.number, self.longest = 0, np.inf
+        self._attached = False
         #: Factor of M in the tangent.
         self.factor = 0.0
         #: Whether the acceleration fits the forces yet.
@@ -138,18 +141,24 @@ class Dynamics:
         """Take in the problem's displacement; returns the damping form (collective).
 
         Raises:
-            SpaceError: if mass or velocity belong to another space.
+            SpaceError: if mass or velocity belong to another space, or these dynamics to another problem.
             NotFiniteError: if the velocity or gravity is not finite.
             ValueError: if they have the wrong shape.
         """
+        if self._attached:
+            raise SpaceError("these dynamics belong to another problem: make new ones for every problem")
+        self._attached = True
         self.config, g = config, config.gdim
         self._n = g * config.n_owned
         wanted = self._n, g * config.index_map.size_global
+        error = None
         if tuple(self.mass.M.getSizes()[0]) != wanted:
-            raise SpaceError(
+            error = SpaceError(
                 f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
                 "function space of the displacement"
             )
+        # on other ranks the parts may be equally large by chance
+        agree(config.comm, error)
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
         self._set_velocity()
@@ -173,8 +182,10 @@ class Dynamics:
     def _set_velocity(self) -> None:
         v, g = self.start_velocity, self.config.gdim
         if isinstance(v, fem.Function):
+            error = None
             if v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array):
-                raise SpaceError("the velocity belongs to another space: make it with the function space of the displacement")
+                error = SpaceError("the velocity belongs to another space: make it with the function space of the displacement")
+            agree(self.config.comm, error)
             self.velocity.x.array[:] = v.x.array
         elif v is not None:
             if np.shape(v) != (g,):
@@ -224,6 +235,10 @@ class Dynamics:
             self._rate.value = self._v_rate
             self._past.x.array[:] = self._v_past - self._v_rate * u
 
+    def restore(self) -> None:
+        """Leave a step that has begun; the forces are those of the committed state again."""
+        self._until, self._moving = self.time, False
+
     def load(self) -> PETSc.Vec:
         """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
         load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
@@ -255,8 +270,13 @@ class Dynamics:
             F: static residual minus weight.
 
         Raises:
+            NotFiniteError: if the forces are not finite.
             LinearSolveError: if the masses are negative.
         """
+        if not np.isfinite(F.norm()):
+            raise NotFiniteError(
+                f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
+            )
         M = self.mass.M.PtAP(restriction.P)
         rhs = restriction.reduce(restriction.pass_on(F))
         diagonal = M.getDiagonal()
@@ -298,10 +318,6 @@ class Dynamics:
                 field.x.scatter_forward()
             self.time, self._moving = self._until, False
         self.remember()
-
-    def restore(self) -> None:
-        """Go back to the committed state."""
-        self._until, self._moving = self.time, False
 
     def remember(self) -> None:
         """Take displacement, velocity and acceleration as they are for the start of the next step."""

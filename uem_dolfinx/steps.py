@@ -19,6 +19,7 @@ from uem_dolfinx.errors import (
     NotFiniteError,
     SpaceError,
     TunnellingError,
+    UEMError,
 )
 from uem_dolfinx.log import logger, progress
 
@@ -36,6 +37,8 @@ SHORTEST_STEP = 1.0 / 1024
 EASY = 6
 #: A remainder of a step below this part of it is rounding.
 NOTHING = 1e-9
+#: Rounding of a time, relative to the largest.
+TIME_ROUNDING = 4 * np.finfo(float).eps
 #: What a shorter step may mend.
 MENDABLE = (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError)
 
@@ -171,7 +174,8 @@ def time_steps(
         An iterator of converged steps.
 
     Raises:
-        ValueError: if ``dt`` is not positive, ``end`` not finite or ``event_tolerance`` not between 0 and 1.
+        ValueError: if ``dt`` is not positive, or too short to be told from rounding of the time, ``end`` before the start or not
+            finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
@@ -181,9 +185,14 @@ def time_steps(
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
-    if not 0.0 < dt < np.inf or not np.isfinite(end) or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
+    if not 0.0 < dt < np.inf or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
+        raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
+    if not dynamics.start <= end < np.inf:
+        raise ValueError(f"end = {end}: expected a time that is not before the start, {dynamics.start:.6g}")
+    if _rounding(dynamics, dt, end) > SHORTEST_STEP * dt:
         raise ValueError(
-            f"dt = {dt}, end = {end}, event_tolerance = {event_tolerance}: expected dt > 0, a finite end and a tolerance between 0 and 1"
+            f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
+            "take longer steps"
         )
     if checkpoint is not None and not checkpoint.begun:
         checkpoint.begin(problem.state())
@@ -195,27 +204,28 @@ def _time_steps(
     problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
 ) -> Iterator[TimeStep]:
     """The steps of ``time_steps``."""
-    _set_time(problem, dynamics.time)
+    set_time(problem, dynamics.time)
     problem.system.accelerate()
-    cuts, before = 0, _touching(problem)
-    while (remainder := end - dynamics.time) > NOTHING * dt:
+    cuts, before, rounding = 0, _touching(problem), _rounding(dynamics, dt, end)
+    while (remainder := end - dynamics.time) > rounding:
         # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
         passed = (dynamics.time - dynamics.start) / dt
-        rest = min((np.floor(passed + NOTHING) + 1.0 - passed) * dt, remainder)
-        length = min(dynamics.longest, dt if abs(rest - dt) <= NOTHING * dt else rest)
+        rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
+        length = min(dynamics.longest, dt if abs(rest - dt) <= rounding else rest)
         try:
             length, iterations = _step(problem, length, before, tolerance)
-        except MENDABLE as error:
-            _set_time(problem, dynamics.time)
+        except UEMError as error:
+            dynamics.restore()
+            set_time(problem, dynamics.time)
             problem.restore()
-            cuts, dynamics.longest = cuts + 1, 0.5 * length
-            if dynamics.longest < SHORTEST_STEP * dt:
+            if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_STEP * dt:
                 raise
+            cuts, dynamics.longest = cuts + 1, 0.5 * length
             logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, dynamics.longest)
             continue
         problem.commit()
         nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
-        if abs(dynamics.time - nearest) <= NOTHING * dt:
+        if abs(dynamics.time - nearest) <= rounding:
             dynamics.time = float(nearest)
         if len(iterations) - 1 <= EASY:
             dynamics.longest *= 2.0
@@ -261,8 +271,8 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
 def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     """Find the state at the end of a step of this length (collective)."""
     assert problem.dynamics is not None
+    set_time(problem, problem.dynamics.time + length)
     problem.dynamics.begin(length)
-    _set_time(problem, problem.dynamics.time + length)
     iterations = problem.attempt()
     check_tunnelling(problem.system, problem.committed)
     return iterations
@@ -273,7 +283,12 @@ def _touching(problem: UnitedProblem) -> list[bool]:
     return [contact.n_active > 0 for contact in problem.contacts]
 
 
-def _set_time(problem: UnitedProblem, time: float) -> None:
+def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
+    """Difference of times that means nothing."""
+    return max(NOTHING * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))
+
+
+def set_time(problem: UnitedProblem, time: float) -> None:
     """Set loads and Dirichlet values of an instant."""
     if isinstance(problem.load, fem.Constant):
         problem.load.value = time
