@@ -68,6 +68,9 @@ class UnitedProblem:
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
 
+    #: Brings bodies and contact together for the Newton loop; a subclass may reach contact in another way.
+    system_type: Callable[..., BodySystem] = BodySystem
+
     def __init__(
         self,
         F: ufl.Form,
@@ -96,7 +99,7 @@ class UnitedProblem:
         self.comm = self.config.comm
         self.contacts, self.dynamics, self.materials = list(contacts), dynamics, list(materials)
         damping = dynamics.attach(self.config) if dynamics is not None else None
-        self.system = BodySystem(
+        self.system = self.system_type(
             self.config,
             F if damping is None else F + damping,
             bcs,

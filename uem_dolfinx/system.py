@@ -25,7 +25,7 @@ from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import MeshTarget
 from uem_dolfinx.surfaces import followed_nodes
-from uem_dolfinx.tangent import Tangent
+from uem_dolfinx.tangent import Tangent, contact_curvature
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -405,31 +405,7 @@ class BodySystem:
         parts = [pair.curvature() for pair in self.pairs if pair.sliding == "finite"]
         if not self.comm.allreduce(sum(len(nodes) for nodes, _ in parts)):
             return None
-        g = self.config.gdim
-        # how many blocks meet at each node bounds the length of its rows
-        counts = self._du_like()
-        for nodes, _ in parts:
-            width = nodes.shape[1]
-            flat = nodes[nodes >= 0].astype(PETSc.IntType)
-            index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
-            counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
-        counts.assemble()
-        n = counts.getLocalSize()
-        rows = np.minimum(counts.array_r, counts.getSize())
-        G = PETSc.Mat().createAIJ(
-            (self._b.getSizes(), self._b.getSizes()),
-            bsize=g,
-            nnz=(np.minimum(rows, n).astype(PETSc.IntType), np.minimum(rows, counts.getSize() - n).astype(PETSc.IntType)),
-            comm=self.comm,
-        )
-        G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
-        # a rank without nodes would not be told, and then assemble otherwise than the others
-        G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
-        for nodes, blocks in parts:
-            for row, block in zip(nodes.astype(PETSc.IntType), blocks):
-                G.setValuesBlocked(row, row, block, addv=PETSc.InsertMode.ADD)
-        G.assemble()
-        return G
+        return contact_curvature(parts, self._du_like())
 
     def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
         """Unknowns dq and the number of linear iterations."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.materials import HistoryMaterial
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 
 class Tangent:
@@ -72,3 +73,38 @@ class Tangent:
                 self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         self._values, self._factor = values, factor
         self.number += 1
+
+
+def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PETSc.Mat:
+    """Matrix of ``-sum lambda grad^2 g``, to be added to K (collective).
+
+    Args:
+        parts: of every pair, global nodes ``(k, m)``, negative where there is none, and the blocks ``(k, m gdim, m gdim)``.
+        du: a vector with the displacement's layout.
+    """
+    g = du.getBlockSize()
+    # how many blocks meet at each node bounds the length of its rows
+    counts = du.duplicate()
+    counts.set(0.0)
+    for nodes, _ in parts:
+        width = nodes.shape[1]
+        flat = nodes[nodes >= 0].astype(PETSc.IntType)
+        index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
+        counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
+    counts.assemble()
+    n = counts.getLocalSize()
+    rows = np.minimum(counts.array_r, counts.getSize())
+    G = PETSc.Mat().createAIJ(
+        (du.getSizes(), du.getSizes()),
+        bsize=g,
+        nnz=(np.minimum(rows, n).astype(PETSc.IntType), np.minimum(rows, counts.getSize() - n).astype(PETSc.IntType)),
+        comm=du.comm,
+    )
+    G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+    # a rank without nodes would not be told, and then assemble otherwise than the others
+    G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
+    for nodes, blocks in parts:
+        for row, block in zip(nodes.astype(PETSc.IntType), blocks):
+            G.setValuesBlocked(row, row, block, addv=PETSc.InsertMode.ADD)
+    G.assemble()
+    return G

@@ -1,0 +1,106 @@
+"""Every method by its name, as a problem with the arguments, steps and results of ``UnitedProblem``."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+import uem_dolfinx as uem
+from evidence.lagrange import LagrangeSystem
+from evidence.penalty import NodePoints, PenaltySystem, SurfacePoints
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    import ufl
+    from dolfinx import fem
+
+#: Every method, the package itself first.
+METHODS = ("united", "penalty", "penalty_surface", "lagrange", "augmented", "barrier")
+#: Those that need a number.
+NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
+#: Overlap at which Uzawa's multipliers are good enough, as part of the model's size.
+UZAWA_OVERLAP = 1e-9
+#: Linear solves of a step: every update of the multipliers takes one or more.
+MOST_UZAWA_ITERATIONS = 400
+MOST_BARRIER_ITERATIONS = 400
+
+
+class OtherProblem(uem.UnitedProblem):
+    """A problem whose contact is reached by another method."""
+
+    def __init__(self, F: ufl.Form, u: fem.Function, system_type: Callable[..., Any], **options: Any):
+        self.system_type = system_type
+        super().__init__(F, u, **options)
+
+
+def available(method: str) -> bool:
+    """Whether what the method needs is installed."""
+    return method != "barrier" or importlib.util.find_spec("ipctk") is not None
+
+
+def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None = None, **options: Any) -> uem.UnitedProblem:
+    """A problem that reaches contact by ``method``.
+
+    Args:
+        method: one of ``METHODS``.
+        F: as for ``UnitedProblem``.
+        u: likewise.
+        parameter: stiffness of the springs, a pressure per length (penalty, penalty_surface, augmented); distance at which the
+            barrier begins, a length (barrier).
+        options: as for ``UnitedProblem``.
+    """
+    if method not in METHODS:
+        raise ValueError(f"'{method}' is not known here: expected one of {', '.join(METHODS)}")
+    if (method in NEED_PARAMETER) != (parameter is not None):
+        raise ValueError(f"{method} {'needs a parameter' if parameter is None else 'has no parameter'}")
+    if method == "united":
+        return uem.UnitedProblem(F, u, **options)
+    if method == "lagrange":
+        return OtherProblem(F, u, LagrangeSystem, **options)
+    tags = [contact.contactor for contact in options.get("contacts", ())]
+    if method == "barrier":
+        from evidence.barrier import BarrierSystem
+
+        options.setdefault("max_iterations", MOST_BARRIER_ITERATIONS)
+        return OtherProblem(F, u, partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter), **options)
+    system = partial(
+        PenaltySystem, tags=tags, stiffness=parameter, points=SurfacePoints if method == "penalty_surface" else NodePoints
+    )
+    if method == "augmented":
+        options.setdefault("max_iterations", MOST_UZAWA_ITERATIONS)
+        system = partial(system, overlap=UZAWA_OVERLAP)
+    return OtherProblem(F, u, system, **options)
+
+
+def counts(steps: Iterable[uem.LoadStep]) -> tuple[int, int]:
+    """Newton iterations and linear iterations of load steps."""
+    histories = [step.iterations for step in steps]
+    return sum(len(h) - 1 for h in histories), sum(i.linear_iterations for h in histories for i in h)
+
+
+def condition_number(problem: uem.UnitedProblem) -> float:
+    """Largest over smallest magnitude of the eigenvalues of the last linear system (serial).
+
+    Idle unknowns are left out; the equations of a saddle point are scaled by the mean diagonal of K.
+    """
+    system = problem.system
+    matrix = system.saddle if isinstance(system, LagrangeSystem) else system.solver.A
+    indptr, columns, values = matrix.getValuesCSR()
+    A = csr_matrix((values, columns, indptr), shape=matrix.getSize())
+    off = A - diags(A.diagonal())
+    idle = (
+        np.abs(off).sum(axis=1).A1 if hasattr(np.abs(off).sum(axis=1), "A1") else np.asarray(np.abs(off).sum(axis=1)).ravel()
+    ) == 0
+    A = A[~idle][:, ~idle].tocsc()
+    start = np.random.default_rng(0).standard_normal(A.shape[0])
+    solver = splu(A)
+    inverse = LinearOperator(A.shape, matvec=solver.solve)
+    largest = eigsh(A, k=1, which="LM", return_eigenvectors=False, v0=start, tol=1e-6)
+    smallest = eigsh(inverse, k=1, which="LM", return_eigenvectors=False, v0=start, tol=1e-6)
+    return float(abs(largest[0]) * abs(smallest[0]))

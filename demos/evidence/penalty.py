@@ -1,0 +1,309 @@
+"""The penalty method and the augmented Lagrange method of Uzawa, on the surfaces, search and Newton loop of the package.
+
+Points of the contactor surface are pushed back by springs, t = <lam - stiffness * area * gap>, that act on the nodes of the
+contactor's facet and of the target's with their shape functions. The points are the contactors themselves (node to surface) or
+quadrature points of the contactor's facets (integrated over the surface). Newton's method gets the exact tangent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.equations import UnitingEquations
+from uem_dolfinx.log import timed
+from uem_dolfinx.newton import United
+from uem_dolfinx.restriction import Restriction
+from uem_dolfinx.search import FacetProjection, Projection
+from uem_dolfinx.surfaces import TargetFacets, tributary_areas
+from uem_dolfinx.system import ROUNDING, BodySystem
+from uem_dolfinx.tangent import contact_curvature
+from uem_dolfinx.uniting import END_HOLDS
+
+if TYPE_CHECKING:
+    from uem_dolfinx.mesh import Tag
+    from uem_dolfinx.uniting import ContactPair
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+#: A multiplier is brought up to date when the bodies are in equilibrium to this part of the forces.
+SETTLED = 1e-8
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Points of a contactor surface, and where they stand relative to the target.
+
+    Attributes:
+        nodes: local nodes that each point moves with ``(k, nb)``.
+        shape: their shape functions ``(k, nb)``.
+        area: reference area that each point stands for ``(k,)``.
+        projection: of the points onto the target.
+        touching: points that may be pushed: in front of the target or inside, not past its end ``(k,)``.
+        force: with which each is pushed along the normal ``(k,)``.
+    """
+
+    nodes: Ints
+    shape: Array
+    area: Array
+    projection: Projection
+    touching: npt.NDArray[np.bool_]
+    force: Array
+
+
+def facet_rule(cell: str, n: int) -> tuple[Array, Array]:
+    """Gauss points ``(k, fdim)`` and weights of a reference facet, n in every direction; on a triangle they collapse at a corner."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    x, w = 0.5 * (x + 1), 0.5 * w
+    if cell == "interval":
+        return x[:, None], w
+    a, b = (grid.ravel() for grid in np.meshgrid(x, x, indexing="ij"))
+    weights = np.outer(w, w).ravel()
+    if cell == "quadrilateral":
+        return np.column_stack([a, b]), weights
+    return np.column_stack([a, b * (1 - a)]), weights * (1 - a)
+
+
+class NodePoints:
+    """The contactors themselves, each with its tributary area."""
+
+    def __init__(self, pair: ContactPair, tag: Tag):
+        self.pair = pair
+        self.nodes = pair.nodes[:, None].astype(np.int64)
+        self.shape = np.ones((len(pair.nodes), 1))
+        self.area = tributary_areas(pair.config, tag)[pair.nodes]
+
+    def project(self) -> Projection:
+        """Where the points stand; the pair knows (collective)."""
+        return self.pair.projection
+
+    def off(self, projection: Projection) -> npt.NDArray[np.bool_]:
+        """Points past the target's end; the pair knows ``(k,)``."""
+        return self.pair.off
+
+    def begin(self) -> None:
+        """Begin a step."""
+
+
+class SurfacePoints:
+    """Quadrature points of the contactor's facets."""
+
+    def __init__(self, pair: ContactPair, tag: Tag):
+        self.pair, config = pair, pair.config
+        facets = TargetFacets(config, tag)
+        xi, w = facet_rule(facets.shape.cell, config.degree + 1)
+        tab = facets.shape.tabulate(xi)
+        t = np.einsum("qaf,mag->mqfg", tab.dN, config.X[facets.dofs])
+        stretch = np.sqrt(np.linalg.det(np.einsum("mqfg,mqeg->mqfe", t, t)))
+        self.area = (stretch * w).ravel()
+        self.nodes = np.repeat(facets.dofs, len(w), axis=0).astype(np.int64)
+        self.shape = np.tile(tab.N, (len(facets.dofs), 1))
+        self._anchor: Any = None
+
+    def project(self) -> Projection:
+        """Where the points stand (collective)."""
+        points = np.einsum("ka,kag->kg", self.shape, self.pair.config.x[self.nodes])
+        if self.pair.sliding == "finite" or self._anchor is None:
+            projection = self._anchor = self.pair.target.project(points)
+            return projection
+        return self.pair.target.follow(points, self._anchor)
+
+    def off(self, projection: Projection) -> npt.NDArray[np.bool_]:
+        """Points past the target's end ``(k,)``."""
+        if not isinstance(projection, FacetProjection):
+            return np.zeros(len(self.area), dtype=bool)
+        facet = np.linalg.norm(projection.x[:, 0] - projection.x[:, 1], axis=1)
+        return np.linalg.norm(projection.beyond, axis=1) > END_HOLDS * facet
+
+    def begin(self) -> None:
+        """Begin a step: small sliding looks for its feet anew."""
+        if self.pair.sliding == "small":
+            self._anchor = None
+
+
+class PenaltySystem(BodySystem):
+    """Contact by springs; arguments beyond those of ``BodySystem``:
+
+    Args:
+        tags: contactor of every contact.
+        stiffness: of the springs, a pressure per length.
+        points: ``NodePoints`` or ``SurfacePoints``.
+        overlap: at which the multipliers are good enough, as part of the model's size; None is plain penalty.
+    """
+
+    def __init__(self, *args: Any, tags: list[Tag], stiffness: float, points: type, overlap: float | None = None, **options: Any):
+        self._tags, self._stiffness_of_springs, self._points_type, self._overlap = tags, stiffness, points, overlap
+        self._springs: list[Springs] = []
+        self._A: PETSc.Mat | None = None
+        super().__init__(*args, **options)
+
+    def add_pairs(self, pairs: list[ContactPair]) -> None:
+        """Take in the contact pairs (collective)."""
+        super().add_pairs(pairs)
+        self.floating, self.contestable = None, False
+        self._points = []
+        for pair, tag in zip(self.pairs, self._tags):
+            # springs know nothing of control gaps
+            pair.control = None
+            self._points.append(self._points_type(pair, tag))
+        self._none = [np.zeros(len(p.area)) for p in self._points]
+        self._multipliers = self._committed = self._none
+        self._known = [pair.committed for pair in self.pairs]
+
+    def land(self) -> None:
+        """Begin a step with the multipliers of the last converged one."""
+        committed = [pair.committed for pair in self.pairs]
+        if any(now is not then for now, then in zip(committed, self._known)):
+            self._committed = [s.force for s in self._springs]
+        self._known = committed
+        for points in self._points:
+            points.begin()
+        self._multipliers = list(self._committed if self._overlap else self._none)
+
+    def place(self, returning: bool) -> None:
+        """Project the contactors; none is put back."""
+        super().place(returning=False)
+
+    # -- forces of the springs ---------------------------------------------------------------------------------------------
+
+    def _stretch(self) -> tuple[PETSc.Vec, float]:
+        """Forces of the springs on the bodies, and the deepest overlap (collective); keeps the springs."""
+        config, g = self.config, self.config.gdim
+        self._springs, overlap = [], 0.0
+        total = self._du_like()
+        total.set(0.0)
+        for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
+            p = points.project()
+            touching = ~points.off(p)
+            force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * touching
+            self._springs.append(s := Springs(points.nodes, points.shape, points.area, p, touching, force))
+            pushed = force > 0
+            overlap = max(overlap, float(np.max(np.abs(p.gap) if self._overlap else -p.gap, where=pushed, initial=0.0)))
+            self._hand_on(total, s)
+            self._tell(pair, s)
+        total.assemble()
+        return total, max(self.comm.allgather(overlap))
+
+    def _hand_on(self, total: PETSc.Vec, s: Springs) -> None:
+        """Add the forces of a pair's springs at the nodes of both bodies."""
+        g = self.config.gdim
+        nodes, weights = self._both(s)
+        t = s.force[:, None, None] * weights[..., None] * s.projection.normal[:, None, :]
+        rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        total.setValues(rows, t.ravel(), addv=PETSc.InsertMode.ADD)
+
+    def _both(self, s: Springs) -> tuple[Ints, Array]:
+        """Global nodes on both sides of each spring, and the weights of the gap in their displacements ``(k, nb + nn)``."""
+        return (
+            np.concatenate([self.config.to_global(s.nodes), s.projection.nodes], axis=1),
+            np.concatenate([s.shape, -s.projection.weights], axis=1),
+        )
+
+    def _tell(self, pair: ContactPair, s: Springs) -> None:
+        """Let the pair know the nodal contact forces (collective)."""
+        on_node = s.shape * s.force[:, None]
+        lam = self.config.to_owners(s.nodes.ravel(), on_node.ravel())[pair.nodes]
+        parts = (on_node[..., None] * s.projection.normal[:, None, :]).reshape(-1, self.config.gdim)
+        force = np.column_stack([self.config.to_owners(s.nodes.ravel(), f)[pair.nodes] for f in parts.T])
+        pair.trial = replace(pair.trial, active=lam > 0, lam=lam, nodal=lam, force=force)
+
+    # -- the loop's questions ----------------------------------------------------------------------------------------------
+
+    def _restrict(self, chords: bool = False) -> tuple[Restriction, None]:
+        """P of the Dirichlet conditions alone."""
+        n = self.config.n_owned
+        prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
+        return Restriction(self.config, UnitingEquations.join([], self.config.gdim), self.free[:n], prescribed, False), None
+
+    def unite(self, cautious: bool) -> United:
+        """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
+        F = self.residual
+        restriction, _ = self._restrict()
+        with timed("springs"):
+            forces, overlap = self._stretch()
+            R = restriction.reduce(F - forces)
+            changed, rounding = False, self._rounding_of_springs()
+            if self._overlap and R.norm() <= max(SETTLED * F.norm(), rounding) and overlap > self._overlap * self.config.size:
+                self._multipliers = [s.force for s in self._springs]
+                forces, _ = self._stretch()
+                R, changed = restriction.reduce(F - forces), True
+        short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
+        largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
+        short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
+        closed = bool(short <= 4 * np.finfo(float).eps * largest)
+        active = sum(pair.n_active for pair in self.pairs)
+        return United(
+            restriction, restriction, R, R.norm(), F.norm(), rounding, self._strain_rounding(), overlap, active, changed, closed
+        )
+
+    def _rounding_of_springs(self) -> float:
+        """Norm of the forces that rounding of positions can make, in bodies and springs (collective)."""
+        rounding = self.rounding()
+        for s in self._springs:
+            on = s.force > 0
+            x = np.abs(self.config.x[s.nodes[on, 0]]).max(initial=0.0)
+            stiffest = (self._stiffness_of_springs * s.area[on]).max(initial=0.0) * np.sqrt(max(on.sum(), 1))
+            rounding += ROUNDING * max(self.comm.allgather(float(x * stiffest)))
+        return rounding
+
+    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+        """Tangent of bodies and springs; returns the right-hand side."""
+        compat.free_petsc_garbage(self.comm)
+        if first or self.newton == "full":
+            self.tangent.update()
+            self._stiffness = self.tangent.K.getDiagonal()
+        sliding = any(pair.sliding == "finite" for pair in self.pairs)
+        on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
+        made_of = self.comm.allgather((self.tangent.number, on))
+        if self._A is None or sliding or made_of != self._factored:
+            with timed("springs"):
+                A = self._with_springs()
+            self.solver.set_operator(state.restriction, A, None)
+            self._A = A
+        self._factored = made_of
+        rhs = state.restriction.reduce(self._A * state.restriction.c)
+        rhs.axpy(1.0, state.residual)
+        rhs.scale(-1.0)
+        return rhs
+
+    def _with_springs(self) -> PETSc.Mat:
+        """``K + sum stiffness area grad g grad g' - t grad^2 g`` over the springs that push (collective)."""
+        blocks = [self._blocks(s) for s in self._springs]
+        A = self.tangent.K.copy()
+        if self.comm.allreduce(sum(len(nodes) for nodes, _ in blocks)):
+            A.axpy(1.0, contact_curvature(blocks, self._du_like()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        return A
+
+    def _blocks(self, s: Springs) -> tuple[Ints, Array]:
+        """Global nodes and stiffness of each spring that pushes."""
+        i = np.flatnonzero(s.force > 0)
+        nodes, weights = self._both(s)
+        nodes, size = nodes[i], nodes.shape[1] * self.config.gdim
+        slope = (weights[i, :, None] * s.projection.normal[i, None, :]).reshape(len(i), size)
+        blocks = self._stiffness_of_springs * s.area[i, None, None] * np.einsum("ki,kj->kij", slope, slope)
+        finite = isinstance(s.projection, FacetProjection) or s.projection.nodes.shape[1] == 0
+        if finite and self.consistent_tangent and any(pair.sliding == "finite" for pair in self.pairs):
+            blocks -= s.force[i, None, None] * self._bend(s, i)
+        return nodes, blocks
+
+    def _bend(self, s: Springs, i: Ints) -> Array:
+        """Second derivative of the gap in the displacements of the nodes on both sides."""
+        H = s.projection.hessians(i)
+        nb, nn, g = s.shape.shape[1], s.projection.nodes.shape[1], self.config.gdim
+        spread = np.zeros((len(i), 1 + nn, nb + nn))
+        spread[:, 0, :nb] = s.shape[i]
+        spread[:, np.arange(1, 1 + nn), nb + np.arange(nn)] = 1.0
+        H = H.reshape(len(i), 1 + nn, g, 1 + nn, g)
+        return np.einsum("kpa,kpgqh,kqb->kagbh", spread, H, spread, optimize=True).reshape(len(i), (nb + nn) * g, (nb + nn) * g)
+
+    def reduced_residual(self, state: United) -> PETSc.Vec:
+        """Out-of-balance forces at the present displacement (collective)."""
+        self.place(returning=False)
+        forces, _ = self._stretch()
+        return state.restriction.reduce(self.residual - forces)
