@@ -53,6 +53,9 @@ def every_converged_state(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def checked(self: uem.UnitedProblem, **how: Any) -> list[Any]:
         history = attempt(self, **how)
+        if type(self) is not uem.UnitedProblem:
+            # another method of contact keeps other conditions
+            return history
         # a step that unloads is in equilibrium against the forces that were there before
         largest[self] = max(largest.get(self, 0.0), self.system.residual.norm())
         check_state(self, largest[self])

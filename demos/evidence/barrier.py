@@ -14,7 +14,9 @@ import ipctk
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
+from scipy.sparse import coo_matrix
 
+from evidence.line_search import flat_length
 from uem_dolfinx import compat
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import SpaceError
@@ -35,8 +37,6 @@ Array = npt.NDArray[np.float64]
 
 #: A step that would collide is shortened to this part of the way to the collision.
 SHY = 0.9
-#: Shortest step of the line search.
-SHORTEST = 2.0**-20
 #: Bodies nearer than this part of dhat at the start are lifted.
 TOO_NEAR = 1e-3
 
@@ -143,8 +143,6 @@ class BarrierSystem(BodySystem):
                 rows.append(np.broadcast_to(dofs[:, :, None], blocks.shape).ravel())
                 columns.append(np.broadcast_to(dofs[:, None, :], blocks.shape).ravel())
                 values.append(blocks.ravel())
-        from scipy.sparse import coo_matrix
-
         S = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=A.getSize()).tocsr()
         if S.nnz:
             csr = (S.indptr.astype(PETSc.IntType), S.indices.astype(PETSc.IntType), S.data)
@@ -218,16 +216,16 @@ class BarrierSystem(BodySystem):
             length = self._free_way(start, step)
             slope = dq.dot(state.residual)
             if state.restriction.c.norm() == 0.0 and slope < 0.0:
-                while length > SHORTEST:
+
+                def look(length: float) -> tuple[float, float]:
                     self.u.x.array[:] = start + length * step
-                    super().place(returning=False)
-                    if (
-                        self.inverted() is None
-                        and self.assemble_residual()
-                        and dq.dot(self._out_of_balance(state.restriction)) <= 0.1 * -slope
-                    ):
-                        break
-                    length *= 0.5
+                    self.place(returning=False)
+                    if self.inverted() is not None or not self.assemble_residual():
+                        return np.inf, np.inf
+                    residual = self._out_of_balance(state.restriction)
+                    return float(dq.dot(residual)), residual.norm()
+
+                length = flat_length(look, (slope, state.norm), length)
         self.u.x.array[:] = start
         super().place(returning=False)
         self._alpha = length

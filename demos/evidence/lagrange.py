@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import coo_matrix
 
 from uem_dolfinx import compat
 from uem_dolfinx.equations import UnitingEquations
@@ -60,7 +61,7 @@ class LagrangeSystem(BodySystem):
         self.floating = None
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
-        """Saddle-point matrix; returns the right-hand side of its first row."""
+        """Saddle-point matrix; returns what drives the step, as the united system would feel it."""
         compat.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
             self.tangent.update()
@@ -90,9 +91,13 @@ class LagrangeSystem(BodySystem):
         self._short = self._G_all * self._c
         self._short.array[:] += equations.gap
         self._short.array[:] *= -self._scale
-        # the equations are scaled, and so are the multipliers
-        rhs = _vector(self._du_like(), -np.where(free, load.array_r.reshape(free.shape), 0.0))
-        return rhs
+        self._load = _vector(self._du_like(), -np.where(free, load.array_r.reshape(free.shape), 0.0))
+        self._restriction = state.restriction
+        load = self._A * state.step.c
+        load.axpy(1.0, self.residual)
+        driving = state.restriction.reduce(state.restriction.pass_on(load))
+        driving.scale(-1.0)
+        return driving
 
     def _build(self, equations: UnitingEquations, curvature: PETSc.Mat | None) -> None:
         """Matrix, and the solver for it (collective)."""
@@ -137,12 +142,10 @@ class LagrangeSystem(BodySystem):
         nodes = np.concatenate([own, equations.followed])
         columns = (nodes[:, None] * g + np.arange(g)).ravel()
         values = np.concatenate([equations.direction.ravel(), -equations.coefficients.ravel()])
-        order = np.lexsort((columns, rows))
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=m))]).astype(PETSc.IntType)
-        G = PETSc.Mat().createAIJ(
-            ((m, PETSc.DETERMINE), sizes), csr=(indptr, columns[order].astype(PETSc.IntType), values[order]), comm=self.comm
-        )
-        return G
+        # a quadratic surface may name a node twice in one equation
+        G = coo_matrix((values, (rows, columns)), shape=(m, sizes[1])).tocsr()
+        csr = (G.indptr.astype(PETSc.IntType), G.indices.astype(PETSc.IntType), G.data)
+        return PETSc.Mat().createAIJ(((m, PETSc.DETERMINE), sizes), csr=csr, comm=self.comm)
 
     def _with_options(self, do: Any, *args: Any) -> None:
         database = PETSc.Options()
@@ -155,10 +158,10 @@ class LagrangeSystem(BodySystem):
                 del database[self._prefix + key]
 
     def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
-        """Free displacements and the number of linear iterations."""
+        """Unknowns q, by which the loop judges its steps, and the number of linear iterations."""
         b, x = self.saddle.createVecs()
         n = rhs.getLocalSize()
-        b.array[:n] = rhs.array_r
+        b.array[:n] = self._load.array_r
         b.array[n:] = self._short.array_r
         with timed("linear solve"):
             try:
@@ -169,14 +172,15 @@ class LagrangeSystem(BodySystem):
                 ) from error
         reason = self._ksp.getConvergedReason()
         b.axpy(-1.0, self.saddle * x)
-        if reason < 0 or not np.isfinite(x.norm()) or b.norm() > 1e-3 * max(rhs.norm(), self._short.norm()):
+        if reason < 0 or not np.isfinite(x.norm()) or b.norm() > 1e-3 * max(self._load.norm(), self._short.norm()):
             raise LinearSolveError(f"the saddle point is singular, or its solve failed with KSP reason {reason}")
-        return _vector(self._du_like(), x.array_r[:n]), int(self._ksp.getIterationNumber())
+        self._x = _vector(self._du_like(), x.array_r[:n])
+        return self._restriction.reduce(self._x), int(self._ksp.getIterationNumber())
 
     def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment with the prescribed displacements."""
         free = self.free[: self.config.n_owned].ravel()
-        return _vector(self._du_like(), np.where(free, dq.array_r, self._c.array_r))
+        return _vector(self._du_like(), np.where(free, self._x.array_r, self._c.array_r))
 
 
 def _vector(like: PETSc.Vec, values: np.ndarray) -> PETSc.Vec:

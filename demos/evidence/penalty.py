@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from evidence.line_search import flat_length
 from uem_dolfinx import compat
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.search import FacetProjection, Projection
+from uem_dolfinx.search import FacetProjection, MeshTarget, Projection
 from uem_dolfinx.surfaces import TargetFacets, tributary_areas
 from uem_dolfinx.system import ROUNDING, BodySystem
 from uem_dolfinx.tangent import contact_curvature
@@ -34,6 +35,12 @@ Ints = npt.NDArray[np.int64]
 
 #: A multiplier is brought up to date when the bodies are in equilibrium to this part of the forces.
 SETTLED = 1e-8
+#: After so many full Newton steps of a load step the line search sees to it that springs do not come and go for ever.
+FULL_STEPS = 2
+#: So near to equilibrium, as part of the forces, Newton's method needs no line search.
+NEAR_BY = 1e-5
+#: After so many steps normals are averaged, so that they no longer jump under a point at a vertex.
+AVERAGED_AFTER = 8
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,7 @@ class PenaltySystem(BodySystem):
         self._none = [np.zeros(len(p.area)) for p in self._points]
         self._multipliers = self._committed = self._none
         self._known = [pair.committed for pair in self.pairs]
+        self._averaged = [isinstance(pair.target, MeshTarget) and pair.target.averaged for pair in self.pairs]
 
     def land(self) -> None:
         """Begin a step with the multipliers of the last converged one."""
@@ -162,8 +170,10 @@ class PenaltySystem(BodySystem):
         if any(now is not then for now, then in zip(committed, self._known)):
             self._committed = [s.force for s in self._springs]
         self._known = committed
-        for points in self._points:
+        for pair, points, averaged in zip(self.pairs, self._points, self._averaged):
             points.begin()
+            if isinstance(pair.target, MeshTarget):
+                pair.target.averaged = averaged
         self._multipliers = list(self._committed if self._overlap else self._none)
 
     def place(self, returning: bool) -> None:
@@ -174,7 +184,6 @@ class PenaltySystem(BodySystem):
 
     def _stretch(self) -> tuple[PETSc.Vec, float]:
         """Forces of the springs on the bodies, and the deepest overlap (collective); keeps the springs."""
-        config, g = self.config, self.config.gdim
         self._springs, overlap = [], 0.0
         total = self._du_like()
         total.set(0.0)
@@ -258,6 +267,11 @@ class PenaltySystem(BodySystem):
         if first or self.newton == "full":
             self.tangent.update()
             self._stiffness = self.tangent.K.getDiagonal()
+        self._solves = 1 if first else self._solves + 1
+        if self._solves == AVERAGED_AFTER:
+            for pair in self.pairs:
+                if isinstance(pair.target, MeshTarget):
+                    pair.target.averaged = True
         sliding = any(pair.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
         made_of = self.comm.allgather((self.tangent.number, on))
@@ -301,6 +315,25 @@ class PenaltySystem(BodySystem):
         spread[:, np.arange(1, 1 + nn), nb + np.arange(nn)] = 1.0
         H = H.reshape(len(i), 1 + nn, g, 1 + nn, g)
         return np.einsum("kpa,kpgqh,kqb->kagbh", spread, H, spread, optimize=True).reshape(len(i), (nb + nn) * g, (nb + nn) * g)
+
+    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+        """The increment; after some full steps, only as much of it as the potential falls."""
+        du = super().move(state, dq)
+        slope = dq.dot(state.residual)
+        if self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.restriction.c.norm() > 0.0 or slope >= 0.0:
+            return du
+        start = self.displacement()
+
+        def look(length: float) -> tuple[float, float]:
+            self.displace(start, du, length)
+            if self.inverted() is not None or not self.assemble_residual():
+                return np.inf, np.inf
+            residual = self.reduced_residual(state)
+            return float(dq.dot(residual)), residual.norm()
+
+        du.scale(flat_length(look, (slope, state.norm)))
+        self.displace(start, du, 0.0)
+        return du
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
         """Out-of-balance forces at the present displacement (collective)."""
