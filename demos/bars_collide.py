@@ -46,6 +46,7 @@ sizes = {
 mesh, tags = uem.read_gmsh(common.MESHES / "bars.geo", comm, gdim=d, parameters=sizes)
 V = compat.function_space(mesh, 1, (d,))
 u, v, velocity = fem.Function(V, name="displacement"), ufl.TestFunction(V), fem.Function(V)
+mesh.topology.create_connectivity(d, d)
 for name, value in (("lower", args.v1), ("upper", args.v2)):
     velocity.x.array[fem.locate_dofs_topological(V.sub(1), d, tags[name].entities)] = value
 material = uem.LinearElastic(E, 0.0, kind="plane_stress" if d == 2 else "3d")

@@ -40,6 +40,7 @@ def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, floa
     E, strength = fem.Function(S), fem.Function(S)
     E.x.array[:], strength.x.array[:] = E_beam, np.inf
     E.x.array[tags["column"].entities], strength.x.array[tags["column"].entities] = E_column, limit
+    mesh.topology.create_connectivity(2, 2)
     velocity.x.array[fem.locate_dofs_topological(V.sub(1), 2, tags["column"].entities)] = -V0
     law = uem.VonMises(u, E, 0.3, strength, kind="plane_stress", strain="green_lagrange")
     mass = uem.nodal_mass(V, lambda x: np.where(x[:, 1] > 1.01, 1.0, 0.0))

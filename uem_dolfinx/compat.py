@@ -14,7 +14,6 @@ from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it load
 
 import basix
 import dolfinx.common
-import dolfinx.fem.petsc
 import numpy as np
 import ufl
 from dolfinx import cpp, fem, io, la, mesh
@@ -441,6 +440,13 @@ def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
     )
 
 
+def _petsc_forms() -> Any:
+    """``dolfinx.fem.petsc``, which is heavy on some versions."""
+    import dolfinx.fem.petsc
+
+    return dolfinx.fem.petsc
+
+
 def create_matrix(a: Any) -> PETSc.Mat:
     """Matrix with the layout, the block size and the sparsity of a compiled bilinear form.
 
@@ -450,7 +456,7 @@ def create_matrix(a: Any) -> PETSc.Mat:
     Returns:
         A matrix without values.
     """
-    return fem.petsc.create_matrix(a)
+    return _petsc_forms().create_matrix(a)
 
 
 def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
@@ -461,7 +467,7 @@ def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
         a: the compiled form.
     """
     A.zeroEntries()
-    fem.petsc.assemble_matrix(A, a, [])
+    _petsc_forms().assemble_matrix(A, a, [])
     A.assemble()
 
 
@@ -475,7 +481,7 @@ def create_vector(V: Any) -> PETSc.Vec:
         The vector.
     """
     if DOLFINX_VERSION >= (0, 10):
-        b = fem.petsc.create_vector(V)
+        b = _petsc_forms().create_vector(V)
     else:
         b = la.create_petsc_vector(V.dofmap.index_map, V.dofmap.index_map_bs)
     with b.localForm() as local:
@@ -493,7 +499,7 @@ def assemble_vector(b: PETSc.Vec, L: Any) -> None:
     """
     with b.localForm() as local:
         local.set(0.0)
-    fem.petsc.assemble_vector(b, L)
+    _petsc_forms().assemble_vector(b, L)
     b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
@@ -609,6 +615,21 @@ def timing(task: str) -> float:
     except RuntimeError:
         return 0.0
     return float(elapsed.total_seconds() if hasattr(elapsed, "total_seconds") else elapsed)
+
+
+def timing_calls(task: str) -> int:
+    """How often DOLFINx's timers have counted a task on this rank so far.
+
+    Args:
+        task: name of the timer.
+
+    Returns:
+        The number, 0 for a task that was never timed.
+    """
+    try:
+        return int(dolfinx.common.timing(task)[0])
+    except RuntimeError:
+        return 0
 
 
 # ---------------------------------------------------------------------------------------------- Gmsh

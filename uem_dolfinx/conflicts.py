@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, ROUNDING, UnitingEquations
 
@@ -101,6 +99,9 @@ class Resolution:
         movable = config.ask_owners(node, free.astype(float)) > 0
         if parts is None:
             return []
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
         m, g = len(rows), config.gdim
         links = coo_matrix((np.ones(m + len(rows.row)), (np.concatenate([np.arange(m), rows.row]), place)), shape=(m, len(node)))
         _, label = connected_components(links @ links.T, directed=False)

@@ -239,6 +239,7 @@ class Dynamics:
         """Leave a step that has begun; the forces are those of the committed state again."""
         self._until, self._moving = self.time, False
 
+    @timed("inertia forces")
     def load(self) -> PETSc.Vec:
         """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
         load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
@@ -277,7 +278,13 @@ class Dynamics:
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
-        M = self.mass.M.PtAP(restriction.P)
+        if restriction.M is None:
+            # without uniting equations P only crosses out the prescribed components
+            M, ones = self.mass.M.copy(), self._like(np.ones(self._n))
+            used = restriction.reduce(restriction.expand(ones))
+            M.diagonalScale(used, used)
+        else:
+            M = self.mass.M.PtAP(restriction.P)
         rhs = restriction.reduce(restriction.pass_on(F))
         diagonal = M.getDiagonal()
         idle = diagonal.array_r <= 1e-12 * diagonal.max()[1]

@@ -327,6 +327,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True)
 
 
+@timed("assemble mass")
 def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], npt.ArrayLike]) -> Mass:
     """Masses given at the nodes (collective).
 

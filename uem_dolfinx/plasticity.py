@@ -439,6 +439,7 @@ class VonMises:
             return plane_stress_return(strain, *before, E, nu, self._yield_stress, self._hardening)
         return radial_return(strain, *before, E / (2 * (1 + nu)), self._yield_stress, self._hardening)
 
+    @timed("commit history")
     def commit(self) -> None:
         """Make the state of the last ``update`` the history (collective)."""
         self._points.write(self.plastic_strain, self._trial.plastic_strain)

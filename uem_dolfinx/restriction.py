@@ -25,6 +25,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, ROUNDING
 from uem_dolfinx.errors import ConflictError, agree
+from uem_dolfinx.log import timed
 
 if TYPE_CHECKING:
     from uem_dolfinx.equations import UnitingEquations
@@ -173,6 +174,7 @@ class Restriction:
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
     @cached_property
+    @timed("restriction matrix P")
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
         if self.chain == 0 or not self.stacked:
@@ -253,11 +255,13 @@ class Restriction:
         return total
 
     def fingerprint(self, *, values: bool) -> int:
-        """Hash of this rank's part of P: of its sparsity, or of its values too."""
+        """Hash of this rank's part of P: of its sparsity, or of its values too, but for rounding."""
         eq = self.equations
         parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), bytes([self.chain])]
         if values:
-            parts += [eq.direction.tobytes(), eq.coefficients.tobytes(), eq.active.tobytes()]
+            # feet that have moved by rounding make no new P
+            rounded = (np.rint(v / ROUNDING).astype(np.int64) for v in (eq.direction, eq.coefficients))
+            parts += [*(v.tobytes() for v in rounded), eq.active.tobytes()]
         return zlib.crc32(b"".join(parts))
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat
+from uem_dolfinx.log import timed
 from uem_dolfinx.steps import LoadStep, TimeStep
 from uem_dolfinx.tables import CsvTable
 
@@ -135,16 +136,17 @@ class ResultsWriter:
             step: a converged step, or a load factor or time; it becomes the time in the files.
         """
         time = clock(step)
-        for name, u in self._sources().items():
-            out = self._nodal[name]
-            out.interpolate(u)
-            out.x.scatter_forward()
-            self._xdmf.write_function(out, time)
-        for name, out in self._cellwise.items():
-            compat.interpolate_expression(out, self._expressions[name])
-            self._xdmf.write_function(out, time)
-        for writer in self._vtx:
-            writer.write(time)
+        with timed("write fields"):
+            for name, u in self._sources().items():
+                out = self._nodal[name]
+                out.interpolate(u)
+                out.x.scatter_forward()
+                self._xdmf.write_function(out, time)
+            for name, out in self._cellwise.items():
+                compat.interpolate_expression(out, self._expressions[name])
+                self._xdmf.write_function(out, time)
+            for writer in self._vtx:
+                writer.write(time)
         self.history.write(step)
 
     def close(self) -> None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -302,6 +301,8 @@ class RigidParaboloid(RigidSurface):
 def rotation_matrix(turn: Array) -> Array:
     """Rotation by an angle ``(1,)`` in 2D, counter-clockwise, or by a rotation vector ``(3,)``: ``(gdim, gdim)``."""
     if len(turn) == 3:
+        from scipy.spatial.transform import Rotation
+
         return np.asarray(Rotation.from_rotvec(turn).as_matrix())
     c, s = np.cos(turn[0]), np.sin(turn[0])
     return np.array([[c, -s], [s, c]])

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from uem_dolfinx.log import timed
 from uem_dolfinx.shapes import FacetShape, Tabulated, closest_point, unit_normals
 
 if TYPE_CHECKING:
@@ -370,6 +370,7 @@ def _pack(answer: FacetProjection, distance: Array, height: Array, part: slice) 
     return [distance[part], height[part], *(getattr(answer, f.name)[part] for f in fields(answer))]
 
 
+@timed("search")
 def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
     """All pairs (point, facet) that can be closest, from trees over the facets' middles, one per size class.
 
@@ -386,6 +387,8 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
     """
     if len(points) == 0 or len(x) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    from scipy.spatial import cKDTree
+
     tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
     middle = np.einsum("na,nag->ng", tab.N, x)
     radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1) * (1.0 if shape.degree == 1 else 1.5)

@@ -87,6 +87,8 @@ class UnitedSolver:
         self._key: object = None
         self._P: PETSc.Mat | None = None
         self.A: Any = None
+        #: Whether the preconditioner has yet to see the present matrix.
+        self._new = False
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.config.comm)
@@ -129,8 +131,9 @@ class UnitedSolver:
         """
         key: object = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
         reuse = key == self._key and self.A is not None
-        with timed("united matrix P'KP"):
-            if restriction.M is None:
+        P = None if restriction.M is None else restriction.P
+        with timed("united matrix P'KP" if P is not None else "cross out prescribed components"):
+            if P is None:
                 # without uniting equations P only crosses out the prescribed components
                 if reuse:
                     K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
@@ -139,10 +142,10 @@ class UnitedSolver:
                 used = restriction.reduce(restriction.expand(_ones_like(K)))
                 self.A.diagonalScale(used, used)
             elif reuse:
-                restriction.P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 K.PtAP(self._P, result=self.A)
             else:
-                self._P = restriction.P
+                self._P = P
                 self.A = K.PtAP(self._P)
             if curvature is not None:
                 # an equation that depends on others acts on nodes that P does not join
@@ -160,6 +163,7 @@ class UnitedSolver:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.ksp.setOperators(self.A)
+        self._new = True
 
     def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
         """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
@@ -195,9 +199,15 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         dq = rhs.duplicate()
-        with timed("linear solve"), self._in_database():
+        with self._in_database():
             try:
-                self.ksp.solve(rhs, dq)
+                if self._new:
+                    with timed("factorisation or preconditioner set-up"):
+                        self.ksp.setUp()
+                        self.ksp.setUpOnBlocks()
+                    self._new = False
+                with timed("linear solve"):
+                    self.ksp.solve(rhs, dq)
             except PETSc.Error as error:
                 raise LinearSolveError(
                     f"PETSc error {error.ierr} in the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()}: "

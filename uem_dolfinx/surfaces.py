@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import OrientationError, SpaceError, SurfaceError, TagError, UEMError, agree
@@ -355,6 +353,9 @@ def find_bodies(config: Configuration) -> tuple[Ints, int]:
 
     Every rank labels its own pieces; only the list of pieces that share nodes across ranks is known to all.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     comm, cells = config.comm, compat.cell_dofs(config.V)
     pairs = np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()])
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(config.n_local,) * 2)

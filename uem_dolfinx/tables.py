@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.log import timed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -92,6 +93,7 @@ class CsvTable:
         if error is not None:
             raise error
 
+    @timed("write table")
     def write(self, row: Sequence[Any]) -> None:
         """Append a row; floats are written to the last bit (collective)."""
 

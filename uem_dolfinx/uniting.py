@@ -15,6 +15,7 @@ import numpy.typing as npt
 from uem_dolfinx.checks import TOUCHING, check_finite
 from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.log import timed
 from uem_dolfinx.pair_state import PairState
 from uem_dolfinx.quadratic import ControlGaps
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
@@ -120,6 +121,7 @@ class ContactPair:
         """Current positions of the contactors ``(n, gdim)``."""
         return self.config.X[self.nodes] + self.config.displacement[self.nodes]
 
+    @timed("projection")
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective)."""
         if self.sliding == "finite":
@@ -449,13 +451,17 @@ class ContactPair:
         return UnitingEquations.join(parts, self.config.gdim)
 
     def _near(self) -> Bools:
-        """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks."""
+        """Contactors with a row in P ``(n,)``: those about a facet from the target, looked for anew when an active one lacks.
+
+        Where nothing touches at the start of a step, none has one until something does.
+        """
         p = self.projection
-        if not isinstance(p, FacetProjection):
-            return np.ones(len(self.nodes), dtype=bool)
         if (self.trial.active & ~self._reserved).any():
-            near = p.gap < NEAR * np.linalg.norm(p.x[:, 0] - p.x[:, 1], axis=1)
-            self._reserved = self.trial.active | (near & ~self.off)
+            # a rigid surface has no facets to measure by
+            self._reserved = np.ones_like(self._reserved)
+            if isinstance(p, FacetProjection):
+                near = p.gap < NEAR * np.linalg.norm(p.x[:, 0] - p.x[:, 1], axis=1)
+                self._reserved = self.trial.active | (near & ~self.off)
         return self._reserved
 
     def read_forces(self, lam: Array, redundant: Bools) -> None:
@@ -502,6 +508,8 @@ class ContactPair:
         self._corners = None
         if self.sliding == "small":
             self._anchor = None
+        if not self.trial.active.any():
+            self._reserved = np.zeros_like(self._reserved)
 
     def restore(self) -> None:
         """Go back to the committed state."""

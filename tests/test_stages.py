@@ -1,0 +1,371 @@
+"""What a scene does not need is not done: counted by the timers, and by what Python has imported.
+
+The two tests worth reading are ``test_nothing_near`` and ``test_linear_bodies_in_small_sliding``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, blocks, box, clamp, linear, run, scene, st_venant
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
+
+SEARCH, PROJECTION = "search", "projection"
+P, PRODUCT, CROSSED = "restriction matrix P", "united matrix P'KP", "cross out prescribed components"
+TANGENT, FACTORISATION = "assemble tangent", "factorisation or preconditioner set-up"
+MASS = ("assemble mass", "redistribute mass", "first acceleration", "inertia forces")
+HISTORY = ("return mapping", "commit history")
+OUTPUT = ("write fields", "write table", "write checkpoint", "read checkpoint")
+STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, TANGENT, FACTORISATION, *MASS, *HISTORY, *OUTPUT)
+
+
+class Calls(dict):
+    """Number of calls by timer."""
+
+    def of(self, timers: tuple[str, ...]) -> int:
+        return sum(self[timer] for timer in timers)
+
+
+@contextmanager
+def counted() -> Iterator[Calls]:
+    """How often each stage runs inside, known at the end (alike on all ranks, or it fails)."""
+    before = {stage: compat.timing_calls(f"~UEM: {stage}") for stage in STAGES}
+    calls = Calls()
+    yield calls
+    calls.update({stage: compat.timing_calls(f"~UEM: {stage}") - n for stage, n in before.items()})
+    assert len({tuple(c.items()) for c in MPI.COMM_WORLD.allgather(calls)}) == 1
+
+
+def block_over(comm, target_of, *, height=1.0, law=linear, **how):
+    """Unit block that hangs ``height`` above a target, held at its top; ``target_of`` makes the target of the contact."""
+    s = scene(comm, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [4, 4])], pose=lambda x: x + [0.0, height])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V, name="u")
+    top, bottom = s.tag("top", 0, at(1, 1.0)), s.tag("bottom", 0, at(1, 0.0))
+    contact = uem.Contact(bottom, target_of())
+    return u, top, contact, law(u, 1000.0)
+
+
+def floor() -> uem.RigidSurface:
+    return uem.RigidPlane([0.0, 0.0], [0.0, 1.0])
+
+
+# -- contact ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", [linear, st_venant])
+@pytest.mark.parametrize("rigid", [False, True])
+def test_nothing_near(comm, law, rigid):
+    """Surfaces that stay far apart: neither P nor a product with it, in any iteration; near ones need both."""
+    counts = {}
+    for height in (1.0, 0.0):
+        if rigid:
+            u, top, contact, F = block_over(comm, floor, height=height, law=law)
+            bcs = [*clamp(u.function_space, top, 0), *clamp(u.function_space, top, 1, value=-0.05)]
+        else:
+            b = blocks(comm, "quadrilateral", gap=height)
+            u, F, bcs = b.u, law(b.u, 1000.0), b.oedometer(0.05)
+            contact = uem.Contact(b.high, b.low)
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+        with counted() as counts[height]:
+            run(problem, 3)
+        assert (contact.n_active > 0) == (height == 0.0)
+    far, near = counts[1.0], counts[0.0]
+    assert far[P] == far[PRODUCT] == 0 < far[PROJECTION]
+    assert far[CROSSED] > 0
+    assert near[P] >= near[PRODUCT] > 0 == near[CROSSED]
+
+
+def test_nothing_near_in_motion(comm):
+    """A block that flies over a rigid floor and a meshed one: no P, not even for the acceleration that it starts with."""
+    b = blocks(comm, "quadrilateral", gap=1.0)
+    dynamics = uem.Dynamics(uem.lumped_mass(b.V, 1.0), velocity=[0.0, 1.0])
+    problem = uem.UnitedProblem(
+        linear(b.u, 1000.0), b.u, contacts=[uem.Contact(b.high, b.low)], bcs=clamp(b.V, b.bottom), dynamics=dynamics
+    )
+    with counted() as calls:
+        steps = list(uem.time_steps(problem, 0.01, 0.03))
+    assert len(steps) == 3
+    assert calls[P] == calls[PRODUCT] == 0
+    assert calls["first acceleration"] == 1
+
+
+def test_left_behind(comm):
+    """After a block has been lifted off its floor P goes as well; set down again, it comes back."""
+    u, top, contact, F = block_over(comm, floor, height=0.0)
+    V, lift = u.function_space, fem.Constant(u.function_space.mesh, 0.0)
+    dofs = fem.locate_dofs_topological(V, top.dim, top.entities)
+    where = fem.Function(V)
+    bcs = [fem.dirichletbc(where, dofs)]
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    found = []
+    for settlement in (0.05, -0.5, -0.6, 0.05):
+        where.x.array.reshape(-1, 2)[:, 1] = -settlement
+        lift.value = settlement
+        with counted() as calls:
+            problem.solve()
+        found.append((contact.n_active > 0, calls[P] > 0, calls[PRODUCT] > 0))
+    # the step that lifts the block begins in contact
+    assert found == [(True,) * 3, (False, True, True), (False,) * 3, (True,) * 3]
+
+
+def test_no_contact(comm):
+    """Bodies without contacts: no search, no projection, no P."""
+    b = blocks(comm, "triangle", gap=0.5)
+    problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(0.0, 0.1))])
+    with counted() as calls:
+        run(problem, 3)
+    assert calls[SEARCH] == calls[PROJECTION] == calls[P] == calls[PRODUCT] == 0
+    assert calls[TANGENT] == calls[FACTORISATION] == 1
+
+
+def test_rigid_surfaces_need_no_search(comm):
+    """A rigid surface is projected onto at once; a meshed one has to be searched."""
+    u, top, contact, F = block_over(comm, floor, height=0.0)
+    with counted() as rigid:
+        run(uem.UnitedProblem(F, u, bcs=clamp(u.function_space, top, value=(0.0, -0.05)), contacts=[contact]))
+    assert rigid[SEARCH] == 0 < rigid[PROJECTION]
+    b = blocks(comm, "quadrilateral")
+    with counted() as meshed:
+        run(uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)]))
+    assert meshed[SEARCH] > 0 and meshed[PROJECTION] > 0
+
+
+# -- linear bodies ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sliding", ["small", "fixed"])
+def test_linear_bodies_in_small_sliding(comm, sliding):
+    """K once for all load steps, and one factorisation while the active set and the feet stay; no search after a step's first."""
+    b = blocks(comm, "quadrilateral")
+    problem = uem.UnitedProblem(
+        linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low, sliding=sliding)]
+    )
+    with counted() as calls:
+        steps = run(problem, 4)
+    assert len(steps) == 4 and sum(step.newton_iterations for step in steps) >= 4
+    assert calls[TANGENT] == 1
+    assert calls[P] == calls[PRODUCT] == calls[FACTORISATION] == 1
+    assert calls[SEARCH] == (4 if sliding == "small" else 0) < calls[PROJECTION]
+
+
+def test_active_set_that_changes(comm):
+    """The counters of the test above do count: where contactors are released K stays, and is factorised anew."""
+    b = blocks(comm, "quadrilateral", overhang=1.0)
+    g = b.gdim
+    # bent upwards at one end, the upper block comes off the lower one
+    tilt = fem.Function(b.V)
+    tilt.interpolate(lambda x: np.stack([0 * x[0], -0.01 + 0.05 * x[0]]))
+    bcs = [*clamp(b.V, b.bottom), fem.dirichletbc(tilt, fem.locate_dofs_topological(b.V, g - 1, b.top.entities))]
+    contact = uem.Contact(b.high, b.low, sliding="fixed")
+    problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=bcs, contacts=[contact])
+    touching = contact.n_active
+    with counted() as calls:
+        run(problem)
+    assert 0 < contact.n_active < touching
+    assert calls[TANGENT] == 1 < calls[FACTORISATION]
+
+
+def test_nonlinear_bodies_assemble(comm):
+    """Bodies of St Venant and Kirchhoff need a new K in every iteration of the full Newton method."""
+    b = blocks(comm, "quadrilateral")
+    problem = uem.UnitedProblem(st_venant(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+    with counted() as calls:
+        steps = run(problem, 4)
+    assert calls[TANGENT] >= sum(step.newton_iterations for step in steps) >= 4
+
+
+# -- mass, history, output -------------------------------------------------------------------------------------------------
+
+
+def test_statics_needs_no_mass(comm):
+    """No mass is assembled or multiplied in statics; with inertia there is one matrix, and forces in every residual."""
+    b = blocks(comm, "quadrilateral")
+    problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+    with counted() as calls:
+        run(problem, 2)
+    assert calls.of(MASS) == 0
+    b = blocks(comm, "quadrilateral")
+    with counted() as calls:
+        dynamics = uem.Dynamics(uem.lumped_mass(b.V, 1.0))
+        problem = uem.UnitedProblem(
+            linear(b.u, 1000.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)], dynamics=dynamics
+        )
+        assert len(list(uem.time_steps(problem, 0.01, 0.02))) == 2
+    assert calls["assemble mass"] == calls["redistribute mass"] == calls["first acceleration"] == 1
+    assert calls["inertia forces"] >= 2
+
+
+def test_elastic_bodies_have_no_history(comm):
+    """No return mapping and no commit of history in elastic bodies; a plastic law has both."""
+    b = blocks(comm, "quadrilateral")
+    problem = uem.UnitedProblem(st_venant(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+    with counted() as calls:
+        run(problem, 2)
+    assert calls.of(HISTORY) == 0
+    b = blocks(comm, "quadrilateral")
+    steel = uem.VonMises(b.u, E=1000.0, nu=0.3, yield_stress=5.0, kind="plane_strain")
+    F = steel.residual(ufl.TestFunction(b.V))
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)], materials=[steel])
+    with counted() as calls:
+        run(problem, 2)
+    assert calls["commit history"] == 2 < calls["return mapping"]
+
+
+def test_output_only_where_asked_for(comm, folder):
+    """Nothing is written unless a writer is made."""
+    b = blocks(comm, "quadrilateral")
+    problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+    with counted() as calls:
+        run(problem, 2)
+    assert calls.of(OUTPUT) == 0
+    with counted() as calls, uem.ResultsWriter(folder / "blocks", problem) as writer:
+        writer.write(1.0)
+    uem.write_checkpoint(folder / "state", problem.state())
+    assert calls["write fields"] == calls["write table"] == 1
+
+
+# -- imports ---------------------------------------------------------------------------------------------------------------
+
+#: What only some scenes need.
+HEAVY = ("gmsh", "matplotlib", "pyvista", "scipy", "tqdm", "vtk")
+
+
+def environment(**more: str) -> dict[str, str]:
+    """For a process told from this one's MPI, with this checkout of the package."""
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    package = str(Path(uem.__file__).resolve().parent.parent)
+    paths = [package, str(Path(__file__).parent), *filter(None, [kept.get("PYTHONPATH")])]
+    return kept | {"PYTHONPATH": os.pathsep.join(paths)} | more
+
+
+def python(script: str, *options: str, **more: str) -> str:
+    """Output of a script in a process of its own."""
+    command = [sys.executable, *options, "-c", script]
+    done = subprocess.run(command, env=environment(**more), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@serial
+def test_imports_nothing_heavy():
+    """``import uem_dolfinx`` brings in nothing that only some scenes need and DOLFINx alone does not bring in."""
+    script = "import mpi4py.MPI, {}; import json, sys; print(json.dumps(sorted(sys.modules)))"
+    alone, ours = (json.loads(python(script.format(name))) for name in ("dolfinx", "uem_dolfinx"))
+    assert "uem_dolfinx.problem" in ours
+    extra = {name.partition(".")[0] for name in set(ours) - set(alone)}
+    assert not extra & set(HEAVY)
+
+
+#: A scene on DOLFINx's own mesh where modules are missing; the last line is what it needed of them.
+SCENE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {missing}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from mpi4py import MPI
+import numpy as np, ufl
+from dolfinx import fem, mesh
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+domain = mesh.create_unit_square(MPI.COMM_WORLD, 4, 4)
+V = compat.function_space(domain, 1, (2,))
+u, v = fem.Function(V), ufl.TestFunction(V)
+facets = [mesh.locate_entities_boundary(domain, 1, lambda x, y=y: np.isclose(x[1], y)) for y in (0.0, 1.0)]
+bottom, top = (uem.Tag(n, i, 1, domain, f) for i, (n, f) in enumerate(zip(("bottom", "top"), facets), 1))
+down = fem.Function(V)
+down.x.array[1::2] = -0.05
+bcs = [fem.dirichletbc(down, fem.locate_dofs_topological(V, 1, top.entities))]
+contact = uem.Contact(bottom, uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
+F = uem.LinearElastic(1000.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+list(uem.load_steps(problem, 2))
+assert contact.n_active == 5 and contact.resultant().force[1] > 0
+{then}
+"""
+#: What needs them.
+READS = """
+try:
+    uem.read_gmsh("none.msh", MPI.COMM_WORLD)
+except uem.UEMError as error:
+    print(type(error).__name__, error)
+"""
+DRAWS = """
+try:
+    uem.plot_scene(problem, "none.png")
+except uem.UEMError as error:
+    print(type(error).__name__, error)
+"""
+
+
+@serial
+def test_scene_without_gmsh_matplotlib_pyvista():
+    """A scene that needs none of them runs where all are missing; what does need one says which."""
+    optional = ["gmsh", "matplotlib", "pyvista", "vtk", "tqdm"]
+    assert python(SCENE.format(missing=optional, then="print('done')")).split() == ["done"]
+    told = python(SCENE.format(missing=optional, then=DRAWS))
+    assert told.startswith("MissingBackendError") and "matplotlib" in told
+
+
+@serial
+def test_what_is_missing_is_missing():
+    """The test above does take modules away."""
+    with pytest.raises(AssertionError, match="No module named"):
+        python(SCENE.format(missing=["scipy"], then="import scipy"))
+
+
+# -- how long the import takes -------------------------------------------------------------------------------------------
+
+#: Bound on the time of ``import uem_dolfinx`` over that of ``import dolfinx``.
+IMPORT_RATIO = 1.2
+
+
+def cpu_seconds(script: str, **more: str) -> float:
+    """User and system time of a Python process."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    python(script, **more)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+@serial
+def test_import_time(folder):
+    """``import uem_dolfinx`` takes at most 1.2 times ``import dolfinx``, both compiled before.
+
+    Processor time of the quickest of several runs in turns: what else a machine does only ever adds to it. On a very busy machine
+    it takes more runs until each has had a quick one; more of them never make a slow import quick.
+    """
+    scripts = ["import mpi4py.MPI, dolfinx", "import mpi4py.MPI, uem_dolfinx"]
+    # the folder holds the byte code of both, wherever they are installed
+    cache = {"PYTHONPYCACHEPREFIX": str(folder), "PYTHONDONTWRITEBYTECODE": ""}
+    for script in scripts:
+        python(script, **cache)
+    best = [np.inf, np.inf]
+    for turn in range(15):
+        best = [min(b, cpu_seconds(script, **cache)) for b, script in zip(best, scripts)]
+        if turn >= 4 and best[1] <= IMPORT_RATIO * best[0]:
+            break
+    assert best[1] <= IMPORT_RATIO * best[0], best
