@@ -251,6 +251,18 @@ def test_instants_are_found():
 # ---------------------------------------------------------------------------------------------- tunnelling
 
 
+@pytest.mark.parametrize("cfl", [5.0, 100.0])
+@pytest.mark.parametrize("events", [None, 1e-3])
+def test_opening_contacts_give_no_energy(cfl, events):
+    """However long the steps, a bar does not leave the wall with more energy than it came with: they are cut where it would."""
+    bar = Bar(n=16, gap=0.3, v=-1.0)
+    dt = cfl * 10.0 / 16 / 30.0
+    bar.run(dt, 0.3 + max(1.0, 6 * dt), event_tolerance=events)
+    energies = np.array([row.kinetic + row.stored for row in bar.book.rows])
+    assert any(step.left for step in bar.steps) and energies.max() < 5.0 * (1 + 4e-3)
+    assert cfl < 100 or any(step.cuts > 3 for step in bar.steps)
+
+
 def bullet(comm=COMM, size=0.05):
     """A small block that flies with velocity 100 towards a thin plate that is held at its ends."""
     plate = box("quadrilateral", [-1.0, -0.1], [1.0, 0.0], [20, 2])

@@ -129,6 +129,8 @@ class Dynamics:
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.number, self.longest = 0, np.inf
+        #: Largest kinetic energy that a step has been judged by.
+        self.largest = 0.0
         self._attached = False
         #: Factor of M in the tangent.
         self.factor = 0.0
@@ -334,7 +336,7 @@ class Dynamics:
     @property
     def numbers(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the Functions."""
-        names = ("time", "start", "number", "longest", "accelerated")
+        names = ("time", "start", "number", "longest", "accelerated", "largest")
         return {name: getattr(self, name) for name in names}
 
     def resume(self, numbers: dict[str, Any]) -> None:

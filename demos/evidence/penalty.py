@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 #: A multiplier is brought up to date when the bodies are in equilibrium to this part of the forces.
-SETTLED = 1e-8
+SETTLED = 1e-7
 #: After so many full Newton steps of a load step the line search sees to it that springs do not come and go for ever.
 FULL_STEPS = 2
 #: So near to equilibrium, as part of the forces, Newton's method needs no line search.
@@ -238,14 +238,15 @@ class PenaltySystem(BodySystem):
             forces, overlap = self._stretch()
             R = restriction.reduce(F - forces)
             changed, rounding = False, self._rounding_of_springs()
-            if self._overlap and R.norm() <= max(SETTLED * F.norm(), rounding) and overlap > self._overlap * self.config.size:
+            deep = self._overlap is not None and overlap > self._overlap * self.config.size
+            if deep and R.norm() <= max(SETTLED * F.norm(), rounding):
                 self._multipliers = [s.force for s in self._springs]
                 forces, _ = self._stretch()
                 R, changed = restriction.reduce(F - forces), True
         short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
         largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
         short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
-        closed = bool(short <= 4 * np.finfo(float).eps * largest)
+        closed = bool(short <= 4 * np.finfo(float).eps * largest) and not deep
         active = sum(pair.n_active for pair in self.pairs)
         return United(
             restriction, restriction, R, R.norm(), F.norm(), rounding, self._strain_rounding(), overlap, active, changed, closed

@@ -1,0 +1,136 @@
+"""Work and precision: the united elements and other methods of contact, error against time, on problems with known answers.
+
+python3 demos/work_precision.py --plot work_precision.png
+"""
+
+# %% [markdown]
+# # Which method reaches 1 %, 0.1 %, 0.01 % first?
+#
+# Four problems, each solved by every method on the same meshes, surfaces, search and Newton loop:
+#
+# - `signorini`: two elastic bodies, in contact for x < 0, with their exact solution, for three ratios of their stiffnesses;
+# - `hertz_cylinder`: an elastic cylinder on an elastic block, against quadratic elements on a fine mesh;
+# - `hertz_penalty`: a rigid paraboloid in 3D, against the exact solution of the discrete problem;
+# - `bar_impact`: a bar hits a wall, against the exact wave.
+#
+# A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best on each mesh counts,
+# which favours them, since nobody knows it beforehand. Times are medians of warm runs without compilation and without reading
+# the mesh.
+
+# %%
+import json
+import logging
+from argparse import Namespace
+from functools import partial
+from pathlib import Path
+
+import common
+from common import comm
+from evidence import methods
+from evidence.graphs import draw_all
+from evidence.measure import at_a_glance, grouped, label, machine, measure, name_of, rate, sweep
+from evidence.problems import bar_impact, hertz_answer, hertz_cylinder, indenter
+from evidence.signorini import signorini
+
+from uem_dolfinx.tables import CsvTable
+
+args = common.arguments(
+    __doc__, sizes=4, runs=5, problems="signorini,hertz_cylinder,hertz_penalty,bar_impact", methods=",".join(methods.METHODS)
+)
+# the indenter's overlap at the start is meant
+logging.getLogger("uem_dolfinx").setLevel(logging.ERROR)
+points = []
+
+
+def names(degree: int, *without: str) -> list[str]:
+    """The methods wanted; the barrier is for one rank and degree 1."""
+    if degree > 1 or comm.size > 1 or not methods.available("barrier"):
+        without += ("barrier",)
+    return [name for name in methods.METHODS if name in args.methods.split(",") and name not in without]
+
+
+# %% [markdown]
+# ## Signorini
+# The displacement is of class H^(5/2 - eps). So linear elements can reach the order 1 in energy, quadratic ones 3/2, or 2 with
+# meshes graded towards the end of the contact. Meshes whose nodes do not include the target's fail the patch test in a
+# single pass, which shows where both bodies are equally stiff.
+
+# %%
+if "signorini" in args.problems:
+    most = ("penalty", "augmented", "barrier")
+    for degree, finer, graded, sizes, ratios, without in (
+        (1, 2.0, 1.0, (4, 8, 16, 32), (1.0, 1e6), ()),
+        (1, 2.0, 1.0, (4, 8, 16), (1e3,), ()),
+        (1, 1.5, 1.0, (4, 8, 16, 32), (1.0,), most),
+        (2, 1.0, 1.0, (4, 8, 16), (1.0, 1e3, 1e6), ()),
+        (2, 1.0, 2.0, (8, 16, 32), (1.0,), ()),
+    ):
+        for ratio in ratios:
+            scene = partial(signorini, degree=degree, ratio=ratio, finer=finer, graded=graded)
+            points += sweep(scene, sizes[: args.sizes], names(degree, *without), args.runs, progress=args.verbose)
+
+# %% [markdown]
+# ## Hertz
+
+# %%
+if "hertz_cylinder" in args.problems:
+    sizes = (1 / 30, 1 / 60, 1 / 120)[: args.sizes]
+    answer = hertz_answer(sizes[-1] / 2)
+    for degree in (1, 2):
+        points += sweep(
+            lambda h, degree=degree: hertz_cylinder(h, degree, answer), sizes[: 4 - degree], names(degree), args.runs,
+            progress=args.verbose,
+        )  # fmt: skip
+if "hertz_penalty" in args.problems:
+    points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface"), args.runs, progress=args.verbose)
+
+# %% [markdown]
+# ## Impact
+# The united elements leave their contactors without mass. Other methods are as they usually are, with mass at the contactors,
+# and with the trapezoidal rule or one that damps.
+
+# %%
+if "bar_impact" in args.problems:
+    for cfl in (2.0, 1.0, 0.5)[: args.sizes]:
+        for method, parameter, scheme, contactors in (
+            ("united", None, "trapezoidal", "massless"),
+            ("lagrange", None, "trapezoidal", "massy"),
+            ("penalty", 1.0, "trapezoidal", "massy"),
+            ("penalty", 10.0, "trapezoidal", "massy"),
+            ("penalty", 10.0, "generalised_alpha", "massy"),
+        ):
+            if method not in names(1):
+                continue
+            scene = bar_impact(25, cfl, scheme=scheme, contactors=contactors)
+            points.append(measure(scene, method, parameter, args.runs, progress=args.verbose))
+
+# %% [markdown]
+# ## The table
+# The cheapest point of every method below each error; a star marks the first.
+
+# %%
+glance = at_a_glance(points)
+rates = []
+for scene, group in grouped(points, label).items():
+    if group[0]["problem"] == "signorini" and len({p["dofs"] for p in group}) > 1:
+        for name, own in grouped(group, name_of).items():
+            rates.append(
+                {"scene": scene, "method": name, "order in h": rate(own), "of the pressure": rate(own, "error_pressure")}
+            )
+results = {"machine": machine(), "rates": rates, "glance": glance}
+common.report(Namespace(json=None), results)
+if args.json and comm.rank == 0:
+    Path(args.json).parent.mkdir(parents=True, exist_ok=True)
+    Path(args.json).write_text(json.dumps(results | {"points": points}, indent=1) + "\n", encoding="utf-8")
+if args.output:
+    columns = list(dict.fromkeys(key for point in points for key in point))
+    with CsvTable(f"{args.output}/work_precision.csv", comm, columns) as table:
+        for point in points:
+            table.write([point.get(key, "") for key in columns])
+if args.plot:
+    draw_all(args.plot, points)
+
+# %%
+for row in rates:
+    if row["method"] == "united" and args.sizes > 1 and "not nested" not in row["scene"]:
+        assert row["order in h"] >= (0.95 if "degree 1" in row["scene"] else 1.4), row
