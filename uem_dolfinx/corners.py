@@ -154,7 +154,7 @@ def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, co
         weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
         found[i] = True
     for node in range(len(shape.topology[0])):
-        i = np.flatnonzero((count == 3) & common[:, node] & ~found)
+        i = np.flatnonzero((count >= 2) & common[:, node] & ~found)
         weights[i, node] = 1.0
         found[i] = True
     foot = np.einsum("ka,kag->kg", weights, x)

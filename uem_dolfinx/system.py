@@ -120,9 +120,10 @@ class BodySystem:
             floating = FloatingBodies(self.config, loose, finite=not self.tangent.linear)
             self.floating = floating if floating.loose else None
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
-        shared = len(np.unique(contactors)) < len(contactors)
+        #: Whether a node is a contactor of several pairs.
+        self.shared = any(self.comm.allgather(len(np.unique(contactors)) < len(contactors)))
         #: Whether equations can get in each other's way.
-        self.contestable = any(self.comm.allgather(shared or any(pair.prescribed or pair.mutual for pair in pairs)))
+        self.contestable = any(self.comm.allgather(self.shared or any(pair.prescribed or pair.mutual for pair in pairs)))
         self.place(returning=False)
         for pair in pairs:
             check_initial(pair)
@@ -159,10 +160,16 @@ class BodySystem:
                 pair.project()
             if returning and self._stiffness is not None:
                 stiffness = self._local_stiffness()
-                for pair in self.pairs:
+                for k, pair in enumerate(self.pairs):
+                    if self.shared and k > 0:
+                        # what another pair has returned is returned
+                        pair.project()
                     # surfaces that follow each other would both make up for the same gap
                     if not pair.mutual:
                         pair.return_to_target(stiffness)
+                if self.shared:
+                    for pair in self.pairs:
+                        pair.project()
                 self.u.x.scatter_forward()
 
     def land(self) -> None:
@@ -445,6 +452,7 @@ class BodySystem:
 
         P belongs to the present normals: the old P would take the turned contact forces for a residual.
         """
+        self.place(returning=False)
         restriction, _ = self._restrict()
         return restriction.reduce(restriction.pass_on(self.residual))
 

@@ -1,0 +1,391 @@
+"""What a case of the stability table is: bodies made of boxes, a method to be tried on them, and figures with their tolerances.
+
+Every figure is an error against an answer known otherwise: a closed form, or the conditions of contact themselves, which are read
+from the residual of the bodies and not from the method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from evidence import methods
+from petsc4py import PETSc
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+COMM = MPI.COMM_WORLD
+
+#: What counts as right, for all methods alike: forces and works to 1 %, overlaps to 1e-3 of the smallest element at the contact.
+FORCE, OVERLAP, BALANCE = 1e-2, 1e-3, 1e-3
+NU = 0.3
+#: A method that has spent more than so many Newton iterations for each load step it was asked for and is not at the end, or so many
+#: times the time steps, counts as one that does not converge.
+PATIENCE = 50
+#: Newton iterations that a cut step has spent.
+LOST = 50
+
+
+def oedometer(E: float = 1.0, nu: float = NU) -> float:
+    """Modulus of a block that is held at its sides."""
+    return E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+
+
+class NotApplicable(Exception):
+    """A method cannot be asked for what a case is about."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A figure measured: an error without dimension, what it may be, and what it is the error of."""
+
+    what: str
+    value: float
+    tolerance: float
+
+    @property
+    def severity(self) -> float:
+        """Value over tolerance; infinite if it is no number."""
+        return float(abs(self.value) / self.tolerance) if np.isfinite(self.value) else np.inf
+
+
+@dataclass(frozen=True)
+class Column:
+    """A method with its setting.
+
+    Attributes:
+        name: of the column.
+        method: as ``methods.create`` knows it.
+        factor: of the parameter: of E/h, or of the size of an element for a distance.
+        stiffer: whether E is that of the stiffer body.
+        words: of the setting, for the head of the table.
+    """
+
+    name: str
+    method: str
+    factor: float = 0.0
+    stiffer: bool = False
+    words: str = ""
+
+    def parameter(self, E: Sequence[float], h: float) -> float | None:
+        """Parameter in a scene with these moduli and this size of the elements at the contact."""
+        if self.method == "barrier":
+            return self.factor * h
+        return self.factor * (max(E) if self.stiffer else min(E)) / h if self.factor else None
+
+
+COLUMNS = (
+    Column("united", "united"),
+    Column("penalty", "penalty", 10.0, words="10 E/h of the softer body"),
+    Column("penalty_stiff", "penalty", 100.0, True, "100 E/h of the stiffer body"),
+    Column("penalty_surface", "penalty_surface", 10.0, words="10 E/h of the softer body"),
+    Column("surface_stiff", "penalty_surface", 100.0, True, "100 E/h of the stiffer body"),
+    Column("lagrange", "lagrange"),
+    Column("augmented", "augmented", 10.0, words="10 E/h of the softer body"),
+    Column("barrier", "barrier", 1e-3, words="distance 1e-3 h"),
+)
+
+
+@dataclass
+class Trial:
+    """A method on its way through a case; it counts what the case costs.
+
+    Attributes:
+        column: the method and its setting.
+        iterations: Newton iterations of all problems so far.
+        checks: figures so far.
+    """
+
+    column: Column
+    iterations: int = 0
+    checks: list[Check] = field(default_factory=list)
+
+    def create(self, F: ufl.Form, u: fem.Function, E: Sequence[float], h: float, **options: Any) -> uem.UnitedProblem:
+        """A problem in which this method makes the contact.
+
+        Args:
+            F: residual.
+            u: displacement.
+            E: moduli of the bodies.
+            h: size of the elements at the contact.
+            options: of ``UnitedProblem``.
+        """
+        options.setdefault("petsc_options_prefix", "stability_")
+        options.setdefault("rtol", 1e-10 if self.column.method == "united" else 1e-8)
+        return methods.create(self.column.method, F, u, parameter=self.column.parameter(E, h), **options)
+
+    def load(self, problem: uem.UnitedProblem, steps: int = 1) -> None:
+        """Load a problem in steps."""
+        for _ in self.load_steps(problem, steps):
+            pass
+
+    def load_steps(self, problem: uem.UnitedProblem, steps: int) -> Iterator[uem.LoadStep]:
+        """Load steps, counted."""
+        spent = 0
+        for step in uem.load_steps(problem, steps):
+            self.iterations += step.newton_iterations
+            # a step that was cut has spent its iterations in vain
+            spent += step.newton_iterations + LOST * step.cuts
+            yield step
+            self._give_up(spent > PATIENCE * (steps + 4) and step.number > steps, step.number, steps)
+
+    def time_steps(self, problem: uem.UnitedProblem, dt: float, end: float, event: float | None) -> Iterator[uem.TimeStep]:
+        """Time steps, counted."""
+        steps = round(end / dt)
+        for step in uem.time_steps(problem, dt, end, event_tolerance=event):
+            self.iterations += step.newton_iterations
+            yield step
+            self._give_up(step.number > PATIENCE * (steps + 4), step.number, steps)
+
+    @staticmethod
+    def _give_up(hopeless: bool, number: int, asked: int) -> None:
+        if hopeless:
+            raise uem.ConvergenceError(f"given up after {number} steps instead of {asked}, cut for want of convergence")
+
+    def check(self, what: str, value: float, tolerance: float) -> None:
+        """Note a figure; all ranks must know the same."""
+        self.checks.append(Check(what, float(value), tolerance))
+
+    def about(self, words: str, start: int) -> None:
+        """Say of the checks since ``start`` which variant of the scene they are of."""
+        self.checks[start:] = [replace(c, what=f"{c.what} ({words})") for c in self.checks[start:]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table.
+
+    Attributes:
+        name: of the row.
+        what: is tried, in words.
+        run: notes the figures of a trial.
+        quick: whether the short table has it.
+        moving: whether it steps through time.
+    """
+
+    name: str
+    what: str
+    run: Callable[[Trial], None]
+    quick: bool = True
+    moving: bool = False
+
+
+def judge(case: Case, column: Column) -> dict[str, Any]:
+    """Cell of the table: verdict, worst figure and what it is (collective)."""
+    trial = Trial(column)
+    cell: dict[str, Any] = {"case": case.name, "method": column.name}
+    try:
+        if not methods.available(column.method):
+            raise NotApplicable("ipctk is not installed")
+        if column.method == "barrier" and (COMM.size > 1 or case.moving):
+            raise NotApplicable("the barrier is serial and static")
+        case.run(trial)
+        worst = max(trial.checks, key=lambda check: check.severity)
+        cell |= {
+            "verdict": "correct" if worst.severity <= 1.0 else "wrong",
+            "figure": worst.value if np.isfinite(worst.value) else str(worst.value),
+            "what": worst.what,
+            "tolerance": worst.tolerance,
+        }
+    except NotApplicable as reason:
+        cell |= {"verdict": "not applicable", "figure": str(reason), "what": "", "tolerance": None}
+    except uem.UEMError as error:
+        cell |= {"verdict": "named error", "figure": type(error).__name__, "what": str(error), "tolerance": None}
+    except Exception as error:
+        cell |= {"verdict": "wrong", "figure": type(error).__name__, "what": str(error), "tolerance": None}
+    compat.free_petsc_garbage(COMM)
+    return cell | {"iterations": trial.iterations}
+
+
+# -- bodies --------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Box:
+    """Box ``[lo, hi]`` with ``n`` divisions in each direction, of Young's modulus E."""
+
+    lo: Sequence[float]
+    hi: Sequence[float]
+    n: Sequence[int]
+    E: float = 1.0
+
+
+def _nodes_and_cells(box: Box, cell: str) -> tuple[Array, Ints]:
+    g = len(box.lo)
+    axes = [np.linspace(a, b, k + 1) for a, b, k in zip(box.lo, box.hi, box.n)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, g)
+    stride = np.cumprod([1, *(k + 1 for k in box.n[:0:-1])])[::-1]
+    first = np.stack(np.meshgrid(*map(np.arange, box.n), indexing="ij"), axis=-1).reshape(-1, g) @ stride
+    ring = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    corners: dict[str, list[Any]] = {
+        "triangle": [[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]],
+        "quadrilateral": [ring],
+        "tetrahedron": [np.cumsum([[0] * 3, *np.eye(3, dtype=int)[list(p)]], axis=0) for p in permutations(range(3))],
+        "hexahedron": [[(*c, z) for z in (0, 1) for c in ring]],
+    }
+    cells = np.concatenate([first[:, None] + np.array(c) @ stride for c in corners[cell]])
+    return x, cells.astype(np.int64)
+
+
+class Scene:
+    """Boxes in one mesh, whose surfaces are found by their places in the drawing, before it is bent, turned and scaled.
+
+    Args:
+        boxes: the bodies; they share no nodes.
+        cell: kind of all cells.
+        pose: where the drawing's nodes ``(n, gdim)`` of each body, by its number, start.
+        nu: Poisson's ratio.
+        law: of the bodies.
+    """
+
+    def __init__(
+        self,
+        boxes: Sequence[Box],
+        cell: str = "quadrilateral",
+        pose: Callable[[Array, int], Array] | None = None,
+        nu: float = NU,
+        law: type[Any] = uem.LinearElastic,
+    ):
+        self.boxes, self.g = list(boxes), len(boxes[0].lo)
+        parts = [_nodes_and_cells(box, cell) for box in boxes]
+        first = np.cumsum([0, *(len(x) for x, _ in parts)])
+        self._drawing = np.concatenate([x for x, _ in parts])
+        x = np.concatenate([pose(x, k) if pose else x for k, (x, _) in enumerate(parts)])
+        cells = np.concatenate([c + f for (_, c), f in zip(parts, first)])
+        given = slice(None) if COMM.rank == 0 else slice(0)
+        self.mesh = compat.create_mesh(COMM, cells[given], x[given], cell, 1)
+        body = np.repeat(np.arange(len(parts)), [len(c) for _, c in parts])
+        self.body = body[compat.original_cells(self.mesh)]
+        self.V = compat.function_space(self.mesh, 1, (self.g,))
+        self.u = fem.Function(self.V, name="displacement")
+        self.E = fem.Function(compat.dg0_space(self.mesh), name="E")
+        self.E.x.array[compat.cell_dofs(self.E.function_space)[:, 0]] = np.array([box.E for box in boxes])[self.body]
+        self.material = law(self.E, nu, kind="plane_strain" if self.g == 2 else "3d")
+        self.F = self.material.residual(self.u, ufl.TestFunction(self.V)) * ufl.dx(degree=2)
+        self.bcs: list[fem.DirichletBC] = []
+        self.contacts: list[uem.Contact] = []
+        self._tags: dict[tuple[int, int, float], uem.Tag] = {}
+        mesh, t = self.mesh, self.mesh.topology.dim
+        for a, b in ((t - 1, 0), (t - 1, t), (t, t - 1)):
+            mesh.topology.create_connectivity(a, b)
+        self._at = self._drawing[np.asarray(mesh.geometry.input_global_indices)[compat.vertex_nodes(mesh)]]
+
+    @property
+    def moduli(self) -> list[float]:
+        """Young's moduli of the bodies."""
+        return [box.E for box in self.boxes]
+
+    def side(self, body: int, axis: int, end: int, within: Callable[[Array], npt.NDArray[np.bool_]] | None = None) -> uem.Tag:
+        """Facets of a body on its lower (0) or upper (1) end along an axis, as a tag.
+
+        Args:
+            body: its number.
+            axis: number of the coordinate.
+            end: 0 or 1.
+            within: places of the drawing ``(n, gdim)`` that count; None takes all.
+        """
+        value = (self.boxes[body].lo, self.boxes[body].hi)[end][axis]
+        t, topology = self.g, self.mesh.topology
+        on = np.abs(self._at[:, axis] - value) < 1e-9 * max(1.0, abs(value))
+        if within is not None:
+            on &= within(self._at)
+        facet_vertices, facet_cells = topology.connectivity(t - 1, 0), topology.connectivity(t - 1, t)
+        index = topology.index_map(t - 1)
+        facets = [
+            f
+            for f in range(index.size_local + index.num_ghosts)
+            if on[facet_vertices.links(f)].all() and (self.body[facet_cells.links(f)] == body).any()
+        ]
+        name = f"body_{body + 1}_{'xyz'[axis]}{end}"
+        return uem.Tag(name, 10 * body + 2 * axis + end + 1, t - 1, self.mesh, np.array(facets, dtype=np.int32))
+
+    def hold(self, tag: uem.Tag, *components: int, value: float | npt.ArrayLike = 0.0) -> None:
+        """Prescribe components of the displacement on a tag; a vector prescribes all."""
+        if np.ndim(value):
+            dofs = fem.locate_dofs_topological(self.V, tag.dim, tag.entities)
+            self.bcs.append(fem.dirichletbc(np.array(value, dtype=PETSc.ScalarType), dofs, self.V))
+            return
+        for c in components or range(self.g):
+            dofs = fem.locate_dofs_topological(self.V.sub(c), tag.dim, tag.entities)
+            self.bcs.append(fem.dirichletbc(PETSc.ScalarType(value), dofs, self.V.sub(c)))
+
+    def rollers(self, *bodies: int) -> None:
+        """Hold the sides of bodies, all when none is named, as an oedometer does."""
+        for body in bodies or range(len(self.boxes)):
+            for axis in range(self.g - 1):
+                for end in (0, 1):
+                    self.hold(self.side(body, axis, end), axis)
+
+    def push(self, tag: uem.Tag, traction: Sequence[float]) -> None:
+        """Load a surface by a force per reference area."""
+        v = ufl.TestFunction(self.V)
+        self.F -= ufl.inner(ufl.as_vector(list(traction)), v) * compat.surface_measure(self.mesh, tag.entities)
+
+    def weigh(self, body: int, force: Sequence[float]) -> None:
+        """Load a body by a force per reference volume."""
+        v = ufl.TestFunction(self.V)
+        self.F -= ufl.inner(ufl.as_vector(list(force)), v) * self._volume(body)
+
+    def volume(self, body: int) -> float:
+        """Reference volume of a body (collective)."""
+        return compat.assemble_scalar(compat.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
+
+    def _volume(self, body: int) -> Any:
+        return compat.cell_measure(self.mesh, np.flatnonzero(self.body == body).astype(np.int32))
+
+    def unite(self, contactor: uem.Tag, target: Any, **options: Any) -> uem.Contact:
+        """Let two surfaces touch."""
+        self.contacts.append(uem.Contact(contactor=contactor, target=target, **options))
+        return self.contacts[-1]
+
+    def solve(self, trial: Trial, h: float, steps: int = 1, **options: Any) -> uem.UnitedProblem:
+        """Set the problem up for a method and load it."""
+        problem = trial.create(self.F, self.u, self.moduli, h, bcs=self.bcs, contacts=self.contacts, **options)
+        trial.load(problem, steps)
+        return problem
+
+    # -- what the bodies themselves say ------------------------------------------------------------------------------------------
+
+    def nodes(self, tag: uem.Tag) -> Ints:
+        """Nodes of a tag that this rank owns ``(n,)``."""
+        nodes = np.asarray(fem.locate_dofs_topological(self.V, tag.dim, tag.entities), dtype=np.int64)
+        return nodes[nodes < self.V.dofmap.index_map.size_local]
+
+    def nodes_of(self, body: int) -> Ints:
+        """Nodes of a body on this rank, ghosts included ``(n,)``."""
+        return np.unique(compat.cell_dofs(self.V)[self.body == body])
+
+    def residual(self) -> Array:
+        """Internal minus external forces of the owned nodes ``(n_owned, gdim)`` (collective)."""
+        b = compat.create_vector(self.V)
+        compat.assemble_vector(b, compat.form(self.F))
+        return np.array(b.array_r).reshape(-1, self.g)
+
+    def reaction(self, tag: uem.Tag) -> Array:
+        """Force of the supports on a tag ``(gdim,)``, from the residual alone (collective)."""
+        return np.asarray(COMM.allreduce(self.residual()[self.nodes(tag)].sum(axis=0)))
+
+    def free(self) -> npt.NDArray[np.bool_]:
+        """Components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``."""
+        n = self.V.dofmap.index_map.size_local * self.g
+        free = np.ones(n, dtype=bool)
+        for bc in self.bcs:
+            dofs, _ = compat.bc_dofs(bc)
+            free[dofs[dofs < n]] = False
+        return free.reshape(-1, self.g)
+
+
+def largest(values: npt.ArrayLike) -> float:
+    """Largest absolute value over all ranks, 0 if there is none; NaN anywhere is NaN (collective)."""
+    return float(np.max(COMM.allgather(np.abs(np.asarray(values, dtype=float)).max(initial=0.0))))

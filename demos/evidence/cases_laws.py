@@ -1,0 +1,141 @@
+"""The conditions of frictionless contact, read from the bodies: residuals, places of nodes and facets, and nothing of the method.
+
+Every contactor is compared with every facet of its target, one by one, so that no search is trusted either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+from scipy.optimize import nnls
+
+import uem_dolfinx as uem
+from evidence.cases import BALANCE, COMM, OVERLAP, Array, Scene, Trial
+from uem_dolfinx.shapes import closest_point, unit_normals
+
+#: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
+AS_NEAR = 1e-3
+#: A contactor that is past the end of the target by less than this part of an element may still bear on the end.
+PAST_END = 0.1
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a contactor is relative to its target.
+
+    Attributes:
+        gap: distance, negative inside the target, infinite past its end.
+        normals: outward normals of the nearest facets ``(k, gdim)``.
+        above: whether the contactor is above or below the target, and not past its end at all.
+    """
+
+    gap: float
+    normals: Array
+    above: bool
+
+
+def places(scene: Scene, contact: uem.Contact, h: float) -> list[Place]:
+    """Places of this rank's contactors (collective)."""
+    points, target = contact.pair.points, contact.pair.target
+    if not isinstance(contact.target, uem.Tag):
+        p = target.project(points)
+        return [Place(float(gap), normal[None], True) for gap, normal in zip(p.gap, p.normal)]
+    facets = target.facets
+    parts = COMM.allgather((contact.config.x[facets.dofs], facets.sign))
+    x, sign = (np.concatenate(part) for part in zip(*parts))
+    found = []
+    for point in points:
+        near = np.full(len(x), True)
+        p = np.tile(point, (len(x), 1))
+        xi, d2 = closest_point(facets.shape, x, p)
+        near = np.sqrt(d2) <= np.sqrt(d2.min()) + AS_NEAR * h
+        tab = facets.shape.tabulate(xi[near])
+        normals = sign[near, None] * unit_normals(tab, x[near])
+        nearest = np.argmin(d2[near])
+        arm = point - np.einsum("a,ag->g", tab.N[nearest], x[near][nearest])
+        away, inside = _off_cone(normals, arm), _off_cone(normals, -arm)
+        height = float(normals[nearest] @ arm)
+        if min(away, inside) > PAST_END * h:
+            height = np.inf
+        elif len(normals) > 1 and np.linalg.norm(arm) > AS_NEAR * h:
+            height = float(np.copysign(np.linalg.norm(arm), inside - away))
+        found.append(Place(height, normals, min(away, inside) <= AS_NEAR * h))
+    return found
+
+
+def _off_cone(normals: Array, force: Array) -> float:
+    """Distance of a vector from the cone of some normals ``(k, gdim)``."""
+    return float(nnls(normals.T, force)[1])
+
+
+def overlap(scene: Scene, h: float) -> float:
+    """How deep the deepest contactor is inside its target, over the size of an element (collective)."""
+    depths = [-place.gap for contact in scene.contacts for place in places(scene, contact, h) if place.above]
+    return max(0.0, *COMM.allgather(max(depths, default=0.0))) / h
+
+
+def lawful(trial: Trial, scene: Scene, h: float, supported: float = BALANCE) -> float:
+    """Check equilibrium and contact conditions; returns the sum of the contact forces' sizes (collective).
+
+    Equilibrium where no contact is, forces along the normals that press and never pull, action equal to reaction in force and
+    moment, no overlap, and forces only where the gap is closed.
+
+    Args:
+        trial: notes the figures.
+        scene: after a solution, without inertia.
+        h: size of the elements at the contact.
+        supported: part of the contact forces that may be missing in the equilibrium where no contact is.
+    """
+    r, free = scene.residual(), scene.free()
+    contactor, target = np.zeros((2, len(r)), dtype=bool)
+    normals: dict[int, list[Array]] = {}
+    gaps = np.full(len(r), np.inf)
+    meshed = True
+    for contact in scene.contacts:
+        contactor[contact.pair.nodes] = True
+        for node, place in zip(contact.pair.nodes, places(scene, contact, h)):
+            gaps[node] = min(gaps[node], abs(place.gap))
+            normals.setdefault(int(node), []).append(place.normals)
+        if isinstance(contact.target, uem.Tag):
+            target[scene.nodes(contact.target)] = True
+        else:
+            meshed = False
+    touching = contactor | target
+    size = COMM.allreduce(float(np.linalg.norm(np.where(free, r, 0.0)[contactor], axis=1).sum()))
+    scale = size if size > 0 else 1.0
+    inner = np.where(free & ~touching[:, None], r, 0.0)
+    trial.check("equilibrium", COMM.allreduce(float(np.linalg.norm(inner, axis=1).sum())) / scale, supported)
+    trial.check("overlap", overlap(scene, h), OVERLAP)
+    astray = work = lost = 0.0
+    for node in np.flatnonzero(contactor & ~target & free.all(axis=1)):
+        astray += _off_cone(np.concatenate(normals[node]), r[node])
+        force = float(np.linalg.norm(r[node]))
+        if np.isfinite(gaps[node]):
+            work += force * gaps[node]
+        else:
+            lost += force
+    trial.check("force off the normals", COMM.allreduce(astray) / scale, BALANCE)
+    trial.check("force times gap", COMM.allreduce(work) / (scale * h), OVERLAP)
+    trial.check("force off the target", COMM.allreduce(lost) / scale, BALANCE)
+    if meshed:
+        _action_and_reaction(trial, scene, r, touching, free, scale)
+    return size
+
+
+def _action_and_reaction(trial: Trial, scene: Scene, r: Array, touching: Array, free: Array, scale: float) -> None:
+    """Check the sums of forces and of moments on all surfaces, where no support shares in them (collective)."""
+    g = scene.g
+    whole = np.array([COMM.allreduce(int((~free[touching, c]).sum())) == 0 for c in range(g)])
+    total = np.asarray(COMM.allreduce(r[touching].sum(axis=0)))
+    trial.check("action - reaction", float(np.abs(total[whole]).max(initial=0.0)) / scale, BALANCE)
+    if whole.all():
+        x = scene.V.tabulate_dof_coordinates()[: len(r), :g] + scene.u.x.array.reshape(-1, g)[: len(r)]
+        x, f = x[touching], r[touching]
+        centre = np.asarray(COMM.allreduce(x.sum(axis=0))) / COMM.allreduce(len(x))
+        a, b = np.pad(x - centre, ((0, 0), (0, 3 - g))), np.pad(f, ((0, 0), (0, 3 - g)))
+        moment = np.asarray(COMM.allreduce(np.cross(a, b).sum(axis=0)))
+        arm = COMM.allreduce(float(np.linalg.norm(a, axis=1).max(initial=0.0)), op=MPI.MAX)
+        trial.check("moment", float(np.abs(moment).max()) / (scale * arm), BALANCE)

@@ -1,0 +1,122 @@
+"""Cases of impact: steps from a hundredth of the Courant limit to a hundred times it, and speeds that cross the target in a step.
+
+What is known of a bar that hits a rigid wall and of a block that hits a plate are momentum, energy, and which side they are on.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from evidence.cases import COMM, FORCE, OVERLAP, Box, Case, Scene, Trial
+from evidence.cases_laws import overlap
+from uem_dolfinx import compat
+
+RHO, V0 = 1.0, 1.0
+#: Fronts of waves spread over a few elements, and steps beyond the Courant limit do not resolve them.
+WAVES = 5 * FORCE
+#: Touches are found to this part of a step.
+EVENT = 1e-3
+#: Energy and overlap are looked at every so many steps.
+LOOK = 10
+
+
+class Motion:
+    """Energy and momentum of a scene in motion without loads.
+
+    Args:
+        problem: with dynamics.
+        scene: its bodies.
+    """
+
+    def __init__(self, problem: uem.UnitedProblem, scene: Scene):
+        assert problem.dynamics is not None
+        self._dynamics = problem.dynamics
+        self._stored = compat.form(scene.material.energy(scene.u) * ufl.dx)
+        self._start_energy, self._start_momentum = self._energy(), self._dynamics.momentum()
+
+    def _energy(self) -> float:
+        return self._dynamics.kinetic_energy() + compat.assemble_scalar(self._stored, COMM)
+
+    def gained(self) -> float:
+        """Energy won since the start, as part of that at the start; negative if lost (collective)."""
+        return self._energy() / self._start_energy - 1
+
+    def impulse(self) -> float:
+        """Momentum upwards won since the start (collective)."""
+        return float((self._dynamics.momentum() - self._start_momentum)[-1])
+
+
+def bar_on_wall(courant: float, event: float | None, trial: Trial) -> None:
+    """A bar hits a rigid wall: no energy won, none lost where touches are found, and an impulse that is right.
+
+    Steps that resolve the wave see it run through 9 elements, at the Courant limit through all and back, with a pressure of
+    rho c v. Longer ones cannot tell how much of the energy is in vibrations: between a plastic impact and an elastic one all is right.
+    """
+    n, c = 16, 10.0
+    h = 1 / n
+    dt = courant * h / c
+    gap = 0.3 * V0 * dt
+    scene = Scene([Box((0.0, gap), (h, gap + 1.0), (1, n), RHO * c**2)], nu=0.0)
+    scene.unite(scene.side(0, 1, 0), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    dynamics = uem.Dynamics(uem.consistent_mass(scene.V, RHO), velocity=(0.0, -V0))
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, contacts=scene.contacts, dynamics=dynamics)
+    motion = Motion(problem, scene)
+    seen = 9 * h / c if courant < 1 else 2.2 / c
+    deep = 0.0
+    for step in trial.time_steps(problem, dt, gap / V0 + max(seen, 8.4 * dt), event):
+        if step.number % LOOK == 0 or courant >= 1:
+            deep = max(deep, overlap(scene, h))
+            trial.check("energy gained", max(0.0, motion.gained()), FORCE)
+    trial.check("overlap", deep, OVERLAP)
+    if event is not None:
+        trial.check("energy lost", min(0.0, motion.gained()), WAVES)
+    impulse, momentum = motion.impulse(), RHO * V0 * h
+    if courant <= 1:
+        trial.check("impulse", impulse / (RHO * c * V0 * h * min(seen, 2 / c)) - 1, WAVES)
+    else:
+        trial.check("impulse", impulse / np.clip(impulse, momentum, 2 * momentum) - 1, FORCE)
+
+
+def through(passes: float, trial: Trial) -> None:
+    """A block flies at a thin held plate, by a part of its thickness or by several in a step: it must not come out behind."""
+    thickness, h, dt = 0.2, 0.1, 1e-2
+    speed = passes * thickness / dt
+    E = RHO * (speed / 0.3) ** 2
+    boxes = [Box((-1.0, -thickness), (1.0, 0.0), (20, 2), E), Box((-0.43, 0.05), (0.43, 0.85), (8, 8), E)]
+    scene = Scene(boxes, nu=0.0)
+    for end in (0, 1):
+        scene.hold(scene.side(0, 0, end))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    v = fem.Function(scene.V)
+    v.x.array.reshape(-1, 2)[scene.nodes_of(1), 1] = -speed
+    dynamics = uem.Dynamics(uem.consistent_mass(scene.V, RHO), velocity=v)
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts, dynamics=dynamics)
+    motion = Motion(problem, scene)
+    block, plate = scene.nodes(scene.side(1, 1, 0)), scene.nodes(scene.side(0, 1, 1, lambda x: np.abs(x[:, 0]) < 0.45))
+    y = scene.V.tabulate_dof_coordinates()[:, 1]
+    for _ in trial.time_steps(problem, dt, 4 * dt / min(1.0, passes), EVENT):
+        trial.check("energy gained", max(0.0, motion.gained()), FORCE)
+        trial.check("overlap", overlap(scene, h), OVERLAP)
+        now = y + scene.u.x.array.reshape(-1, 2)[:, 1]
+        # both vibrate, and what is above what node by node is the overlap's matter
+        sums = [(now[nodes].sum(), len(nodes)) for nodes in (block, plate)]
+        (above, n), (below, m) = np.sum(COMM.allgather(sums), axis=0)
+        trial.check("block behind the plate", min(0.0, above / n - below / m) / h, 0.5)
+
+
+CASES = [
+    *(
+        Case(f"{c:g} CFL", "a bar hits a rigid wall", partial(bar_on_wall, c, EVENT), quick=c >= 1, moving=True)
+        for c in (0.01, 0.1, 1.0, 10.0, 100.0)
+    ),
+    Case("100 CFL no events", "touches are not looked for within steps", partial(bar_on_wall, 100.0, None), moving=True),
+    *(
+        Case(f"{p:g} thickness a step", "a block flies at a thin plate", partial(through, p), quick=p == 1, moving=True)
+        for p in (0.1, 1.0, 10.0)
+    ),
+]

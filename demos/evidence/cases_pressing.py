@@ -1,0 +1,171 @@
+"""Cases of pressure that is hard to hold: edges and corners that dig in, and scenes drawn at random."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+import uem_dolfinx as uem
+from evidence.cases import COMM, FORCE, Box, Case, Scene, Trial
+from evidence.cases_laws import lawful
+
+
+def _under_a_punch(boxes: list[Box]) -> Scene:
+    """Half of a wide and deep block, even under the punch and growing beyond; with the half of a punch if there are two boxes."""
+
+    def graded(x: np.ndarray, body: int) -> np.ndarray:
+        if body:
+            return x
+        far = np.where(x[:, 0] > 1.5, 0.5 + np.exp(x[:, 0] - 1.5), x[:, 0])
+        return np.column_stack([far, 1.0 - np.exp(-x[:, 1])])
+
+    scene = Scene(boxes, pose=graded)
+    scene.hold(scene.side(0, 1, 0))
+    for body in range(len(boxes)):
+        scene.hold(scene.side(body, 0, 0), 0)
+    return scene
+
+
+def flat_punch(trial: Trial) -> None:
+    """A stiff flat punch on an elastic block, 16 elements wide: the same nodes led downwards by Dirichlet values.
+
+    Pressure grows without bound towards the edge; forces are compared over parts of the width, and at the edge itself.
+    """
+    h, d = 0.125, 0.02
+    block, punch = Box((0.0, -3.0), (4.5, 0.0), (36, 24)), Box((0.0, 0.0), (1.0, 1.0), (8, 8), 1e6)
+    led = _under_a_punch([block])
+    led.hold(led.side(0, 1, 1, lambda x: x[:, 0] < 1.0 + 1e-9), 1, value=-d)
+    uem.UnitedProblem(led.F, led.u, bcs=led.bcs, petsc_options_prefix="led_").solve()
+    scene = _under_a_punch([block, punch])
+    scene.hold(scene.side(1, 1, 1), 1, value=-d)
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, h)
+    force = led.reaction(led.side(0, 1, 0))[1]
+    for part in (0.25, 0.5, 0.75, 0.95):
+        carried = []
+        for s in (led, scene):
+            nodes = s.nodes(s.side(0, 1, 1))
+            inside = s.V.tabulate_dof_coordinates()[nodes, 0] < part + 1e-6
+            carried.append(-COMM.allreduce(float(s.residual()[nodes[inside], 1].sum())))
+        trial.check(f"force within {part:g} of the width", (carried[1] - carried[0]) / force, FORCE)
+    trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / force - 1, FORCE)
+    lawful(trial, scene, h)
+
+
+def sharp_corner(trial: Trial) -> None:
+    """A square on its corner is pressed into a flat block, in finite strain."""
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        if body == 0:
+            return x
+        c = np.sqrt(0.5)
+        return np.column_stack([0.013 + c * (x[:, 0] - x[:, 1]), c * (x[:, 0] + x[:, 1])])
+
+    boxes = [Box((-1.0, -1.0), (1.0, 0.0), (24, 12)), Box((0.0, 0.0), (0.7, 0.7), (7, 7), 10.0)]
+    scene = Scene(boxes, "triangle", pose, law=uem.NeoHooke)
+    scene.hold(scene.side(0, 1, 0))
+    for axis in (0, 1):
+        scene.hold(scene.side(1, axis, 1), value=(0.0, -0.12))
+        scene.unite(scene.side(1, axis, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 1 / 12, 6)
+    lawful(trial, scene, 1 / 12)
+
+
+def corner_on_corner(trial: Trial) -> None:
+    """A block that overhangs the edge of a lower one is pressed down: the target's corner lies between two contactors."""
+    boxes = [Box((0.0, -1.0), (1.0, 0.0), (8, 8)), Box((0.53, 0.0), (1.53, 1.0), (10, 10), 2.0)]
+    scene = Scene(boxes, "triangle", law=uem.NeoHooke)
+    scene.hold(scene.side(0, 1, 0))
+    scene.hold(scene.side(1, 1, 1), value=(0.0, -0.1))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 0.1, 4)
+    lawful(trial, scene, 0.1)
+
+
+def wedge(trial: Trial) -> None:
+    """A wedge pressed into a groove of another angle, until it bears on both sides."""
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        if body == 0:
+            return np.column_stack([x[:, 0], x[:, 1] + 0.5 * np.abs(x[:, 0]) * (x[:, 1] + 1)])
+        return np.column_stack([x[:, 0] + 0.01, x[:, 1] + 0.8 * np.abs(x[:, 0]) * (1 - x[:, 1])])
+
+    boxes = [Box((-1.0, -1.0), (1.0, 0.0), (16, 8)), Box((-0.5, 0.0), (0.5, 1.0), (10, 10), 3.0)]
+    scene = Scene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
+    scene.hold(scene.side(0, 1, 0))
+    scene.hold(scene.side(1, 1, 1), value=(0.0, -0.08))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), max_penetration=0.2)
+    scene.solve(trial, 0.1, 4)
+    lawful(trial, scene, 0.1)
+
+
+def random_scene(seed: int, g: int, law: type, angle: float) -> tuple[Scene, float, np.ndarray]:
+    """A block on another one, whose sizes, shapes, stiffnesses, meshes and ways are drawn; turned by an angle.
+
+    Returns:
+        The scene, the size of its elements at the contact, and the rotation.
+    """
+    rng = np.random.default_rng(seed)
+    n_low, n_high = rng.integers(3, 9 if g == 2 else 4, 2)
+    wide, high = rng.uniform(1.3, 2.0), rng.uniform(0.6, 1.2)
+    E = 10.0 ** rng.uniform(-3, 3)
+    bump, crown, wave = rng.uniform(-0.25, 0.35), rng.uniform(-0.2, 0.2), rng.uniform(0.0, 0.04)
+    shift = rng.uniform(-0.2, 0.2)
+    gap = rng.uniform(0.0, 0.03)
+    way = np.array([rng.uniform(-0.05, 0.05), *[0.0] * (g - 2), -gap - rng.uniform(0.02, 0.08)])
+    jitter = [rng.uniform(-0.15, 0.15, ((n + 1) ** g, g)) for n in (n_low, n_high)]
+    cell = [("triangle", "quadrilateral"), ("tetrahedron", "hexahedron")][g - 2][rng.integers(2)]
+    R = np.eye(g)
+    R[0, 0] = R[-1, -1] = np.cos(angle)
+    R[-1, 0], R[0, -1] = np.sin(angle), -np.sin(angle)
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        y = np.array(x)
+        depth = x[:, -1] + 1 if body == 0 else 0.0
+        box = boxes[body]
+        size = (np.array(box.hi) - np.array(box.lo)) / box.n
+        inner = ((x > np.array(box.lo) + 1e-9) & (x < np.array(box.hi) - 1e-9)).all(axis=1)
+        y += np.where(inner[:, None], jitter[body] * size, 0.0)
+        if body == 0:
+            y[:, -1] -= depth * (bump * (x[:, 0] - crown) ** 2 - wave * np.sin(9 * x[:, 0]))
+        else:
+            top = (x[:, -1] - box.lo[-1]) / high
+            lift = max(0.0, -bump) * (0.5 + abs(shift) + abs(crown)) ** 2 + wave
+            curved = (0.3 + max(0.0, -bump)) * ((x[:, 0] - shift) ** 2 if bump < 0.1 else 0.0 * x[:, 0])
+            y[:, -1] += (1 - top) * curved + lift * 0.0
+        return y @ R.T
+
+    boxes = [
+        Box([-wide / 2] * (g - 1) + [-1.0], [wide / 2] * (g - 1) + [0.0], [int(n_low)] * g),
+        Box([-0.5 + shift] * (g - 1) + [gap], [0.5 + shift] * (g - 1) + [gap + high], [int(n_high)] * g, E),
+    ]
+    scene = Scene(boxes, cell, pose, law=law)
+    scene.hold(scene.side(0, g - 1, 0))
+    scene.hold(scene.side(1, g - 1, 1), value=R @ way)
+    scene.unite(scene.side(1, g - 1, 0), scene.side(0, g - 1, 1), max_penetration=0.5)
+    return scene, min(wide / n_low, 1.0 / n_high), R
+
+
+def random_scenes(seeds: range, g: int, law: type, trial: Trial) -> None:
+    """Lawful, and the same force when the scene is turned."""
+    for seed in seeds:
+        start, forces = len(trial.checks), []
+        for angle in (0.0, 0.7 + seed):
+            scene, h, R = random_scene(seed, g, law, angle)
+            scene.solve(trial, h, 4)
+            size = lawful(trial, scene, h)
+            forces.append(scene.reaction(scene.side(0, g - 1, 0)) @ R)
+        trial.check("rotation", float(np.abs(forces[1] - forces[0]).max()) / size if size > 0 else np.inf, FORCE)
+        trial.about(f"scene {seed}", start)
+
+
+CASES = [
+    Case("flat punch", "stiff flat punch, singular at its edge", flat_punch),
+    Case("sharp corner", "a square pressed in with its corner", sharp_corner),
+    Case("corner on edge", "an overhanging block over the edge of its target", corner_on_corner),
+    Case("wedge in a groove", "of another angle", wedge),
+    Case("random 1-10", "small strain, 2D", partial(random_scenes, range(1, 11), 2, uem.LinearElastic)),
+    Case("random 11-20", "finite strain, 2D", partial(random_scenes, range(11, 21), 2, uem.StVenantKirchhoff), quick=False),
+    Case("random 21-30", "finite strain, 3D", partial(random_scenes, range(21, 31), 3, uem.StVenantKirchhoff), quick=False),
+]

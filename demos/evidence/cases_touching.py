@@ -1,0 +1,283 @@
+"""Cases of how bodies come to touch: on a vertex, hardly at all, off an end, through supports, one after the other, or loose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from evidence.cases import BALANCE, FORCE, OVERLAP, Box, Case, Scene, Trial, oedometer
+from evidence.cases_laws import lawful, overlap
+from evidence.cases_scales import settled, springs
+
+
+def bend(height: float, nudge: float, lift: float) -> Callable[[np.ndarray, int], np.ndarray]:
+    """Fold the lower body's top at x = 0, a ridge for a positive height and a valley for a negative one; shift the upper body."""
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        y = np.array(x)
+        if body == 0:
+            y[:, -1] -= height * (x[:, -1] + 1) * np.abs(x[:, 0])
+        else:
+            y[:, 0] += nudge
+            y[:, -1] += lift + (x[:, 0] ** 2 * 0.2 if height > 0 else 0.6 * np.abs(x[:, 0])) * (1 - x[:, -1])
+        return y
+
+    return pose
+
+
+#: Shifts from a vertex of the target, in the last bits of a place and more.
+NUDGES = (0.0, *(s * np.spacing(0.5) for s in (1, -1, 4, -4)), 1e-12, -1e-9, 1e-6)
+
+
+def vertex(height: float, law: type, trial: Trial) -> None:
+    """A contactor on a vertex of the target, and beside it by a few bits: lawful, and the same force."""
+    forces = []
+    for nudge in (1e-3, -1e-3, *NUDGES):
+        boxes = [Box((-1.0, -1.0), (1.0, 0.0), (8, 4)), Box((-0.5, 0.0), (0.5, 1.0), (4, 4), 2.0)]
+        scene = Scene(boxes, "triangle", bend(height, nudge, 0.0), law=law)
+        scene.hold(scene.side(0, 1, 0))
+        scene.hold(scene.side(1, 1, 1), value=(0.0, -0.03))
+        scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), max_penetration=0.2)
+        scene.solve(trial, 0.25, 2)
+        start = len(trial.checks)
+        lawful(trial, scene, 0.25)
+        forces.append(scene.reaction(scene.side(0, 1, 0))[1])
+        # on a ridge either side is an equilibrium
+        low, high = min(forces[:2]), max(forces[:2])
+        trial.check("force", (forces[-1] - np.clip(forces[-1], low, high)) / high if high > 0 else np.inf, FORCE)
+        trial.about(f"nudge {nudge:.2g}", start)
+
+
+def edge(trial: Trial) -> None:
+    """The same in 3D: contactors on edges and vertices of the target's triangles, on a roof and in a valley."""
+    for height in (0.2, -0.2):
+        forces = []
+        for nudge in NUDGES[:3]:
+            boxes = [Box((-1.0, -0.5, -1.0), (1.0, 1.5, 0.0), (4, 4, 2)), Box((-0.5, 0.0, 0.0), (0.5, 1.0, 1.0), (2, 2, 2), 2.0)]
+            scene = Scene(boxes, "tetrahedron", bend(height, nudge, 0.0), law=uem.StVenantKirchhoff)
+            scene.hold(scene.side(0, 2, 0))
+            scene.hold(scene.side(1, 2, 1), value=(0.0, 0.0, -0.03))
+            scene.unite(scene.side(1, 2, 0), scene.side(0, 2, 1), max_penetration=0.2)
+            scene.solve(trial, 0.5, 2)
+            start = len(trial.checks)
+            lawful(trial, scene, 0.5)
+            forces.append(scene.reaction(scene.side(0, 2, 0))[2])
+            trial.check("force", forces[-1] / forces[0] - 1, FORCE)
+            trial.about(f"{'roof' if height > 0 else 'valley'}, nudge {nudge:.2g}", start)
+
+
+def rest(trial: Trial) -> None:
+    """Touching with nothing that pushes: nothing moves, no force."""
+    for law in (uem.LinearElastic, uem.NeoHooke):
+        scene = Scene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle", law=law)
+        scene.hold(scene.side(0, 1, 0))
+        scene.hold(scene.side(1, 1, 1))
+        scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+        scene.solve(trial, 1 / 6, 2)
+        trial.check("force over E h", np.linalg.norm(scene.reaction(scene.side(0, 1, 0))) * 6, OVERLAP)
+        trial.check("movement over h", float(np.abs(scene.u.x.array).max(initial=0.0)) * 6, OVERLAP)
+
+
+def grazing(trial: Trial) -> None:
+    """A block slides along a flat target at zero pressure, over its vertices and off its end, without force."""
+    scene = Scene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle")
+    scene.hold(scene.side(0, 1, 0))
+    scene.hold(scene.side(1, 1, 1), value=(1.7, 0.0))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    problem = trial.create(scene.F, scene.u, scene.moduli, 1 / 6, bcs=scene.bcs, contacts=scene.contacts)
+    for _ in trial.load_steps(problem, 13):
+        trial.check("force over E h", np.linalg.norm(scene.reaction(scene.side(0, 1, 0))) * 6, OVERLAP)
+        trial.check("overlap", overlap(scene, 1 / 6), OVERLAP)
+
+
+def tangent_sphere(trial: Trial) -> None:
+    """A round block comes down on a flat one until it just touches, and a little further and less far."""
+    for more in (-1e-9, 0.0, 1e-9):
+
+        def pose(x: np.ndarray, body: int) -> np.ndarray:
+            return np.column_stack([x[:, 0], x[:, 1] + (0.1 + 0.4 * x[:, 0] ** 2 * (1 - x[:, 1]) if body else 0.0)])
+
+        boxes = [Box((-1.0, -1.0), (1.0, 0.0), (15, 6)), Box((-0.5, 0.0), (0.5, 1.0), (10, 6))]
+        scene = Scene(boxes, "triangle", pose)
+        scene.hold(scene.side(0, 1, 0))
+        scene.hold(scene.side(1, 1, 1), value=(0.0, -0.1 - more))
+        scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+        scene.solve(trial, 0.1, 2)
+        force = scene.reaction(scene.side(0, 1, 0))[1]
+        trial.check(f"force over E h (way {more:+g})", force / 0.1, OVERLAP)
+        trial.check("overlap", overlap(scene, 0.1), OVERLAP)
+
+
+def off_the_end(trial: Trial) -> None:
+    """A pressed round block is dragged off the end of its target: lawful while it presses, and without force at the end."""
+    h = 1 / 12
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        return np.column_stack([x[:, 0], x[:, 1] + (0.8 * (x[:, 0] - 0.85) ** 2 * (0.5 - x[:, 1]) if body else 0.0)])
+
+    boxes = [Box((0.0, -1.0), (2.0, 0.0), (10, 5)), Box((0.6, 0.0), (1.1, 0.5), (6, 6), 10.0)]
+    scene = Scene(boxes, "triangle", pose, law=uem.NeoHooke)
+    scene.hold(scene.side(0, 1, 0))
+    lead = fem.Constant(scene.mesh, np.zeros(2))
+    top = fem.locate_dofs_topological(scene.V, 1, scene.side(1, 1, 1).entities)
+    scene.bcs.append(fem.dirichletbc(lead, top, scene.V))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+
+    def drag(t: float) -> None:
+        lead.value[:] = (1.7 * max(0.0, t - 0.1) / 0.9, -0.04 * min(1.0, t / 0.1))
+
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts, load=drag)
+    pressed = 0.0
+    for step in trial.load_steps(problem, 40):
+        start = len(trial.checks)
+        force = float(np.linalg.norm(scene.reaction(scene.side(0, 1, 0))))
+        pressed = max(pressed, force)
+        if force > 0.01 * pressed:
+            lawful(trial, scene, h)
+        trial.about(f"at {step.factor:.3g}", start)
+    trial.check("force at the end", force / pressed, BALANCE)
+
+
+def led_contactor(trial: Trial) -> None:
+    """The contactors themselves are led downwards by d and the target gives way: F = M d."""
+    scene = springs(([4, 4], [8, 8]), d=0.01)
+    scene.hold(scene.side(1, 1, 0), 1, value=-0.01)
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 1 / 8)
+    settled(trial, scene, 0.01 * oedometer(), 1 / 8)
+
+
+def fought_contactor(trial: Trial) -> None:
+    """The contactors are led into a target that is held: nothing can meet both."""
+    scene = springs(([4, 4], [8, 8]), d=0.01)
+    scene.hold(scene.side(1, 1, 0), 1, value=-0.01)
+    scene.hold(scene.side(0, 1, 1), 1)
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 1 / 8)
+    trial.check("overlap", overlap(scene, 1 / 8), OVERLAP)
+
+
+def clamped_corner(trial: Trial) -> None:
+    """Contactors held sideways where the target is held fast: values that fit, and a target's node that cannot move."""
+    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (5, 5)), Box((0.0, 0.0), (1.0, 1.0), (5, 5))])
+    scene.hold(scene.side(0, 1, 0))
+    scene.hold(scene.side(0, 0, 0))
+    scene.hold(scene.side(1, 1, 1), value=(0.0, -0.01))
+    scene.hold(scene.side(1, 0, 0), 0)
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 0.2)
+    lawful(trial, scene, 0.2)
+
+
+def two_pass(n: tuple[int, int], trial: Trial) -> None:
+    """Meshes that are not nested, each side contactor and target: a uniform pressure passes."""
+    scene = springs(([n[0], 4], [n[1], 4]))
+    low, high = scene.side(0, 1, 1), scene.side(1, 1, 0)
+    scene.unite(high, low)
+    scene.unite(low, high)
+    scene.solve(trial, 1 / max(n))
+    settled(trial, scene, 0.01 * oedometer() / 2, 1 / max(n))
+    lawful(trial, scene, 1 / max(n))
+
+
+def two_pass_round(trial: Trial) -> None:
+    """A round block on a flat one, meshes that are not nested, each side contactor and target."""
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        return np.column_stack([x[:, 0], x[:, 1] + (0.3 * x[:, 0] ** 2 * (1 - x[:, 1]) if body else 0.0)])
+
+    scene = Scene([Box((-1.0, -1.0), (1.0, 0.0), (30, 12)), Box((-0.6, 0.0), (0.6, 1.0), (25, 12), 3.0)], "triangle", pose)
+    scene.hold(scene.side(0, 1, 0))
+    scene.hold(scene.side(1, 1, 1), value=(0.0, -0.04))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.unite(scene.side(0, 1, 1), scene.side(1, 1, 0))
+    scene.solve(trial, 0.05)
+    lawful(trial, scene, 0.05)
+
+
+def chain(E: tuple[float, float, float], trial: Trial) -> None:
+    """Three blocks on each other, the middle one contactor and target: springs in series."""
+    scene = Scene([Box((0.0, k), (1.0, k + 1.0), (2 * 2**k, 2 * 2**k), E[k]) for k in range(3)])
+    scene.rollers()
+    scene.hold(scene.side(0, 1, 0), 1)
+    scene.hold(scene.side(2, 1, 1), 1, value=-0.01)
+    for k in (1, 2):
+        scene.unite(scene.side(k, 1, 0), scene.side(k - 1, 1, 1))
+    scene.solve(trial, 1 / 8)
+    settled(trial, scene, 0.01 * oedometer() / sum(1 / e for e in E), 1 / 8)
+    lawful(trial, scene, 1 / 8)
+
+
+def loose(load: float, gap: float, sides: bool, trial: Trial) -> None:
+    """A block that nothing but contact holds up is pushed down across a gap: the ground carries the load."""
+    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, gap), (1.0, 1.0 + gap), (8, 8))])
+    scene.rollers(*((0, 1) if sides else (0,)))
+    scene.hold(scene.side(0, 1, 0), 1)
+    scene.push(scene.side(1, 1, 1), (0.0, -load))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 1 / 8)
+    settled(trial, scene, load, 1 / 8)
+    lawful(trial, scene, 1 / 8)
+
+
+def rocking(trial: Trial) -> None:
+    """A loose round body, askew above the floor, falls and rocks until it lies under its weight.
+
+    Nothing tells its place along the floor but the slopes of facets; a force along it to 1 % of the weight is no error.
+    """
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        if body == 0:
+            return x
+        x = np.column_stack([x[:, 0], x[:, 1] + 1.25 * x[:, 0] ** 2 * (0.4 - x[:, 1])])
+        c, s = np.cos(0.2), np.sin(0.2)
+        return np.column_stack([0.02 + c * x[:, 0] - s * x[:, 1], 0.2 + s * x[:, 0] + c * x[:, 1]])
+
+    boxes = [Box((-1.0, -1.0), (1.0, 0.0), (16, 6)), Box((-0.3, 0.0), (0.3, 0.4), (12, 4))]
+    scene = Scene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
+    scene.hold(scene.side(0, 1, 0))
+    scene.weigh(1, (0.0, -1e-2))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 0.05)
+    trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / (1e-2 * scene.volume(1)) - 1, FORCE)
+    lawful(trial, scene, 0.05, supported=FORCE)
+
+
+def lifted(trial: Trial) -> None:
+    """A loose block that is pulled off its ground: nothing can hold it."""
+    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, 0.0), (1.0, 1.0), (8, 8))])
+    scene.rollers()
+    scene.hold(scene.side(0, 1, 0), 1)
+    scene.push(scene.side(1, 1, 1), (0.0, 0.01))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    scene.solve(trial, 1 / 8)
+    trial.check("force", np.inf, FORCE)
+
+
+CASES = [
+    Case("vertex ridge", "contactor on a vertex of a ridge to the last bit", partial(vertex, 0.3, uem.StVenantKirchhoff)),
+    Case("vertex flat", "contactor on a vertex of a plane to the last bit", partial(vertex, 0.0, uem.LinearElastic)),
+    Case("vertex valley", "contactor on a vertex of a valley to the last bit", partial(vertex, -0.3, uem.StVenantKirchhoff)),
+    Case("edge 3D", "contactors on edges of a roof and a valley to the last bit", edge),
+    Case("rest", "touching, but nothing pushes", rest),
+    Case("grazing", "sliding at zero pressure, and off the end", grazing),
+    Case("tangent", "round block brought down until it touches", tangent_sphere),
+    Case("off the end", "pressed block dragged off its target", off_the_end),
+    Case("contactor led", "Dirichlet values on the contactors, the target gives way", led_contactor),
+    Case("contactor fought", "contradicting Dirichlet values", fought_contactor),
+    Case("clamped corner", "contactor beside a node of the target that is held", clamped_corner),
+    Case("two-pass 3:4", "meshes that are not nested", partial(two_pass, (3, 4))),
+    Case("two-pass 7:24", "meshes that are not nested", partial(two_pass, (7, 24))),
+    Case("two-pass round", "a round block, meshes that are not nested", two_pass_round),
+    Case("chain", "three blocks", partial(chain, (1.0, 1.0, 1.0))),
+    Case("chain hard middle", "three blocks", partial(chain, (1.0, 1e4, 1.0))),
+    Case("loose block", "rigid-body mode before touching", partial(loose, 0.01, 0.25, True)),
+    Case("loose sideways", "also free to slide and tilt", partial(loose, 0.01, 0.25, False)),
+    Case("force-driven", "small load across a large gap", partial(loose, 1e-6, 2.0, True)),
+    Case("rocking", "loose round body that falls askew and comes to rest", rocking),
+    Case("lifted", "nothing can hold", lifted),
+]
