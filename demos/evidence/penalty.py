@@ -77,6 +77,14 @@ def facet_rule(cell: str, n: int) -> tuple[Array, Array]:
     return np.column_stack([a, b * (1 - a)]), weights * (1 - a)
 
 
+def _past_the_end(projection: Projection) -> npt.NDArray[np.bool_]:
+    """Points that have slid off the target; the end holds those that are near it ``(k,)``."""
+    beyond = np.linalg.norm(projection.beyond, axis=1)
+    if not isinstance(projection, FacetProjection):
+        return beyond > 0
+    return beyond > END_HOLDS * np.linalg.norm(projection.x[:, 0] - projection.x[:, 1], axis=1)
+
+
 class NodePoints:
     """The contactors themselves, each with its tributary area."""
 
@@ -89,10 +97,6 @@ class NodePoints:
     def project(self) -> Projection:
         """Where the points stand; the pair knows (collective)."""
         return self.pair.projection
-
-    def off(self, projection: Projection) -> npt.NDArray[np.bool_]:
-        """Points past the target's end; the pair knows ``(k,)``."""
-        return self.pair.off
 
     def begin(self) -> None:
         """Begin a step."""
@@ -120,13 +124,6 @@ class SurfacePoints:
             projection = self._anchor = self.pair.target.project(points)
             return projection
         return self.pair.target.follow(points, self._anchor)
-
-    def off(self, projection: Projection) -> npt.NDArray[np.bool_]:
-        """Points past the target's end ``(k,)``."""
-        if not isinstance(projection, FacetProjection):
-            return np.zeros(len(self.area), dtype=bool)
-        facet = np.linalg.norm(projection.x[:, 0] - projection.x[:, 1], axis=1)
-        return np.linalg.norm(projection.beyond, axis=1) > END_HOLDS * facet
 
     def begin(self) -> None:
         """Begin a step: small sliding looks for its feet anew."""
@@ -189,7 +186,7 @@ class PenaltySystem(BodySystem):
         total.set(0.0)
         for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
             p = points.project()
-            touching = ~points.off(p)
+            touching = ~_past_the_end(p)
             force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * touching
             self._springs.append(s := Springs(points.nodes, points.shape, points.area, p, touching, force))
             pushed = force > 0
