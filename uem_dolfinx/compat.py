@@ -1,7 +1,7 @@
 """The one place that knows DOLFINx versions: 0.5 (Debian 12), 0.9 (Debian 13) and 0.11 (PyPI wheel, Debian sid).
 
-Everything later on the way, from the mesh to the files, speaks to DOLFINx through these functions wherever the
-versions differ; what is the same in all of them is called directly.
+Everything later on the way, from the mesh to the files, speaks to DOLFINx through these functions wherever the versions differ,
+or a call that is the same in all of them needs arguments that every caller would have to repeat.
 """
 
 from __future__ import annotations
@@ -540,17 +540,14 @@ def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
     return dofs, int(np.searchsorted(dofs, dofmap.index_map.size_local * dofmap.index_map_bs))
 
 
-def set_bc_values(x: PETSc.Vec | npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
+def set_bc_values(x: npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
     """Write the values of Dirichlet conditions at their d.o.f., ghosts included, and nowhere else.
 
     Args:
-        x: ghosted vector, or local array with ghosts, shape ``(n_local incl. ghosts,)``.
+        x: local array with ghosts, shape ``(n_local incl. ghosts,)``.
         bcs: the conditions.
     """
-    if isinstance(x, PETSc.Vec):
-        with x.localForm() as local:
-            set_bc_values(local.array_w, bcs)
-    elif DOLFINX_VERSION < (0, 9):
+    if DOLFINX_VERSION < (0, 9):
         cpp.fem.set_bc(x, list(bcs), 1.0)
     else:
         for bc in bcs:

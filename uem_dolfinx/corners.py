@@ -26,6 +26,10 @@ Bools = npt.NDArray[np.bool_]
 
 #: Facets whose slopes differ by less are one plane.
 ON_PLANE = 1e-9
+#: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
+STEEP = 0.05
+#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+IN_PLANE = 4
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,8 @@ class Corners:
     Attributes:
         which: their places among the pair's contactors ``(k,)``.
         count: number of facets, 2 to gdim ``(k,)``.
-        meets: whether the facets share a place of the right dimension ``(k,)``.
+        meets: whether the facets share a place to be held at ``(k,)``.
+        loose: whether that is a vertex of two facets in space, whose planes meet in a line through it ``(k,)``.
         rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
         normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
         axes: orthonormal; the first ``count`` span the normals, the very first is their mean ``(k, gdim, gdim)``.
@@ -50,6 +55,7 @@ class Corners:
     which: Ints
     count: Ints
     meets: Bools
+    loose: Bools
     rising: Array
     normals: Array
     axes: Array
@@ -63,7 +69,7 @@ class Corners:
     @property
     def concave(self) -> Bools:
         """Corners that can hold a contactor ``(k,)``."""
-        return self.meets & (self.rising > ON_PLANE)
+        return self.meets & (self.rising > np.where(self.loose, STEEP, ON_PLANE))
 
     @property
     def flat(self) -> Bools:
@@ -75,7 +81,16 @@ class Corners:
         return np.einsum("krg,kg->kr", self.axes, points - self.foot)
 
     def pulls(self, force: Array) -> Array:
-        """Share of each facet in the contact forces ``(k, gdim)``; a negative one pulls at the contactor ``(k, gdim)``."""
+        """What each facet contributes to the contact forces, along its own outward normal.
+
+        Args:
+            force: on the contactors ``(k, gdim)``.
+
+        Returns:
+            Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or, where they span less than the
+            space, to the part of it in their span; of those possible the least in norm. A facet whose coefficient is negative pulls.
+            They are infinite beyond ``count``, where there is no facet.
+        """
         shares = np.einsum("kgr,kg->kr", np.linalg.pinv(self.normals.transpose(0, 2, 1)).transpose(0, 2, 1), force)
         shares[np.arange(shares.shape[1])[None, :] >= self.count[:, None]] = np.inf
         return shares
@@ -120,13 +135,13 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
         common[i] &= (first.nodes[i][:, :, None] == other.nodes[:, None, :]).any(axis=2)
         middle[i] = other.x.mean(axis=1)
     count = (facets >= 0).sum(axis=1)
-    place = _shared_place(target, first.x, points, common, count)
+    place = _shared_place(target, first.x, points, common, count, normals)
     arm = middle - place.foot
     arm /= np.linalg.norm(arm, axis=1, keepdims=True)
     earlier = np.arange(gdim)[None, :] < count[:, None] - 1
     rising = np.where(earlier, np.einsum("kg,kjg->kj", arm, normals), np.inf).min(axis=1)
     return Corners(
-        which, count, place.found, rising, normals, _axes(normals, count), first.nodes, place.weights, place.foot, first.x,
+        which, count, place.found, place.loose, rising, normals, _axes(normals, count), first.nodes, place.weights, place.foot, first.x,
         place.dN, place.ddN,
     )  # fmt: skip
 
@@ -134,18 +149,22 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
 @dataclass(frozen=True)
 class _Place:
     found: Bools
+    loose: Bools
     weights: Array
     foot: Array
     dN: Array
     ddN: Array
 
 
-def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, count: Ints) -> _Place:
-    """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three."""
+def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, count: Ints, normals: Array) -> _Place:
+    """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three.
+
+    Two facets that share only a vertex stand for others beside them; their planes meet in a line.
+    """
     k, nn = common.shape
     shape = target.shape
     d = shape.dim - 1
-    found, weights, foot = np.zeros(k, bool), np.zeros((k, nn)), np.zeros_like(points)
+    found, loose, weights = np.zeros(k, bool), np.zeros(k, bool), np.zeros((k, nn))
     dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
     for side, nodes, _, _ in shape.edges():
         i = np.flatnonzero((count == 2) & common[:, nodes].all(axis=1) & ~found)
@@ -154,11 +173,39 @@ def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, co
         weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
         found[i] = True
     for node in range(len(shape.topology[0])):
-        i = np.flatnonzero((count >= 2) & common[:, node] & ~found)
+        i = np.flatnonzero(common[:, node] & ~found)
         weights[i, node] = 1.0
         found[i] = True
+        if d:
+            i = i[count[i] == 2]
+            loose[i] = True
+            weights[i], dN[i, :, 0] = _on_line(target, x[i], points[i], node, normals[i])
     foot = np.einsum("ka,kag->kg", weights, x)
-    return _Place(found, weights, foot, dN, ddN)
+    return _Place(found, loose, weights, foot, dN, ddN)
+
+
+def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Array) -> tuple[Array, Array]:
+    """Closest points on the line through a vertex in which the planes of two facets meet.
+
+    Returns:
+        Shape functions of the first facet, continued as far as need be, and their derivatives along the line ``(k, nn)``.
+    """
+    along = np.cross(normals[:, 0], normals[:, 1])
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along /= np.where(length > 0, length, 1.0)
+    vertex = x[:, node]
+    foot = vertex + np.einsum("kg,kg->k", along, points - vertex)[:, None] * along
+    xi = np.tile(target.shape.nodes[node], (len(x), 1))
+    for _ in range(IN_PLANE):
+        tab = target.shape.tabulate(xi)
+        t = np.einsum("kaf,kag->kfg", tab.dN, x)
+        m = np.einsum("kfg,keg->kfe", t, t)
+        xi = xi + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, foot - np.einsum("ka,kag->kg", tab.N, x))[..., None])[..., 0]
+    tab = target.shape.tabulate(xi)
+    t = np.einsum("kaf,kag->kfg", tab.dN, x)
+    m = np.einsum("kfg,keg->kfe", t, t)
+    rate = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, along)[..., None])[..., 0]
+    return tab.N, np.einsum("kaf,kf->ka", tab.dN, rate)
 
 
 def _axes(normals: Array, count: Ints) -> Array:

@@ -15,7 +15,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import logger
 from uem_dolfinx.results import contact_suffixes
-from uem_dolfinx.steps import set_time
+from uem_dolfinx.steps import set_load
 from uem_dolfinx.tables import CsvTable
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class EnergyBook:
         self.table = None
         begin: dict[str, float] = {}
         if path is not None:
-            self.table = CsvTable(path, problem.comm, columns, self.dynamics.time if resume else None)
+            self.table = CsvTable(path, problem.comm, columns, self.dynamics if resume else None)
             begin = self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
         self._impulse = np.array([[begin.get(f"impulse_{a}{s}", 0.0) for a in axes] for s in suffixes])
@@ -111,7 +111,7 @@ class EnergyBook:
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
         # the work of the first step begins with the load of this instant
-        set_time(problem, self.dynamics.time)
+        set_load(problem, self.dynamics.time)
         self._look()
         # the sum at the start, from which the defect is counted
         if self.table is not None and begin:

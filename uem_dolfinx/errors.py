@@ -99,7 +99,7 @@ class ConvergenceError(UEMError, RuntimeError):
         self.history = list(history)
 
 
-def agree(comm: MPI.Comm, error: UEMError | None) -> None:
+def agree(comm: MPI.Comm, error: Exception | None) -> None:
     """Raise on every rank the error of the first rank that has one (collective).
 
     Ranks that each look at their own part of the mesh must not raise alone: the others would wait for ever
@@ -110,7 +110,7 @@ def agree(comm: MPI.Comm, error: UEMError | None) -> None:
         error: what this rank found wrong, or None.
 
     Raises:
-        UEMError: the same error on all ranks, if any rank had one.
+        Exception: the same error on all ranks, if any rank had one.
     """
     if comm.size > 1:
         errors = comm.allgather(error)

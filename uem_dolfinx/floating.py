@@ -251,6 +251,12 @@ class FloatingBodies:
         )
 
 
+def find_floating(config: Configuration, free: Bools, finite: bool) -> FloatingBodies | None:
+    """Bodies with open motions, None if there are none (collective); arguments as of ``FloatingBodies``."""
+    floating = FloatingBodies(config, free, finite)
+    return floating if floating.loose else None
+
+
 def _turn(angles: Array) -> Array:
     """Angle ``(1,)`` or rotation vector ``(3,)`` from rotations in the planes that ``rigid_velocities`` lists."""
     return angles if len(angles) == 1 else np.array([angles[2], -angles[1], angles[0]])

@@ -131,6 +131,8 @@ class Dynamics:
         self.number, self.longest = 0, np.inf
         #: Largest kinetic energy that a step has been judged by.
         self.largest = 0.0
+        #: How often a checkpoint has been read into them.
+        self.resumed = 0
         self._attached = False
         #: Factor of M in the tangent.
         self.factor = 0.0
@@ -334,6 +336,11 @@ class Dynamics:
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
 
     @property
+    def moving(self) -> bool:
+        """Whether a step has begun that is neither kept nor left."""
+        return self._moving
+
+    @property
     def numbers(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the Functions."""
         names = ("time", "start", "number", "longest", "accelerated", "largest")
@@ -343,6 +350,7 @@ class Dynamics:
         """Go on from the Functions as they are and the numbers of a checkpoint."""
         for name in self.numbers:
             setattr(self, name, numbers[name])
+        self.resumed += 1
         self.restore()
         self.remember()
 

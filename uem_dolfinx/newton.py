@@ -61,8 +61,8 @@ class United:
         scale: norm of the forces at work.
         rounding: norm below which a force is rounding of the displacement.
         strain_rounding: norm that rounding of the deformation gradient alone can make, in laws that start from it.
-        gap: largest gap of an active contactor over the model's size.
-        active: number of active contactors.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks.
         changed: whether the active set changed.
         closed: whether gaps and Dirichlet conditions are met.
     """

@@ -50,7 +50,7 @@ class HistoryWriter:
         for suffix in contact_suffixes(problem.contacts):
             columns += [f"active{suffix}", f"max_gap{suffix}"]
             columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
-        self.table = CsvTable(path, problem.comm, columns, dynamics.time if resume and dynamics is not None else None)
+        self.table = CsvTable(path, problem.comm, columns, dynamics if resume else None)
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
         """Append a row (collective).

@@ -148,11 +148,12 @@ class UnitedSolver:
                 self._P = P
                 self.A = K.PtAP(self._P)
             if curvature is not None:
-                # an equation that depends on others acts on nodes that P does not join
+                # an equation that depends on others acts on nodes that P does not join, and without equations P joins none
+                alone = restriction.stacked or restriction.M is None
                 pattern = PETSc.Mat.Structure
-                fits = pattern.DIFFERENT_NONZERO_PATTERN if restriction.stacked else pattern.SUBSET_NONZERO_PATTERN
-                self.A.axpy(1.0, curvature.PtAP(self._P), fits)
-                key = None if restriction.stacked else key
+                fits = pattern.DIFFERENT_NONZERO_PATTERN if alone else pattern.SUBSET_NONZERO_PATTERN
+                self.A.axpy(1.0, curvature.PtAP(restriction.P), fits)
+                key = None if alone else key
             diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
             idle = ~restriction.used.ravel()
             diagonal.array[idle] = stiffness.array_r[idle]

@@ -5,6 +5,7 @@ Ninth step on the data's way; a step is committed when it has converged, and a r
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from uem_dolfinx.errors import (
     SpaceError,
     TunnellingError,
     UEMError,
+    agree,
 )
 from uem_dolfinx.log import logger, progress
 from uem_dolfinx.rigid import RigidSurface
@@ -104,8 +106,8 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
         try:
             iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
         except MENDABLE as error:
-            cuts += 1
-            length *= 0.5
+            # the last step may have been shorter than was meant
+            cuts, length = cuts + 1, 0.5 * (factor - done)
             if length < SHORTEST_STEP * nominal:
                 _apply_load(problem, done)
                 # the targets that the load moves are back, too
@@ -122,12 +124,8 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
 
 def _apply_load(problem: UnitedProblem, factor: float) -> float:
     """Set the load; returns how far the Dirichlet values are to be ramped."""
-    if callable(problem.load) and not isinstance(problem.load, fem.Constant):
-        problem.load(factor)
-        return 1.0
-    if problem.load is not None:
-        problem.load.value = factor
-    return factor
+    set_load(problem, factor)
+    return 1.0 if callable(problem.load) and not isinstance(problem.load, fem.Constant) else factor
 
 
 @dataclass(frozen=True)
@@ -219,7 +217,7 @@ def _time_steps(
     problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
 ) -> Iterator[TimeStep]:
     """The steps of ``time_steps``."""
-    set_time(problem, dynamics.time)
+    set_load(problem, dynamics.time)
     problem.system.accelerate()
     cuts, before, rounding = 0, _touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
@@ -234,7 +232,7 @@ def _time_steps(
                 _refuse_given_energy(problem, dynamics, forces)
         except UEMError as error:
             dynamics.restore()
-            set_time(problem, dynamics.time)
+            set_load(problem, dynamics.time)
             problem.restore()
             if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_STEP * dt:
                 raise
@@ -289,7 +287,7 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
 def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     """Find the state at the end of a step of this length (collective)."""
     assert problem.dynamics is not None
-    set_time(problem, problem.dynamics.time + length)
+    set_load(problem, problem.dynamics.time + length)
     problem.dynamics.begin(length)
     iterations = problem.attempt()
     check_tunnelling(problem.system, problem.committed)
@@ -338,9 +336,26 @@ def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
     return max(NOTHING * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))
 
 
-def set_time(problem: UnitedProblem, time: float) -> None:
-    """Set loads and Dirichlet values of an instant."""
+def set_load(problem: UnitedProblem, at: float) -> None:
+    """Set loads, and what else the problem's ``load`` sets, of a load factor or a time (collective).
+
+    What a function raises on some ranks is raised on all of them, where it can be sent as it is; else as a RuntimeError.
+    """
     if isinstance(problem.load, fem.Constant):
-        problem.load.value = time
+        problem.load.value = at
     elif problem.load is not None:
-        problem.load(time)
+        try:
+            problem.load(at)
+        except Exception as error:
+            agree(problem.comm, error if problem.comm.size == 1 else _to_be_sent(error))
+        else:
+            agree(problem.comm, None)
+
+
+def _to_be_sent(error: Exception) -> Exception:
+    """The error, or its words if it does not survive the way to other ranks."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error

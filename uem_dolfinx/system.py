@@ -19,17 +19,18 @@ from uem_dolfinx.checks import check_initial
 from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import NotFiniteError
-from uem_dolfinx.floating import HARDLY_HELD, OPEN, FloatingBodies
+from uem_dolfinx.floating import HARDLY_HELD, OPEN, find_floating
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import MeshTarget
 from uem_dolfinx.surfaces import followed_nodes
-from uem_dolfinx.tangent import Tangent, contact_curvature
+from uem_dolfinx.tangent import Inversions, Tangent, contact_curvature
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uem_dolfinx.floating import FloatingBodies
     from uem_dolfinx.inertia import Dynamics
     from uem_dolfinx.materials import HistoryMaterial
     from uem_dolfinx.solver import UnitedSolver
@@ -93,15 +94,21 @@ class BodySystem:
         self.free = self._free_components()
         #: Displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
         self.wanted: Array = np.array(config.displacement)
-        #: Bodies that contact must hold, if there are any.
+        #: Bodies that contact must hold in this step, if there are any: in a step in time, inertia holds those that have mass.
         self.floating: FloatingBodies | None = None
+        #: The same at rest (False) and in motion (True).
+        self._floating: dict[bool, FloatingBodies | None] = {}
         self._open: Array = np.zeros((0, 0))
+        #: Whether a node is a contactor of several pairs.
+        self.shared = False
+        #: Whether equations can get in each other's way.
+        self.contestable = False
         #: Whether contact of bodies that only contact holds has yet to develop in this step.
         self._landing = False
         self._factored: object = None
         self._stiffness: Any = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
-        self._detector = self._inversion_detector() if check else None
+        self._inversions = Inversions(config) if check else None
 
     def add_pairs(self, pairs: Sequence[ContactPair]) -> None:
         """Take in the contact pairs (collective)."""
@@ -111,18 +118,15 @@ class BodySystem:
         chained = any(pair.control is not None and pair.control.chained for pair in pairs)
         self.stacked = any(self.comm.allgather(chained or any(followed[pair.nodes].any() for pair in pairs)))
         self._find_mutual(self.pairs)
-        if self.dynamics is not None:
-            self.dynamics.weigh(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
-        if self.pairs:
-            free = self.free[: self.config.n_owned]
-            # what has mass does not float: its inertia holds it
-            loose = free & ~self.dynamics.massy if self.dynamics is not None else free
-            floating = FloatingBodies(self.config, loose, finite=not self.tangent.linear)
-            self.floating = floating if floating.loose else None
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
-        #: Whether a node is a contactor of several pairs.
+        if self.dynamics is not None:
+            self.dynamics.weigh(np.unique(contactors))
+        if self.pairs:
+            free, finite = self.free[: self.config.n_owned], not self.tangent.linear
+            self.floating = self._floating[False] = find_floating(self.config, free, finite)
+            if self.dynamics is not None:
+                self._floating[True] = find_floating(self.config, free & ~self.dynamics.massy, finite)
         self.shared = any(self.comm.allgather(len(np.unique(contactors)) < len(contactors)))
-        #: Whether equations can get in each other's way.
         self.contestable = any(self.comm.allgather(self.shared or any(pair.prescribed or pair.mutual for pair in pairs)))
         self.place(returning=False)
         for pair in pairs:
@@ -174,6 +178,8 @@ class BodySystem:
 
     def land(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch (collective)."""
+        if self.dynamics is not None:
+            self.floating = self._floating.get(self.dynamics.moving)
         self._landing = self.floating is not None
         if self.floating is not None:
             self.floating.release()
@@ -248,6 +254,7 @@ class BodySystem:
         if self.dynamics is not None and not self.dynamics.accelerated:
             self.place(returning=False)
             self.assemble_residual()
+            self.floating = self._floating.get(True)
             self.dynamics.accelerate(self._restrict()[0], self.residual)
 
     def _du_like(self) -> PETSc.Vec:
@@ -456,26 +463,6 @@ class BodySystem:
         restriction, _ = self._restrict()
         return restriction.reduce(restriction.pass_on(self.residual))
 
-    def _inversion_detector(self) -> tuple[ufl.core.expr.Expr, object]:
-        """Volume of the cells turned inside out, as a form."""
-        J = ufl.det(ufl.Identity(self.config.gdim) + ufl.grad(self.u))
-        one = fem.Constant(self.config.mesh, 1.0)
-        with timed("compile forms"):
-            return J, compat.form(ufl.conditional(ufl.le(J, 0.0), one, 0.0 * one) * ufl.dx(domain=self.config.mesh))
-
     def inverted(self) -> str | None:
         """Where a cell is inside out, if one is (collective)."""
-        if self._detector is None:
-            return None
-        J, form = self._detector
-        if compat.assemble_scalar(form, self.comm) == 0.0:
-            return None
-        determinant = fem.Function(compat.dg0_space(self.config.mesh))
-        compat.interpolate_expression(determinant, J)
-        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
-        dofs = compat.cell_dofs(self.config.V)
-        here = (np.inf, "")
-        if len(values):
-            cell = int(values.argmin())
-            here = (float(values[cell]), str(np.round(self.config.X[dofs[cell]].mean(axis=0), 6)))
-        return min(self.comm.allgather(here))[1]
+        return self._inversions.find() if self._inversions is not None else None

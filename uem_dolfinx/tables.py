@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from uem_dolfinx.errors import CheckpointError
 from uem_dolfinx.log import timed
@@ -20,15 +20,24 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 
+class Clock(Protocol):
+    """Something that tells the time, and how often a checkpoint has put it forward."""
+
+    time: float
+    resumed: int
+
+
 class CsvTable:
     """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
+
+    A file that is gone on with stays as it is until the first row is written.
 
     Args:
         path: name of the file; its folder is made.
         comm: communicator of the run.
         columns: their names; the first is a load factor or a time that grows.
-        resume_at: keep the rows of a file that is there up to this value of the first column, and go on after them; None
-            begins a new file.
+        resume_at: keep the rows of a file that is there up to this value of the first column, and go on after them; of a clock, up
+            to its present time. None begins a new file.
 
     Raises:
         OSError: of rank 0, on all ranks, if the file cannot be written.
@@ -36,22 +45,36 @@ class CsvTable:
         CheckpointError: likewise, if it has other columns.
     """
 
-    def __init__(self, path: str | Path, comm: MPI.Comm, columns: Sequence[str], resume_at: float | None = None):
+    def __init__(self, path: str | Path, comm: MPI.Comm, columns: Sequence[str], resume_at: float | Clock | None = None):
         self.columns, self.comm, self.path = list(columns), comm, Path(path)
         #: First and last row kept, by column, as numbers; empty in a new file.
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
         self._file: IO[str] | None = None
+        self._clock: Clock | None = None
+        self._resumed = 0
+        until: float | None
+        if resume_at is None or isinstance(resume_at, (int, float)):
+            until = resume_at
+        else:
+            self._clock, self._resumed, until = resume_at, resume_at.resumed, resume_at.time
+        #: Where in the file the rows kept end, 0 without any; None once it has been cut there.
+        self._end: int | None = None
         kept: list[list[str]] = []
 
         def begin() -> None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            if resume_at is not None and self.path.exists():
-                kept.extend(self._cut(resume_at))
-            self._file = self.path.open("a" if kept else "w", newline="", encoding="utf-8")
-            if not kept:
-                csv.writer(self._file).writerow(self.columns)
-            self._file.flush()
+            if until is not None and self.path.exists():
+                self._file = self.path.open("r+", newline="", encoding="utf-8")
+                try:
+                    kept.extend(self._read(until))
+                except (OSError, ValueError):
+                    self.close()
+                    raise
+            else:
+                self._file = self.path.open("w", newline="", encoding="utf-8")
+                self._end = 0
+                self._cut()
 
         self._on_rank_0(begin)
         kept = comm.bcast([*kept[:1], *kept[-1:]])
@@ -60,26 +83,37 @@ class CsvTable:
                 {name: float(value) for name, value in zip(self.columns, row) if value} for row in (kept[0], kept[-1])
             )
 
-    def _cut(self, resume_at: float) -> list[list[str]]:
-        """Cut the file behind its last row up to a value of the first column; returns the rows left."""
+    def _read(self, until: float) -> list[list[str]]:
+        """Rows of the file up to a value of the first column; finds where they end."""
+        assert self._file is not None
         kept: list[list[str]] = []
-        with self.path.open("r+", newline="", encoding="utf-8") as file:
-            head, end = file.readline(), 0
-            if head.endswith("\n") and next(csv.reader([head])) != self.columns:
-                raise CheckpointError(
-                    f"the table {self.path} belongs to another run: expected the columns {', '.join(self.columns)}, found "
-                    f"{head.strip()}; choose another name, or remove it to start anew"
-                )
-            while line := file.readline():
-                row = next(csv.reader([line]), [])
-                # a killed run may have left half a row
-                if not line.endswith("\n") or len(row) != len(self.columns) or float(row[0]) > resume_at:
-                    break
-                kept.append(row)
-                end = file.tell()
-            file.seek(end)
-            file.truncate()
+        file, end = self._file, 0
+        head = file.readline()
+        if head.endswith("\n") and next(csv.reader([head])) != self.columns:
+            raise CheckpointError(
+                f"the table {self.path} belongs to another run: expected the columns {', '.join(self.columns)}, found "
+                f"{head.strip()}; choose another name, or remove it to start anew"
+            )
+        while line := file.readline():
+            row = next(csv.reader([line]), [])
+            # a killed run may have left half a row
+            if not line.endswith("\n") or len(row) != len(self.columns) or float(row[0]) > until:
+                break
+            kept.append(row)
+            end = file.tell()
+        self._end = end
         return kept
+
+    def _cut(self) -> None:
+        """Cut the file behind the rows kept, once; without any it begins with the names of the columns."""
+        if self._file is None or self._end is None:
+            return
+        self._file.seek(self._end)
+        self._file.truncate()
+        if self._end == 0:
+            csv.writer(self._file).writerow(self.columns)
+        self._file.flush()
+        self._end = None
 
     def _on_rank_0(self, action: Callable[[], None]) -> None:
         """Do something on rank 0; what it raises about the file is raised on all ranks (collective)."""
@@ -95,15 +129,32 @@ class CsvTable:
 
     @timed("write table")
     def write(self, row: Sequence[Any]) -> None:
-        """Append a row; floats are written to the last bit (collective)."""
+        """Append a row; floats are written to the last bit (collective).
+
+        Raises:
+            CheckpointError: if a checkpoint was read after the table had been made to go on with its file, which stays as it was.
+            OSError: of rank 0, on all ranks, if the file cannot be written.
+            ValueError: if the table is closed.
+        """
+        if self._late:
+            raise CheckpointError(
+                f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "
+                "call checkpoint.begin(problem.state()) before you make what writes tables with resume=True"
+            )
 
         def append() -> None:
             if self._file is None:
                 raise ValueError(f"the table {self.path} is closed: write before close(), inside of its with block")
+            self._cut()
             csv.writer(self._file).writerow([repr(float(v)) if isinstance(v, float) else v for v in row])
             self._file.flush()
 
         self._on_rank_0(append)
+
+    @property
+    def _late(self) -> bool:
+        """Whether a checkpoint has been read since the table was made."""
+        return self._clock is not None and self._clock.resumed != self._resumed
 
     def close(self) -> None:
         """Close the file."""

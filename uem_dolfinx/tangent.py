@@ -1,6 +1,6 @@
-"""The tangent K of the bodies: the residual's derivative, the stiffness of materials with history, and the mass's part of it.
+"""Derivatives at the present displacement: the tangent K of the bodies, the curvature of the contact, and cells turned inside out.
 
-Seventh step on the data's way; it is assembled only when something it depends on has changed.
+A part of the seventh step on the data's way; K is assembled only when something it depends on has changed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from uem_dolfinx.inertia import Dynamics
     from uem_dolfinx.materials import HistoryMaterial
+    from uem_dolfinx.surfaces import Configuration
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -104,7 +105,38 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
     # a rank without nodes would not be told, and then assemble otherwise than the others
     G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
     for nodes, blocks in parts:
-        for row, block in zip(nodes.astype(PETSc.IntType), blocks):
-            G.setValuesBlocked(row, row, block, addv=PETSc.InsertMode.ADD)
+        if len(nodes):
+            which = nodes.astype(PETSc.IntType)
+            G.setValuesBlockedRCV(which, which, blocks, addv=PETSc.InsertMode.ADD)
     G.assemble()
     return G
+
+
+class Inversions:
+    """Looks for cells that the displacement turns inside out.
+
+    Args:
+        config: configuration of the displacement.
+    """
+
+    def __init__(self, config: Configuration):
+        self.config = config
+        self._J = ufl.det(ufl.Identity(config.gdim) + ufl.grad(config.u))
+        one = fem.Constant(config.mesh, 1.0)
+        with timed("compile forms"):
+            self._volume = compat.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
+
+    def find(self) -> str | None:
+        """Where the worst of them is, if there are any (collective)."""
+        config = self.config
+        if compat.assemble_scalar(self._volume, config.comm) == 0.0:
+            return None
+        determinant = fem.Function(compat.dg0_space(config.mesh))
+        compat.interpolate_expression(determinant, self._J)
+        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
+        dofs = compat.cell_dofs(config.V)
+        here = (np.inf, "")
+        if len(values):
+            cell = int(values.argmin())
+            here = (float(values[cell]), str(np.round(config.X[dofs[cell]].mean(axis=0), 6)))
+        return min(config.comm.allgather(here))[1]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.checks import TOUCHING, check_finite
-from uem_dolfinx.corners import Corners, find_corners
 from uem_dolfinx.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.facet_changes import FacetChanges
 from uem_dolfinx.log import timed
 from uem_dolfinx.pair_state import PairState
 from uem_dolfinx.quadratic import ControlGaps
@@ -23,6 +23,7 @@ from uem_dolfinx.search import FacetProjection, MeshTarget, Projection, Target
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from uem_dolfinx.corners import Corners
     from uem_dolfinx.surfaces import Configuration
 
 Array = npt.NDArray[np.float64]
@@ -39,12 +40,6 @@ GAP_ROUNDING = 1e-13
 NEAR = 1.0
 #: Normal return may change nodal forces by this part of the largest contact force.
 GENTLE = 0.1
-#: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
-HOLD_AFTER = 2
-#: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
-MOST_CHANGES = 8
-#: A corner holds a contactor if its free components keep this part of each of the corner's directions.
-FREE_ENOUGH = 1e-3
 
 
 class ContactPair:
@@ -83,36 +78,25 @@ class ContactPair:
         self.free, self._free = free[nodes], free
         #: Whether any contactor on any rank is prescribed in some direction.
         self.prescribed = bool(config.comm.allreduce(int(not self.free.all())))
-        none = np.full(n, -1, dtype=np.int64)
-        self.committed = PairState(
-            np.zeros(n, bool),
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros((n, config.gdim)),
-            none,
-            np.full((n, config.gdim - 1), -1),
-            np.zeros(n, np.int64),
-            np.zeros(n, np.int64),
-            np.zeros(n, bool),
-        )
-        self.trial = self.last_commit = self.committed
+        self.trial = self.last_commit = self.committed = PairState.initial(n, config.gdim)
         self.projection: Projection
         #: Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface.
         self.gap: Array = np.zeros(n)
         self.control = ControlGaps(config, nodes) if config.degree == 2 else None
-        #: Whether the target's nodes are contactors on this pair's own contactor surface (two-pass).
+        #: Whether a pair that follows these contactors has contactors that this pair follows (two-pass); found by the system.
         self.mutual = False
         #: Active contactors whose equations depend on others and were left out ``(n,)``.
         self.redundant: Bools = np.zeros(n, dtype=bool)
         #: Number of equations of the last call of ``equations``.
         self.n_equations = 0
-        self._united: Ints = none
+        self._united: Ints = np.zeros(0, dtype=np.int64)
         self._reserved: Bools = np.zeros(n, dtype=bool)
         self._anchor: Projection | None = None
         self._target_moves: Bools | None = None
-        self._nearest: Projection
-        self._corners: Corners | None = None
-        self._left: Bools = np.zeros(n, dtype=bool)
+        self._facet_changes: FacetChanges | None = None
+        if sliding == "finite" and isinstance(target, MeshTarget) and not target.averaged:
+            # normals jump from facet to facet
+            self._facet_changes = FacetChanges(config, target, self.free)
 
     # -- projection ------------------------------------------------------------------------------------------------
 
@@ -125,8 +109,9 @@ class ContactPair:
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective)."""
         if self.sliding == "finite":
-            self._nearest = self._held_at_end(self.target.project(self.points))
-            self.projection = self._in_corners(self._nearest)
+            self.projection = self._held_at_end(self.target.project(self.points))
+            if self._facet_changes is not None:
+                self.projection = self._facet_changes.place(self.projection, self.trial, self.points)
         elif self._anchor is None:
             self._anchor = self.projection = self.target.project(self.points)
         else:
@@ -158,51 +143,15 @@ class ContactPair:
         return nearest.reaching_out(i, self.target.shape) if len(i) else nearest
 
     @property
-    def _has_corners(self) -> bool:
-        """Whether facet normals jump under the contactors at all."""
-        return self.sliding == "finite" and isinstance(self.target, MeshTarget) and not self.target.averaged
-
-    def _in_corners(self, nearest: Projection) -> Projection:
-        """Replace the nearest facet by the corner that holds a contactor, or its normal by the averaged one (collective)."""
-        if not self._has_corners:
-            return nearest
-        assert isinstance(nearest, FacetProjection)
-        locked = self.trial.changes >= MOST_CHANGES
-        gap = np.einsum("ng,ng->n", nearest.averaged, self.points - nearest.foot)
-        normal = np.where(locked[:, None], nearest.averaged, nearest.normal)
-        projection = replace(nearest, normal=normal, gap=np.where(locked, gap, nearest.gap))
-        held = np.flatnonzero((self.trial.held >= 0).any(axis=1))
-        self._corners = self._corners_of(held, self.trial.held[held])
-        if self._corners is None:
-            return projection
-        c = self._corners
-        at_corner: dict[str, Any] = {
-            "normal": c.axes[:, 0],
-            "gap": c.gaps(self.points[held])[:, 0],
-            "facet": self.trial.facet[held],
-        }
-        return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0})
-
-    def _corners_of(self, which: Ints, others: Ints) -> Corners | None:
-        """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
-        assert isinstance(self.target, MeshTarget)
-        facets = np.column_stack([self.trial.facet[which], others])
-        return find_corners(self.config.comm, self.target, self.points[which], which, facets)
+    def _corners(self) -> Corners | None:
+        """Corners of the target that hold contactors, None if no rank has any."""
+        return self._facet_changes.corners if self._facet_changes is not None else None
 
     def refresh_corners(self) -> None:
         """Put contactors that have entered or left a corner where they now belong (collective)."""
-        if not self._has_corners:
-            return
-        assert isinstance(self._nearest, FacetProjection) and isinstance(self.target, MeshTarget)
-        # one that has just left is still as near to the facet it left
-        left = np.flatnonzero(self._left & (self.trial.held < 0).all(axis=1))
-        if self.config.comm.allreduce(len(left)):
-            own = self.target.project_on(self.points[left], self.trial.facet[left])
-            own = replace(own, normal=self.target.outward(own))
-            own = replace(own, gap=np.einsum("ng,ng->n", own.normal, self.points[left] - own.foot))
-            self._nearest = self._nearest.with_rows(left, {f.name: getattr(own, f.name) for f in fields(own)})
-        self.projection = self._in_corners(self._nearest)
-        self._measure()
+        if self._facet_changes is not None:
+            self.projection = self._facet_changes.place_again(self.trial, self.points)
+            self._measure()
 
     def return_to_target(self, stiffness: Array) -> None:
         """Normal return [UEM, 4.2]: put the active contactors back onto the moved target.
@@ -353,73 +302,15 @@ class ContactPair:
         active = (state.active | enter) & ~release
         slips = state.slips + (release & off)
         passed = (state.passed | (release & off)) & ~active
+        # nodal forces stay until they are read anew: the next iteration is no better without the curvature of what is released
         self.trial = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips, passed=passed)
         changed = bool(enter.any() or release.any())
-        if self._has_corners:
-            changed |= self._leave_corners(settled or not cautious)
-            changed |= self._change_facets()
+        if self._facet_changes is not None:
+            self.trial, left = self._facet_changes.leave(self.trial, settled or not cautious)
+            self.trial, entered = self._facet_changes.follow(self.trial, self.points)
+            changed |= left or entered
         self._update_control()
         return bool(comm.allreduce(changed))
-
-    def _leave_corners(self, trusted: bool) -> bool:
-        """Let go of the facet of a corner that would have to pull, if the forces are to be trusted."""
-        self._left = np.zeros(len(self.nodes), dtype=bool)
-        c, state = self._corners, self.trial
-        if c is None or not len(c.which):
-            return False
-        i = c.which
-        pulls = c.pulls(state.force[i])
-        leaving = (trusted & (pulls < 0).any(axis=1)) | ~state.active[i]
-        facets = np.column_stack([state.facet[i], state.held[i]])
-        rows = np.flatnonzero(leaving)
-        facets[rows, np.argmin(pulls[rows], axis=1)] = -1
-        # the facets that stay move up
-        facets = np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)
-        facet, held = state.facet.copy(), state.held.copy()
-        facet[i], held[i] = facets[:, 0], facets[:, 1:]
-        held[~state.active] = -1
-        self._left[i[leaving]] = True
-        self.trial = replace(state, facet=facet, held=held)
-        return bool(leaving.any())
-
-    def _change_facets(self) -> bool:
-        """Follow contactors onto new facets; into a concave corner they take the old facet with them (collective)."""
-        state = self.trial
-        nearest = self._nearest.facet
-        known = (state.facet == nearest) | (state.held == nearest[:, None]).any(axis=1) | (state.facet < 0)
-        moved = ~known & state.active & ~self._left & (state.changes < MOST_CHANGES)
-        i = np.flatnonzero(moved)
-        facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
-        settled = ~moved & ~self._left & (held < 0).all(axis=1)
-        facet[settled] = nearest[settled]
-        # first together with all facets that it is on, then with the first of them alone
-        together = np.column_stack([state.held[i], nearest[i]])
-        full = (state.held[i] >= 0).all(axis=1)
-        together = np.take_along_axis(together, np.argsort(together < 0, axis=1, kind="stable"), axis=1)[:, : held.shape[1]]
-        alone = np.full_like(together, -1)
-        alone[:, 0] = nearest[i]
-        taken = np.zeros(len(i), dtype=bool)
-        bent = False
-        for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)):
-            ask = np.flatnonzero(allowed & ~taken)
-            c = self._corners_of(i[ask], others[ask])
-            if c is None:
-                continue
-            hold = c.concave & self._can_be_held(c) & (state.changes[c.which] >= HOLD_AFTER)
-            held[c.which[hold]] = others[ask[hold]]
-            taken[ask[hold]] = True
-            changes[c.which[~c.flat]] += 1
-            bent |= bool(hold.any())
-        switch = i[~taken]
-        facet[switch], held[switch] = nearest[switch], -1
-        self.trial = replace(state, facet=facet, held=held, changes=changes)
-        return bent
-
-    def _can_be_held(self, c: Corners) -> Bools:
-        """Corners whose contactor has a free direction for every facet ``(k,)``."""
-        asked = np.arange(self.config.gdim) < c.count[:, None]
-        A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
-        return (np.linalg.svd(A, compute_uv=False) > FREE_ENOUGH).sum(axis=1) == c.count
 
     # -- what the united system gets ---------------------------------------------------------------------------------
 
@@ -504,8 +395,7 @@ class ContactPair:
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
         self.last_commit, self.committed = self.committed, fresh
-        self.trial = self.committed
-        self._corners = None
+        self.restore()
         if self.sliding == "small":
             self._anchor = None
         if not self.trial.active.any():
@@ -514,27 +404,21 @@ class ContactPair:
     def restore(self) -> None:
         """Go back to the committed state."""
         self.trial = self.committed
-        self._corners = None
+        if self._facet_changes is not None:
+            self._facet_changes.corners = None
 
     def keep(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
         kept: dict[str, npt.NDArray[Any]] = {"reserved": self._reserved, "redundant": self.redundant}
         for when, state in (("committed", self.committed), ("last", self.last_commit)):
-            kept |= {f"{when}_{f.name}": getattr(state, f.name) for f in fields(state)}
-            if isinstance(self.target, MeshTarget):
-                for name in (f"{when}_facet", f"{when}_held"):
-                    kept[name] = self.target.keys_of(kept[name].ravel()).reshape(kept[name].shape)
+            kept |= {f"{when}_{name}": array for name, array in state.keep(self.target).items()}
         return kept
 
     def recall(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what ``keep`` returned, to be followed by ``project`` (collective)."""
 
         def state(when: str) -> PairState:
-            arrays = {f.name: np.array(kept[f"{when}_{f.name}"]) for f in fields(PairState)}
-            if isinstance(self.target, MeshTarget):
-                for name in ("facet", "held"):
-                    arrays[name] = self.target.facets_of(arrays[name].ravel()).reshape(arrays[name].shape)
-            return PairState(**arrays)
+            return PairState.recall({f.name: kept[f"{when}_{f.name}"] for f in fields(PairState)}, self.target)
 
         self._reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
         self.committed, self.last_commit = state("committed"), state("last")
