@@ -24,7 +24,6 @@ from uem_dolfinx.search import FacetProjection, MeshTarget, Projection
 from uem_dolfinx.surfaces import TargetFacets, tributary_areas
 from uem_dolfinx.system import ROUNDING, BodySystem
 from uem_dolfinx.tangent import contact_curvature
-from uem_dolfinx.uniting import END_HOLDS
 
 if TYPE_CHECKING:
     from uem_dolfinx.mesh import Tag
@@ -35,6 +34,8 @@ Ints = npt.NDArray[np.int64]
 
 #: A multiplier is brought up to date when the bodies are in equilibrium to this part of the forces.
 SETTLED = 1e-7
+#: The target's end holds points up to this part of its facet beyond.
+HELD_AT_END = 1e-3
 #: After so many full Newton steps of a load step the line search sees to it that springs do not come and go for ever.
 FULL_STEPS = 2
 #: So near to equilibrium, as part of the forces, Newton's method needs no line search.
@@ -82,7 +83,7 @@ def _past_the_end(projection: Projection) -> npt.NDArray[np.bool_]:
     beyond = np.linalg.norm(projection.beyond, axis=1)
     if not isinstance(projection, FacetProjection):
         return beyond > 0
-    return beyond > END_HOLDS * np.linalg.norm(projection.x[:, 0] - projection.x[:, 1], axis=1)
+    return beyond > HELD_AT_END * np.linalg.norm(projection.x[:, 0] - projection.x[:, 1], axis=1)
 
 
 class NodePoints:
