@@ -10,7 +10,8 @@ python3 demos/work_precision.py --plot work_precision.png
 #
 # - `signorini`: two elastic bodies, in contact for x < 0, with their exact solution, for three ratios of their stiffnesses;
 # - `hertz_cylinder`: an elastic cylinder on an elastic block, against quadratic elements on a fine mesh;
-# - `hertz_penalty`: a rigid paraboloid in 3D, against the exact solution of the discrete problem;
+# - `hertz_penalty`: a rigid paraboloid in 3D, against the exact solution of the discrete problem, which springs spread over the
+#   surface and a barrier do not aim at;
 # - `bar_impact`: a bar hits a wall, against the exact wave.
 #
 # A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best on each mesh counts,
@@ -82,7 +83,7 @@ if "hertz_cylinder" in args.problems:
             progress=args.verbose,
         )  # fmt: skip
 if "hertz_penalty" in args.problems:
-    points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface"), args.runs, progress=args.verbose)
+    points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface", "barrier"), args.runs, progress=args.verbose)
 
 # %% [markdown]
 # ## Impact
