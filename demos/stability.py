@@ -67,11 +67,19 @@ def say(name: str, texts: list[str]) -> None:
         print(f"{name:22}" + "".join(f"{text:>19}" for text in texts), flush=True)
 
 
+def keep(results: dict) -> None:
+    """Write the JSON file, after every row, so that a run that is stopped leaves what it has found."""
+    if args.json and comm.rank == 0:
+        Path(args.json).parent.mkdir(parents=True, exist_ok=True)
+        Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
 start, cells = time.perf_counter(), []
 say("case", [column.name for column in columns])
 for row in rows:
     cells += [judge(row, column) for column in columns]
     say(row.name, [MARK[cell["verdict"]] + figure_of(cell) for cell in cells[-len(columns) :]])
+    keep({"cells": cells})
 seconds = time.perf_counter() - start
 wrong = [cell for cell in cells if cell["verdict"] == "wrong"]
 if comm.rank == 0:
@@ -117,10 +125,7 @@ if comm.size == 1 and args.cases == "all" and not flag.quick:
                 curves.append({"method": column.name, "against": against, "value": value, "condition": number})
 
 common.report(argparse.Namespace(json=None), {"totals": totals, "seconds": seconds, "ranks": comm.size})
-if args.json and comm.rank == 0:
-    Path(args.json).parent.mkdir(parents=True, exist_ok=True)
-    results = {"cells": cells, "totals": totals, "condition": curves, "seconds": seconds, "ranks": comm.size}
-    Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+keep({"cells": cells, "totals": totals, "condition": curves, "seconds": seconds, "ranks": comm.size})
 
 # %% [markdown]
 # ## The pictures

@@ -43,6 +43,13 @@ logging.getLogger("uem_dolfinx").setLevel(logging.ERROR)
 points = []
 
 
+def keep(results: dict) -> None:
+    """Write the JSON file; after every problem, so that a run that is stopped leaves what it has found."""
+    if args.json and comm.rank == 0:
+        Path(args.json).parent.mkdir(parents=True, exist_ok=True)
+        Path(args.json).write_text(json.dumps(results | {"points": points}, indent=1) + "\n", encoding="utf-8")
+
+
 def names(degree: int, *without: str) -> list[str]:
     """The methods wanted; the barrier is for one rank and degree 1."""
     if degree > 1 or comm.size > 1 or not methods.available("barrier"):
@@ -69,6 +76,7 @@ if "signorini" in args.problems:
         for ratio in ratios:
             scene = partial(signorini, degree=degree, ratio=ratio, finer=finer, graded=graded)
             points += sweep(scene, sizes[: args.sizes], names(degree, *without), args.runs, progress=args.verbose)
+            keep({})
 
 # %% [markdown]
 # ## Hertz
@@ -82,6 +90,7 @@ if "hertz_cylinder" in args.problems:
             lambda h, degree=degree: hertz_cylinder(h, degree, answer), sizes[: 4 - degree], names(degree), args.runs,
             progress=args.verbose,
         )  # fmt: skip
+    keep({})
 if "hertz_penalty" in args.problems:
     points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface", "barrier"), args.runs, progress=args.verbose)
 
@@ -120,9 +129,7 @@ for scene, group in grouped(points, label).items():
             )
 results = {"machine": machine(), "rates": rates, "glance": glance}
 common.report(Namespace(json=None), results)
-if args.json and comm.rank == 0:
-    Path(args.json).parent.mkdir(parents=True, exist_ok=True)
-    Path(args.json).write_text(json.dumps(results | {"points": points}, indent=1) + "\n", encoding="utf-8")
+keep(results)
 if args.output:
     columns = list(dict.fromkeys(key for point in points for key in point))
     with CsvTable(f"{args.output}/work_precision.csv", comm, columns) as table:
