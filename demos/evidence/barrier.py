@@ -236,7 +236,9 @@ class BarrierSystem(BodySystem):
         """Part of a step that meets nothing."""
         length = 1.0
         if self._mesh is not None:
-            free = ipctk.compute_collision_free_stepsize(self._mesh, self._vertices(start), self._vertices(start + step))
+            ends = self._vertices(start), self._vertices(start + step)
+            # the default one's tree of intervals can outgrow any memory
+            free = ipctk.compute_collision_free_stepsize(self._mesh, *ends, narrow_phase_ccd=ipctk.AdditiveCCD())
             length = free if free == 1.0 else SHY * free
         for pair in self.pairs:
             if not isinstance(pair.target, MeshTarget):

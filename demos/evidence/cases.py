@@ -32,7 +32,7 @@ FORCE, OVERLAP, BALANCE = 1e-2, 1e-3, 1e-3
 NU = 0.3
 #: A method that has spent more than so many Newton iterations for each load step it was asked for and is not at the end, or so many
 #: times the time steps, counts as one that does not converge.
-PATIENCE = 50
+PATIENCE = 20
 #: Newton iterations that a cut step has spent.
 LOST = 50
 

@@ -28,7 +28,7 @@ NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
 UZAWA_OVERLAP = 1e-9
 #: Linear solves of a step: every update of the multipliers takes one or more.
 MOST_UZAWA_ITERATIONS = 400
-MOST_BARRIER_ITERATIONS = 400
+MOST_BARRIER_ITERATIONS = 100
 
 
 class OtherProblem(uem.UnitedProblem):
