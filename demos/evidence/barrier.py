@@ -19,7 +19,7 @@ from scipy.sparse import coo_matrix
 from evidence.line_search import flat_length
 from uem_dolfinx import compat
 from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
@@ -37,6 +37,8 @@ Array = npt.NDArray[np.float64]
 
 #: A step that would collide is shortened to this part of the way to the collision.
 SHY = 0.9
+#: Surfaces nearer than this part of dhat are given up.
+CRUSHED = 1e-7
 #: Bodies nearer than this part of dhat at the start are lifted.
 TOO_NEAR = 1e-3
 
@@ -236,6 +238,10 @@ class BarrierSystem(BodySystem):
         """Part of a step that meets nothing."""
         length = 1.0
         if self._mesh is not None:
+            if self._squeezed():
+                raise ConvergenceError(
+                    f"the barrier is squeezed to less than {CRUSHED:.0e} of its distance {self.distance:.3g}: take smaller steps"
+                )
             ends = self._vertices(start), self._vertices(start + step)
             # the default one's tree of intervals can outgrow any memory
             free = ipctk.compute_collision_free_stepsize(self._mesh, *ends, narrow_phase_ccd=ipctk.AdditiveCCD())
@@ -249,6 +255,13 @@ class BarrierSystem(BodySystem):
                 ).any():
                     length *= 0.5
         return length
+
+    def _squeezed(self) -> bool:
+        """Whether surfaces are so near that collision detection has no digits left to tell them apart."""
+        if self._collisions.empty():
+            return False
+        nearest = self._collisions.compute_minimum_distance(self._mesh, self._vertices())
+        return bool(nearest < (CRUSHED * self.distance) ** 2)
 
     def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
         """Set the displacement; Dirichlet values are met to the last bit when the whole way was free."""
