@@ -39,6 +39,8 @@ Array = npt.NDArray[np.float64]
 SHY = 0.9
 #: Surfaces nearer than this part of dhat are given up.
 CRUSHED = 1e-7
+#: So many iterations in a row they may be that near.
+MOST_SQUEEZES = 20
 #: Bodies nearer than this part of dhat at the start are lifted.
 TOO_NEAR = 1e-3
 
@@ -157,7 +159,7 @@ class BarrierSystem(BodySystem):
 
     def land(self) -> None:
         """Begin a step; bodies that are too near for the barrier are lifted."""
-        self._alpha = 1.0
+        self._alpha, self._squeezes = 1.0, 0
         for pair in self.pairs:
             self.place(returning=False)
             gap = np.where(pair.off, np.inf, pair.projection.gap)
@@ -238,7 +240,8 @@ class BarrierSystem(BodySystem):
         """Part of a step that meets nothing."""
         length = 1.0
         if self._mesh is not None:
-            if self._squeezed():
+            self._squeezes = self._squeezes + 1 if self._squeezed() else 0
+            if self._squeezes > MOST_SQUEEZES:
                 raise ConvergenceError(
                     f"the barrier is squeezed to less than {CRUSHED:.0e} of its distance {self.distance:.3g}: take smaller steps"
                 )
