@@ -27,7 +27,7 @@ NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
 #: Overlap at which Uzawa's multipliers are good enough, as part of the model's size.
 UZAWA_OVERLAP = 1e-9
 #: Linear solves of a step: every update of the multipliers takes one or more.
-MOST_UZAWA_ITERATIONS = 400
+MOST_UZAWA_ITERATIONS = 100
 MOST_BARRIER_ITERATIONS = 100
 
 
