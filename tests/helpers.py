@@ -6,6 +6,9 @@ look at the same scene in many poses and on any number of ranks.
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
@@ -337,3 +340,10 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     difference = ahead - residual(smooth - h * direction)
     difference.scale(0.5 / h)
     return difference, full, plain
+
+
+def start_process(script: str) -> subprocess.Popen[str]:
+    """A Python process of its own that runs a script, told from this one's MPI."""
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)

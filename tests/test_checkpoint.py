@@ -9,8 +9,6 @@ from __future__ import annotations
 import functools
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import fields
@@ -23,7 +21,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import CELLS, at, blocks, box, clamp, highest, modulus, scene, st_venant
+from helpers import CELLS, at, blocks, box, clamp, highest, modulus, scene, st_venant, start_process
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, numbering
@@ -699,11 +697,8 @@ with uem.Checkpoint({path!r}, every={every}) as checkpoint:
 
 
 def start(path, every):
-    """A process that runs until it is killed, told from this one's MPI."""
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
-    script = RUN.format(tests=str(Path(__file__).parent), path=str(path), every=every)
-    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
+    """A process that runs until it is done or killed."""
+    return start_process(RUN.format(tests=str(Path(__file__).parent), path=str(path), every=every))
 
 
 @serial

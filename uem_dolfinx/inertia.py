@@ -283,10 +283,8 @@ class Dynamics:
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
         if restriction.M is None:
-            # without uniting equations P only crosses out the prescribed components
-            M, ones = self.mass.M.copy(), self._like(np.ones(self._n))
-            used = restriction.reduce(restriction.expand(ones))
-            M.diagonalScale(used, used)
+            M = self.mass.M.copy()
+            restriction.cross_out(M)
         else:
             M = self.mass.M.PtAP(restriction.P)
         rhs = restriction.reduce(restriction.pass_on(F))

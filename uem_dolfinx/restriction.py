@@ -210,6 +210,11 @@ class Restriction:
         all_columns[united], all_values[united] = columns, values
         return PETSc.Mat().createAIJ(self._sizes, bsize=g, csr=(indptr, all_columns, all_values), comm=self.comm)
 
+    def cross_out(self, A: PETSc.Mat) -> None:
+        """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""
+        used = self._vector(self.used.astype(float))
+        A.diagonalScale(used, used)
+
     # -- P as a map ----------------------------------------------------------------------------------------------------
 
     @property

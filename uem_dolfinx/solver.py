@@ -134,13 +134,11 @@ class UnitedSolver:
         P = None if restriction.M is None else restriction.P
         with timed("united matrix P'KP" if P is not None else "cross out prescribed components"):
             if P is None:
-                # without uniting equations P only crosses out the prescribed components
                 if reuse:
                     K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 else:
                     self.A = K.copy()
-                used = restriction.reduce(restriction.expand(_ones_like(K)))
-                self.A.diagonalScale(used, used)
+                restriction.cross_out(self.A)
             elif reuse:
                 P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 K.PtAP(self._P, result=self.A)
@@ -222,12 +220,6 @@ class UnitedSolver:
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
         return dq, int(self.ksp.getIterationNumber())
-
-
-def _ones_like(K: PETSc.Mat) -> PETSc.Vec:
-    v = K.createVecRight()
-    v.set(1.0)
-    return v
 
 
 def rigid_body_modes(config: Configuration) -> list[Array]:

@@ -17,15 +17,14 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
 from evidence.line_search import flat_length
+from evidence.pushed import PushedSystem
 from uem_dolfinx import compat
-from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import MeshTarget
 from uem_dolfinx.surfaces import TargetFacets, tributary_areas
-from uem_dolfinx.system import BodySystem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +44,7 @@ MOST_SQUEEZES = 20
 TOO_NEAR = 1e-3
 
 
-class BarrierSystem(BodySystem):
+class BarrierSystem(PushedSystem):
     """Contact by a barrier; arguments beyond those of ``BodySystem``:
 
     Args:
@@ -63,7 +62,7 @@ class BarrierSystem(BodySystem):
     def add_pairs(self, pairs: list[ContactPair]) -> None:
         """Take in the contact pairs and build the collision mesh of their surfaces."""
         super().add_pairs(pairs)
-        self.floating, self.contestable, config = None, False, self.config
+        config = self.config
         surfaces = [TargetFacets(config, contact.contactor) for contact in self._contacts]
         meshed = [pair.target.facets for pair in pairs if isinstance(pair.target, MeshTarget)]
         self._areas = [tributary_areas(config, contact.contactor)[pair.nodes] for contact, pair in zip(self._contacts, pairs)]
@@ -90,13 +89,18 @@ class BarrierSystem(BodySystem):
         return np.asfortranarray(self.config.X[self._nodes] + u[self._nodes])
 
     @property
-    def _potential(self) -> Any:
+    def _pressure(self) -> float:
+        """Stiffness of the barrier."""
         if self.stiffness is None:
             self.tangent.update()
             spacing = np.concatenate(self._areas).mean() ** (1.0 / (self.config.gdim - 1))
             diagonal = self.tangent.K.getDiagonal().array_r
             self.stiffness = float(diagonal[diagonal > 0].min()) / spacing ** (self.config.gdim - 2)
-        return ipctk.BarrierPotential(self.distance, self.stiffness, True)
+        return self.stiffness
+
+    @property
+    def _potential(self) -> Any:
+        return ipctk.BarrierPotential(self.distance, self._pressure, True)
 
     def _push(self) -> Array:
         """Forces of the barrier on all nodes ``(n, gdim)``; keeps the collisions, and tells the pairs."""
@@ -118,8 +122,7 @@ class BarrierSystem(BodySystem):
     def _rigid(self, gap: Array) -> tuple[Array, Array]:
         """First and second derivative of the potential per area at distances from a rigid surface."""
         d2, h2 = gap**2, self.distance**2
-        scale = self._potential.stiffness if hasattr(self._potential, "stiffness") else self.stiffness
-        scale = scale * self.distance / h2**2
+        scale = self._pressure * self.distance / h2**2
         near = (gap > 0) & (gap < self.distance)
         first, second = np.zeros_like(gap), np.zeros_like(gap)
         for i in np.flatnonzero(near):
@@ -170,16 +173,6 @@ class BarrierSystem(BodySystem):
                 self.config.displacement[body == body[pair.nodes[0]]] += (0.5 * self.distance - near) * normal
         self.place(returning=False)
 
-    def place(self, returning: bool) -> None:
-        """Project the contactors; none is put back."""
-        super().place(returning=False)
-
-    def _restrict(self, chords: bool = False) -> tuple[Restriction, None]:
-        """P of the Dirichlet conditions alone."""
-        n = self.config.n_owned
-        prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
-        return Restriction(self.config, UnitingEquations.join([], self.config.gdim), self.free[:n], prescribed, False), None
-
     def _out_of_balance(self, restriction: Restriction) -> PETSc.Vec:
         R = self.residual
         R.array[:] -= self._push()[: self.config.n_owned].ravel()
@@ -191,8 +184,7 @@ class BarrierSystem(BodySystem):
         with timed("barrier"):
             R = self._out_of_balance(restriction)
         F = self.residual.norm()
-        short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
-        closed = bool(short <= 4 * np.finfo(float).eps * np.abs(self.wanted[~self.free]).max(initial=0.0))
+        closed = self._prescribed_is_met()
         active = sum(pair.n_active for pair in self.pairs)
         rounding = self.rounding()
         return United(restriction, restriction, R, R.norm(), F, rounding, self._strain_rounding(), 0.0, active, False, closed)
@@ -205,11 +197,9 @@ class BarrierSystem(BodySystem):
         with timed("barrier"):
             A = self._hessian()
         self.solver.set_operator(state.restriction, A, None)
+        # the solver tells matrices by their handles, so that one must live until the next is made
         self._A = A
-        rhs = state.restriction.reduce(A * state.restriction.c)
-        rhs.axpy(1.0, state.residual)
-        rhs.scale(-1.0)
-        return rhs
+        return self._right_hand_side(state, A)
 
     def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment, as much of it as meets nothing on its way and does not pass the potential's minimum."""
@@ -231,7 +221,7 @@ class BarrierSystem(BodySystem):
 
                 length = flat_length(look, (slope, state.norm), length)
         self.u.x.array[:] = start
-        super().place(returning=False)
+        self.place(returning=False)
         self._alpha = length
         du.scale(length)
         return du

@@ -15,14 +15,13 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from evidence.line_search import flat_length
+from evidence.pushed import PushedSystem
 from uem_dolfinx import compat
-from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.log import timed
 from uem_dolfinx.newton import United
-from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import FacetProjection, MeshTarget, Projection
 from uem_dolfinx.surfaces import TargetFacets, tributary_areas
-from uem_dolfinx.system import ROUNDING, BodySystem
+from uem_dolfinx.system import ROUNDING
 from uem_dolfinx.tangent import contact_curvature
 
 if TYPE_CHECKING:
@@ -53,7 +52,6 @@ class Springs:
         shape: their shape functions ``(k, nb)``.
         area: reference area that each point stands for ``(k,)``.
         projection: of the points onto the target.
-        touching: points that may be pushed: in front of the target or inside, not past its end ``(k,)``.
         force: with which each is pushed along the normal ``(k,)``.
     """
 
@@ -61,7 +59,6 @@ class Springs:
     shape: Array
     area: Array
     projection: Projection
-    touching: npt.NDArray[np.bool_]
     force: Array
 
 
@@ -132,7 +129,7 @@ class SurfacePoints:
             self._anchor = None
 
 
-class PenaltySystem(BodySystem):
+class PenaltySystem(PushedSystem):
     """Contact by springs; arguments beyond those of ``BodySystem``:
 
     Args:
@@ -151,7 +148,6 @@ class PenaltySystem(BodySystem):
     def add_pairs(self, pairs: list[ContactPair]) -> None:
         """Take in the contact pairs (collective)."""
         super().add_pairs(pairs)
-        self.floating, self.contestable = None, False
         self._points = []
         for pair, tag in zip(self.pairs, self._tags):
             # springs know nothing of control gaps
@@ -174,10 +170,6 @@ class PenaltySystem(BodySystem):
                 pair.target.averaged = averaged
         self._multipliers = list(self._committed if self._overlap else self._none)
 
-    def place(self, returning: bool) -> None:
-        """Project the contactors; none is put back."""
-        super().place(returning=False)
-
     # -- forces of the springs ---------------------------------------------------------------------------------------------
 
     def _stretch(self) -> tuple[PETSc.Vec, float]:
@@ -187,9 +179,8 @@ class PenaltySystem(BodySystem):
         total.set(0.0)
         for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
             p = points.project()
-            touching = ~_past_the_end(p)
-            force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * touching
-            self._springs.append(s := Springs(points.nodes, points.shape, points.area, p, touching, force))
+            force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * ~_past_the_end(p)
+            self._springs.append(s := Springs(points.nodes, points.shape, points.area, p, force))
             pushed = force > 0
             overlap = max(overlap, float(np.max(np.abs(p.gap) if self._overlap else -p.gap, where=pushed, initial=0.0)))
             self._hand_on(total, s)
@@ -222,12 +213,6 @@ class PenaltySystem(BodySystem):
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def _restrict(self, chords: bool = False) -> tuple[Restriction, None]:
-        """P of the Dirichlet conditions alone."""
-        n = self.config.n_owned
-        prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[:n]
-        return Restriction(self.config, UnitingEquations.join([], self.config.gdim), self.free[:n], prescribed, False), None
-
     def unite(self, cautious: bool) -> United:
         """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
         F = self.residual
@@ -241,10 +226,7 @@ class PenaltySystem(BodySystem):
                 self._multipliers = [s.force for s in self._springs]
                 forces, _ = self._stretch()
                 R, changed = restriction.reduce(F - forces), True
-        short = np.abs(self.wanted - self.config.displacement)[~self.free].max(initial=0.0)
-        largest = np.abs(self.wanted[~self.free]).max(initial=0.0)
-        short, largest = np.max(self.comm.allgather([short, largest]), axis=0)
-        closed = bool(short <= 4 * np.finfo(float).eps * largest) and not deep
+        closed = self._prescribed_is_met() and not deep
         active = sum(pair.n_active for pair in self.pairs)
         return United(
             restriction, restriction, R, R.norm(), F.norm(), rounding, self._strain_rounding(), overlap, active, changed, closed
@@ -280,10 +262,7 @@ class PenaltySystem(BodySystem):
             self.solver.set_operator(state.restriction, A, None)
             self._A = A
         self._factored = made_of
-        rhs = state.restriction.reduce(self._A * state.restriction.c)
-        rhs.axpy(1.0, state.residual)
-        rhs.scale(-1.0)
-        return rhs
+        return self._right_hand_side(state, self._A)
 
     def _with_springs(self) -> PETSc.Mat:
         """``K + sum stiffness area grad g grad g' - t grad^2 g`` over the springs that push (collective)."""
