@@ -303,7 +303,9 @@ def test_going_on_is_not_having_stopped(cell, normals, folder):
     assert lead(second, range(5, 11)) == iterations[4:]
     u, v = s.gather(whole.u), t.gather(second.u)
     assert np.abs(u - v).max() <= 1e-9 * np.abs(u).max()
-    assert highest(COMM, np.abs(other.pressures - contact.pressures)) <= 1e-9 * contact.max_pressure()
+    # each mesh is shared out among the ranks in its own way
+    field, other_field = s.gather(contact.pressure), t.gather(other.pressure)
+    assert np.abs(field - other_field).max() <= 1e-9 * contact.max_pressure()
     if COMM.size == 1:
         assert np.array_equal(bits(whole.u.x.array), bits(second.u.x.array))
         assert np.array_equal(bits(whole._last), bits(second._last)) and whole._largest_forces == second._largest_forces

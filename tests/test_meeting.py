@@ -216,6 +216,14 @@ def test_overlap_is_an_approach_in_3d(overlap):
     overlapping("hexahedron", (2, 2), overlap)
 
 
+@pytest.mark.parametrize("shuffle", [1, 7, 11])
+def test_contactor_led_past_the_end_of_a_valley(shuffle):
+    """One that has changed facets too often to be followed lets go of an edge it has left, whatever order the facets come in."""
+    m = meet("hexahedron", (2, 2), d=0.25, shuffle=shuffle)
+    assert m.active == 9
+    assert np.abs(m.force[:2]).max() < 1e-10 * m.force[2]
+
+
 # -- to the last bit -------------------------------------------------------------------------------------------------------------
 
 #: Shifts of a contactor from a vertex, as parts of an element; the smallest is the last bit of its place.

@@ -116,7 +116,7 @@ class FacetChanges:
             points: current positions of the contactors ``(n, gdim)``.
 
         Returns:
-            The new state, and whether a contactor on this rank has entered a corner.
+            The new state, and whether a contactor on this rank has entered a corner or left it for good.
         """
         nearest = self._nearest.facet
         known = (state.facet == nearest) | (state.held == nearest[:, None]).any(axis=1) | (state.facet < 0)
@@ -145,6 +145,10 @@ class FacetChanges:
             entered |= bool(hold.any())
         switch = i[~taken]
         facet[switch], held[switch] = nearest[switch], -1
+        # one that is still led past the end of what holds it goes on with averaged normals
+        past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
+        facet[past], held[past] = nearest[past], -1
+        entered |= bool(past.any())
         return replace(state, facet=facet, held=held, changes=changes), entered
 
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
