@@ -24,6 +24,10 @@ CAUTIOUS_AFTER = 10
 SHORTEST_STEP = 1.0 / 64
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 ENOUGH_DECREASE = 0.9
+#: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
+PASSING = 1e-4
+#: One that may be the last leaves this part of what convergence asks for.
+LAST = 0.1
 #: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
 LARGEST_ROUNDING = 1e-4
 
@@ -87,6 +91,10 @@ class UnitedSystem(Protocol):
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
 
+    @property
+    def in_contact(self) -> bool:
+        """Whether there are contacts at all."""
+
     def place(self, returning: bool) -> None:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
 
@@ -102,8 +110,8 @@ class UnitedSystem(Protocol):
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
 
-    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
-        """Unknowns dq and the number of linear iterations."""
+    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
 
     def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
@@ -172,7 +180,9 @@ def solve_united(
         rhs = system.linearise(state, first=k == 0)
         driving = rhs.norm()
         thrust = max(thrust, driving if k == 0 else 0.0)
-        dq, iterations = system.solve(rhs)
+        passing = not cautious and (not system.linear or state.changed or (k == 0 and system.in_contact))
+        enough = LAST * rtol * forces / driving if driving > 0 else 0.0
+        dq, iterations = system.solve(rhs, max(enough, PASSING if passing else 0.0))
         residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
         history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
         _report(history, verbose)

@@ -29,6 +29,12 @@ Array = npt.NDArray[np.float64]
 MODES_OF_THEIR_OWN = 4
 #: A mode of which less than this part is new adds nothing to the near-null space.
 INDEPENDENT = 1e-6
+#: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
+MOST_ACCURATE = 1e-10
+#: A preconditioner is kept for matrices that differ from its own in less than this part of the equations,
+KEPT_CHANGES = 0.1
+#: and while it takes less than this times as many iterations for each digit as at first.
+KEPT_SLOWER = 1.5
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 
@@ -40,7 +46,7 @@ def default_options(size: int, gdim: int) -> dict[str, Any]:
         if compat.has_mumps():
             options["pc_factor_mat_solver_type"] = "mumps"
         return options
-    common = {"ksp_type": "cg", "ksp_rtol": 1e-10, "ksp_max_it": 2000}
+    common = {"ksp_type": "cg", "ksp_max_it": 2000}
     if compat.has_hypre():
         return common | {
             "pc_type": "hypre",
@@ -74,7 +80,8 @@ class UnitedSolver:
     Args:
         config: configuration of the displacement.
         prefix: PETSc options prefix.
-        options: PETSc options without prefix; None chooses by size.
+        options: PETSc options without prefix; None chooses by size. Without ``ksp_rtol`` every solve is as accurate as its Newton
+            iteration can use.
     """
 
     def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
@@ -83,12 +90,16 @@ class UnitedSolver:
         self.options = default_options(size, config.gdim) if options is None else dict(options)
         check_options(self.options)
         self._prefix = prefix
+        self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
         self.ksp = self._create_ksp()
         self._key: object = None
         self._P: PETSc.Mat | None = None
         self.A: Any = None
         #: Whether the preconditioner has yet to see the present matrix.
         self._new = False
+        #: Active equations that the preconditioner was made with, and the iterations per digit it took at first and takes now.
+        self._made_with: npt.NDArray[np.bool_] | None = None
+        self._first_pace = self._pace = 0.0
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.config.comm)
@@ -100,7 +111,7 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self._key = self._P = self.A = None
+        self._key = self._P = self.A = self._made_with = None
         self.ksp.destroy()
         self.ksp = self._create_ksp()
 
@@ -115,6 +126,11 @@ class UnitedSolver:
         finally:
             for key in self.options:
                 del database[prefix + key]
+
+    @property
+    def iterative(self) -> bool:
+        """Whether solves have a tolerance."""
+        return bool(self.ksp.getType() != "preonly")
 
     @property
     def needs_near_null_space(self) -> bool:
@@ -156,6 +172,7 @@ class UnitedSolver:
             idle = ~restriction.used.ravel()
             diagonal.array[idle] = stiffness.array_r[idle]
             self.A.setDiagonal(diagonal)
+        self._keep_preconditioner(restriction, reuse)
         self._key = key
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         if self.needs_near_null_space:
@@ -163,6 +180,17 @@ class UnitedSolver:
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.ksp.setOperators(self.A)
         self._new = True
+
+    def _keep_preconditioner(self, restriction: Restriction, reuse: bool) -> None:
+        """Decide whether the preconditioner serves the present matrix as well (collective)."""
+        active, keep = restriction.equations.active, False
+        if self.iterative and reuse and self._made_with is not None:
+            changed = (active != self._made_with).sum()
+            changed, present = self.config.comm.allreduce(np.array([changed, active.sum()]))
+            keep = changed <= KEPT_CHANGES * present and self._pace <= KEPT_SLOWER * self._first_pace
+        if not keep:
+            self._made_with, self._first_pace = active, 0.0
+        self.ksp.getPC().setReusePreconditioner(bool(keep))
 
     def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
         """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
@@ -188,8 +216,12 @@ class UnitedSolver:
                 vectors.append(q)
         return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
 
-    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
+    def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0) -> tuple[PETSc.Vec, int]:
         """Solve for dq (collective).
+
+        Args:
+            rhs: right-hand side.
+            accuracy: part of it that may be left by an iterative solver whose options do not fix its ``ksp_rtol``.
 
         Returns:
             dq and the number of linear iterations.
@@ -198,6 +230,8 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         dq = rhs.duplicate()
+        if self.iterative and not self._fixed_accuracy:
+            self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
         with self._in_database():
             try:
                 if self._new:
@@ -219,7 +253,10 @@ class UnitedSolver:
                 f"{self.ksp.getIterationNumber()} iterations: a body may be free to move as a rigid body, the tangent may be "
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
-        return dq, int(self.ksp.getIterationNumber())
+        iterations = int(self.ksp.getIterationNumber())
+        self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
+        self._first_pace = self._first_pace or self._pace
+        return dq, iterations
 
 
 def rigid_body_modes(config: Configuration) -> list[Array]:

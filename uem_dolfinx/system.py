@@ -421,9 +421,9 @@ class BodySystem:
             return None
         return contact_curvature(parts, self._du_like())
 
-    def solve(self, rhs: PETSc.Vec) -> tuple[PETSc.Vec, int]:
-        """Unknowns dq and the number of linear iterations."""
-        return self.solver.solve(rhs)
+    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
+        return self.solver.solve(rhs, accuracy)
 
     # -- displacement ------------------------------------------------------------------------------------------------
 
@@ -453,6 +453,11 @@ class BodySystem:
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement."""
         return self.tangent.linear and not self.materials
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether there are contacts at all."""
+        return bool(self.pairs)
 
     def reduced_residual(self, state: United) -> PETSc.Vec:
         """``P'F`` at the present displacement, with the active set of ``state``.
