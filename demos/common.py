@@ -15,7 +15,7 @@ import numpy as np
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx import compat
+from uem_dolfinx.solver import multigrid_options
 
 if TYPE_CHECKING:
     import uem_dolfinx as uem
@@ -53,11 +53,7 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
 
 def cg(amg: str = "", rtol: float = 1e-10) -> dict[str, Any]:
     """PETSc options of CG with algebraic multigrid, hypre where PETSc has it."""
-    options = {"ksp_type": "cg", "ksp_rtol": rtol, "pc_type": amg or ("hypre" if compat.has_hypre() else "gamg")}
-    if options["pc_type"] == "hypre":
-        hypre = {"strong_threshold": 0.5, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4}
-        options |= {f"pc_hypre_boomeramg_{key}": value for key, value in hypre.items()}
-    return options
+    return {"ksp_type": "cg", "ksp_rtol": rtol} | multigrid_options(amg)
 
 
 def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) -> fem.DirichletBC:

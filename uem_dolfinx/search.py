@@ -193,9 +193,16 @@ class MeshTarget:
 
     def project(self, points: Array) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
-        data = self.facets.current()
-        owners = self._possible_owners(points, data)
-        return self._ask(points, [np.flatnonzero(o) for o in owners], data)
+        data, size = self.facets.current(), self.comm.size
+        if size == 1:
+            return self._ask(points, [np.arange(len(points))], data)
+        # the answer of the rank that seems nearest tells who else can be as near
+        near, far = self._bounds(points, data)
+        first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
+        found = self._ask(points, [np.flatnonzero(first == r) for r in range(size)], data)
+        reach = np.linalg.norm(points - found.foot, axis=1) * (1 + 1e-9) + ON_SIDE * self.stride
+        others = (near <= reach) & (first != np.arange(size)[:, None])
+        return self._ask(points, [np.flatnonzero(o) for o in others], data, found=found)
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
@@ -246,29 +253,29 @@ class MeshTarget:
         owner = np.searchsorted(self.first, facet, side="right") - 1
         return [np.flatnonzero(owner == r) for r in range(self.comm.size)]
 
-    def _possible_owners(self, points: Array, data: FacetData) -> list[Bools]:
-        """Per rank, which points may have their closest point there.
-
-        A box is ruled out when its near side is farther than the far side of some other box.
-        """
-        if self.comm.size == 1:
-            return [np.ones(len(points), dtype=bool)]
+    def _bounds(self, points: Array, data: FacetData) -> tuple[Array, Array]:
+        """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective)."""
         nodes = data.x.reshape(-1, points.shape[1])
         box = np.stack([nodes.min(axis=0), nodes.max(axis=0)]) if len(nodes) else None
-        boxes = self.comm.allgather(box)
         near, far = np.full((2, self.comm.size, len(points)), np.inf)
-        for r, b in enumerate(boxes):
+        for r, b in enumerate(self.comm.allgather(box)):
             if b is not None:
                 slack = 0.0 if self.shape.degree == 1 else 0.25 * np.linalg.norm(b[1] - b[0])
                 outside = np.maximum(np.maximum(b[0] - points, points - b[1]), 0.0)
                 near[r] = np.linalg.norm(outside, axis=1) - slack
                 far[r] = np.linalg.norm(np.maximum(np.abs(points - b[0]), np.abs(points - b[1])), axis=1) + slack
-        return list(near <= far.min(axis=0))
+        return near, far
 
     def _ask(
-        self, points: Array, requests: list[Ints], data: FacetData, facet: Ints | None = None, xi: Array | None = None
+        self,
+        points: Array,
+        requests: list[Ints],
+        data: FacetData,
+        facet: Ints | None = None,
+        xi: Array | None = None,
+        found: FacetProjection | None = None,
     ) -> FacetProjection:
-        """Send each rank its points (with the facet, or facet and foot, if given), keep the nearest answer."""
+        """Send each rank its points (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
         comm = self.comm
         known = [a for a in (points, facet, xi) if a is not None]
         local = [[a[i] for a in known] for i in requests]
@@ -280,13 +287,21 @@ class MeshTarget:
         if comm.size == 1:
             return answer
         # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
-        away = p - answer.foot
-        distance, height = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.outward(answer))
         ends = np.cumsum([0, *(len(a[0]) for a in asked)])
-        parts = comm.alltoall([_pack(answer, distance, height, slice(a, b)) for a, b in pairwise(ends)])
+        columns = self._judged(p, answer)
+        parts = comm.alltoall([[column[a:b] for column in columns] for a, b in pairwise(ends)])
+        if found is not None:
+            requests, parts = [*requests, np.arange(len(points))], [*parts, self._judged(points, found)]
         d, h, *columns = (np.concatenate(column) for column in zip(*parts))
-        best = _nearest(np.concatenate(requests), d, h, np.arange(len(d)))
+        answers = FacetProjection(*columns)
+        best = _nearest(np.concatenate(requests), d, h, answers.facet)
         return FacetProjection(*(column[best] for column in columns))
+
+    def _judged(self, points: Array, answer: FacetProjection) -> list[npt.NDArray[Any]]:
+        """What tells the nearest of several answers, distance and height over the facet's own plane, and the answer's fields."""
+        away = points - answer.foot
+        height = np.einsum("ng,ng->n", away, self.outward(answer))
+        return [np.linalg.norm(away, axis=1), height, *(getattr(answer, f.name) for f in fields(answer))]
 
     def _project_here(
         self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
@@ -366,10 +381,6 @@ def _unit_normals_of(p: FacetProjection) -> Array:
     return unit_normals(Tabulated(p.weights, p.dN, p.ddN), p.x)
 
 
-def _pack(answer: FacetProjection, distance: Array, height: Array, part: slice) -> list[npt.NDArray[np.generic]]:
-    return [distance[part], height[part], *(getattr(answer, f.name)[part] for f in fields(answer))]
-
-
 @timed("search")
 def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
     """All pairs (point, facet) that can be closest, from trees over the facets' middles, one per size class.
@@ -391,7 +402,10 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
 
     tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
     middle = np.einsum("na,nag->ng", tab.N, x)
-    radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1) * (1.0 if shape.degree == 1 else 1.5)
+    arm, stretch = x - middle[:, None], 1.0 if shape.degree == 1 else 1.5
+    radius = stretch * np.linalg.norm(arm, axis=2).max(axis=1)
+    normal = unit_normals(tab, x)
+    bulge = stretch * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     bound, _ = cKDTree(middle).query(points)
     bound = bound * (1 + 1e-12)
     size_class = np.floor(np.log2(radius / radius.max()))
@@ -404,5 +418,9 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
         pairs.append(np.repeat(np.arange(len(points)), counts))
         facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
     i, f = np.concatenate(pairs), np.concatenate(facets)
-    keep = np.linalg.norm(points[i] - middle[f], axis=1) <= bound[i] + radius[f]
-    return i[keep], f[keep]
+    # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
+    away = points[i] - middle[f]
+    height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
+    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
+    return i[~too_far], f[~too_far]

@@ -1,0 +1,233 @@
+"""How contact scales: speed-up of a Hertz scene on several ranks, what ranks receive in a search, and its time against its size.
+
+python3 demos/scaling.py --json scaling.json --plot scaling.png
+"""
+
+# %% [markdown]
+# # Ranks
+#
+# Three measurements, each a ratio of things done in one run:
+#
+# 1. A half sphere on a block, linear elastic, small sliding, one load step, CG with multigrid: seconds from the making of the problem to
+#    its solution, without reading the mesh and compiling forms.
+# 2. Two plates, one cell thick, that touch all over: bytes that a rank receives from others while all contactors are projected,
+#    against its share of the surfaces, its own contactors and facets. Nothing is timed: there may be more ranks than cores.
+# 3. The time of that search on one rank against the number of contactors.
+#
+# Called on one rank the script starts `mpiexec` of itself for each number of ranks; on several, or with `--where here`, it measures on
+# those that it has. Numbers of a list are parted by commas.
+
+# %%
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import common
+import numpy as np
+import ufl
+from common import comm, dirichlet
+from dolfinx import fem
+from evidence.traffic import Surfaces, plates, search_traffic
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+args = common.arguments(
+    __doc__,
+    where=("apart", "here"),
+    dofs=500_000,
+    ranks="1,2",
+    runs=1,
+    plates="60,120",
+    plate_ranks="1,2,4,8",
+    searches="40,80,160,320",
+)
+
+#: Timers of the stages of a solution.
+STAGES = {
+    "search and projection": ["projection"],
+    "uniting equations": ["uniting equations", "contact curvature"],
+    "assembly": ["assemble residual", "assemble tangent"],
+    "P and P'KP": ["restriction matrix P", "united matrix P'KP", "cross out prescribed components"],
+    "multigrid and CG": ["factorisation or preconditioner set-up", "linear solve"],
+}
+
+
+def numbers(text: str) -> list[int]:
+    """Of a list parted by commas."""
+    return [int(word) for word in text.split(",") if word]
+
+
+# %% [markdown]
+# ## The scene
+
+
+# %%
+def solve(dofs: int, runs: int) -> dict[str, object]:
+    """Solve a Hertz scene with about so many unknowns some times: the quickest run, and what a search of it sends (collective)."""
+    a = 0.005
+    parameters = {"h": 0.1 * a * (89_000 / dofs) ** (1 / 3), "zone": 1.4 * a, "growth": 0.8 / a}
+    mesh, tags = uem.read_gmsh(common.MESHES / "hertz_sphere.geo", comm, gdim=3, parameters=parameters)
+    V = compat.function_space(mesh, 1, (3,))
+    bcs = [dirichlet(V, tags[name], i, 0.0) for i, name in enumerate(("symmetry_x", "symmetry_y", "block_bottom"))]
+    bcs.append(dirichlet(V, tags["sphere_top"], 2, -(a**2)))
+    found = []
+    for _ in range(runs):
+        u = fem.Function(V, name="displacement")
+        F = uem.LinearElastic(1e6, 0.3).residual(u, ufl.TestFunction(V)) * ufl.dx
+        contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], sliding="small")
+        compat.free_petsc_garbage(comm)
+        comm.barrier()
+        before, start = clocks(), time.perf_counter()
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="scaling_", verbose=args.verbose)
+        (step,) = uem.load_steps(problem)
+        seconds = [time.perf_counter() - start, *(clocks() - before)]
+        found.append([float(max(s)) for s in zip(*comm.allgather(seconds))])
+    seconds, *stages = min(found)
+    pair = contact.pair
+    searched = search_traffic(Surfaces(problem.config, pair.target, pair.points))
+    return {
+        "ranks": comm.size,
+        "dofs": 3 * V.dofmap.index_map.size_global,
+        "seconds": seconds,
+        "search_bytes_max": searched["bytes_max"],
+        "contact_imbalance": searched["imbalance"],
+        "contactors": searched["contactors"],
+        "active": contact.n_active,
+        "newton_iterations": step.newton_iterations,
+        "cg_iterations": sum(i.linear_iterations for i in step.iterations),
+    } | dict(zip(STAGES, stages))
+
+
+def clocks() -> np.ndarray:
+    """Seconds that each stage has taken so far on this rank."""
+    return np.array([sum(compat.timing(f"~UEM: {timer}") for timer in timers) for timers in STAGES.values()])
+
+
+# %% [markdown]
+# ## Here: on the ranks of this call
+
+
+# %%
+def best_time(surfaces: Surfaces) -> float:
+    """Seconds of the quicker of two searches of all contactors (collective)."""
+    seconds = []
+    for _ in range(2):
+        comm.barrier()
+        start = time.perf_counter()
+        surfaces.target.project(surfaces.points)
+        seconds.append(max(comm.allgather(time.perf_counter() - start)))
+    return min(seconds)
+
+
+def here(dofs: int, sizes: str, searches: str) -> dict[str, list]:
+    """All measurements on the ranks of this call (collective)."""
+    found: dict[str, list] = {"ranks": [], "plates": [], "search": []}
+    if dofs:
+        # whatever is compiled or imported at first use
+        solve(min(dofs, 2000), 1)
+        found["ranks"].append(solve(dofs, args.runs))
+    for n in numbers(sizes):
+        found["plates"].append({"ranks": comm.size} | search_traffic(plates(n)))
+    for n in numbers(searches):
+        surfaces = plates(n)
+        found["search"].append({"contactors": sum(comm.allgather(len(surfaces.points))), "seconds": best_time(surfaces)})
+    return found
+
+
+# %% [markdown]
+# ## Apart: one call for each number of ranks
+
+
+# %%
+def apart(ranks: int, **options: object) -> dict[str, list]:
+    """What this script measures on so many ranks, told from this one's MPI."""
+    mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
+    if mpiexec is None:
+        raise RuntimeError(
+            f"no mpiexec beside {sys.executable} or on the PATH: install one, or call this script with --where here"
+        )
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    # Open MPI 4 and 5: more ranks than cores, none of them bound to the cores of another run
+    environment |= {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+    environment |= {"OMPI_MCA_hwloc_base_binding_policy": "none", "PRTE_MCA_hwloc_default_binding_policy": "none"}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "figures.json"
+        options = {"where": "here", "json": file, "runs": args.runs, "dofs": 0, "plates": "", "searches": ""} | options
+        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        command = [mpiexec, "-n", str(ranks), sys.executable, str(Path(__file__).resolve()), *words]
+        done = subprocess.run(command, env=environment | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
+        if args.verbose:
+            print(done.stdout, flush=True)
+        return json.loads(file.read_text(encoding="utf-8"))
+
+
+# %%
+if args.where == "here" or comm.size > 1:
+    if comm.rank == 0 and args.where != "here":
+        print(f"measured on the {comm.size} ranks of this call alone; call it on one rank to compare numbers of ranks")
+    results = here(args.dofs, args.plates, args.searches)
+else:
+    results = {
+        "ranks": [row for k in numbers(args.ranks) if args.dofs for row in apart(k, dofs=args.dofs)["ranks"]],
+        "plates": [row for k in numbers(args.plate_ranks) if args.plates for row in apart(k, plates=args.plates)["plates"]],
+        "search": apart(1, searches=args.searches)["search"] if args.searches else [],
+    }
+
+# %% [markdown]
+# ## Ratios
+# The exponent of the search is that between a row and the one before.
+
+# %%
+for row in results["ranks"]:
+    alone = [r["seconds"] for r in results["ranks"] if r["ranks"] == 1]
+    row["speedup"] = alone[0] / row["seconds"] if alone else None
+for row, last in zip(results["search"], [None, *results["search"]]):
+    more, longer = (1.0, 1.0) if last is None else (row[key] / last[key] for key in ("contactors", "seconds"))
+    row["exponent"] = float(np.log(longer) / np.log(more)) if last is not None else None
+common.report(args, {name: rows for name, rows in results.items() if rows})
+
+# %% [markdown]
+# ## The picture
+
+# %%
+with uem.figure(args.plot, comm, panels=2) as (left, right):
+    if left is not None:
+        k = [row["ranks"] for row in results["ranks"]]
+        left.plot(k, k, "k:", label="ideal")
+        left.plot(k, [row["speedup"] or np.nan for row in results["ranks"]], "o-", label="from problem to solution")
+        for stage in STAGES:
+            alone = [row[stage] for row in results["ranks"] if row["ranks"] == 1]
+            left.plot(k, [alone[0] / row[stage] if alone else np.nan for row in results["ranks"]], ".--", lw=0.8, label=stage)
+        left.set_xlabel("ranks")
+        left.set_ylabel("speed-up")
+        left.set_xticks(k)
+        left.legend(fontsize=8)
+        several = [row for row in results["plates"] if row["ranks"] > 1]
+        for count in sorted({row["contactors"] for row in several}):
+            rows = [row for row in several if row["contactors"] == count]
+            right.loglog([count / r["ranks"] for r in rows], [r["bytes_max"] for r in rows], "o-", label=f"{count} contactors")
+        if several:
+            ends = np.array([f(row["contactors"] / row["ranks"] for row in several) for f in (min, max)])
+            right.loglog(ends, ends / ends[1] * max(row["bytes_max"] for row in several), "k:", label="in proportion")
+            right.legend()
+        right.set_xlabel("contactors per rank")
+        right.set_ylabel("most bytes that a rank receives in a search")
+
+# %% [markdown]
+# ## What must hold
+# What a rank receives is bounded by its own part of the surfaces and the number of ranks, whatever the whole surface.
+
+# %%
+#: Bytes for each contactor and facet of a rank's own, two answers at most, and for every rank that talks to it.
+PER_OWN, PER_RANK = 1100, 5000
+for row in results["plates"]:
+    assert row["bytes_max"] <= (PER_OWN * row["share_max"] + PER_RANK * row["ranks"]) * (row["ranks"] > 1), row
