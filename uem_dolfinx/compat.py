@@ -6,6 +6,7 @@ or a call that is the same in all of them needs arguments that every caller woul
 
 from __future__ import annotations
 
+import logging
 import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ from petsc4py import PETSc
 from .errors import MissingBackendError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -425,6 +426,26 @@ def form(integrals: Any) -> Any:
         The DOLFINx form.
     """
     return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
+
+
+@contextmanager
+def on_compilation(tell: Callable[[], None]) -> Iterator[None]:
+    """Call ``tell`` once if FFCx compiles something meanwhile, at the beginning; what it finds in its cache does not count."""
+    ffcx = logging.getLogger("ffcx")
+    told = False
+
+    def info(message: object, *_: object) -> None:
+        nonlocal told
+        if not told and str(message).startswith("Compiler stage"):
+            told = True
+            tell()
+
+    # FFCx reports the stages of a compilation to its logger, whose level it sets itself
+    ffcx.info = info  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del ffcx.info
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:

@@ -15,6 +15,8 @@ from mpi4py import MPI
 
 from dolfinx.common import Timer
 
+from uem_dolfinx import compat
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
@@ -45,6 +47,20 @@ def timed(stage: str) -> Iterator[None]:
         stage: what is done inside, e.g. ``"search"``.
     """
     with Timer(f"~UEM: {stage}"):
+        yield
+
+
+@contextmanager
+def compiling(what: str) -> Iterator[None]:
+    """Time the compilation of forms, and tell the user if there is any: it takes a while, in the first run only.
+
+    Args:
+        what: is compiled, e.g. ``"the residual"``.
+    """
+    with (
+        timed("compile forms"),
+        compat.on_compilation(lambda: logger.warning("compiling %s: later runs find it in the cache", what)),
+    ):
         yield
 
 

@@ -14,7 +14,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import SpaceError, TagError, UEMError, agree
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import compiling
 
 if TYPE_CHECKING:
     from uem_dolfinx.mesh import Tag
@@ -92,7 +92,7 @@ class QuadraturePoints:
 
     def compile(self, expression: Any) -> fem.Expression:
         """Prepare a scalar or vector UFL expression for ``evaluate``; once, as it takes a compiler."""
-        with timed("compile forms"):
+        with compiling("stresses at the quadrature points"):
             return fem.Expression(expression, self.points)
 
     def evaluate(self, compiled: fem.Expression) -> Array:

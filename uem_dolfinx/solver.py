@@ -20,6 +20,7 @@ from uem_dolfinx.surfaces import rigid_velocities
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from uem_dolfinx.equations import UnitingEquations
     from uem_dolfinx.restriction import Restriction
     from uem_dolfinx.surfaces import Configuration
 
@@ -34,7 +35,7 @@ MOST_ACCURATE = 1e-10
 #: A preconditioner is kept for matrices that differ from its own in less than this part of the equations,
 KEPT_CHANGES = 0.1
 #: and while it takes less than this times as many iterations for each digit as at first.
-KEPT_SLOWER = 1.5
+KEPT_SLOWER = 2.0
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 
@@ -58,7 +59,7 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     if amg == "gamg":
         return {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
     boomeramg = {
-        "strong_threshold": 0.25,
+        "strong_threshold": 0.15,
         "coarsen_type": "HMIS",
         "interp_type": "ext+i",
         "P_max": 4,
@@ -105,8 +106,8 @@ class UnitedSolver:
         self.A: Any = None
         #: Whether the preconditioner has yet to see the present matrix.
         self._new = False
-        #: Active equations that the preconditioner was made with, and the iterations per digit it took at first and takes now.
-        self._made_with: npt.NDArray[np.bool_] | None = None
+        #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
+        self._made_with: UnitingEquations | None = None
         self._first_pace = self._pace = 0.0
 
     def _create_ksp(self) -> PETSc.KSP:
@@ -180,24 +181,25 @@ class UnitedSolver:
             idle = ~restriction.used.ravel()
             diagonal.array[idle] = stiffness.array_r[idle]
             self.A.setDiagonal(diagonal)
-        self._keep_preconditioner(restriction, reuse)
+        self._keep_preconditioner(restriction.equations)
         self._key = key
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         if self.needs_near_null_space:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.ksp.setOperators(self.A)
-        self._new = True
 
-    def _keep_preconditioner(self, restriction: Restriction, reuse: bool) -> None:
+    def _keep_preconditioner(self, equations: UnitingEquations) -> None:
         """Decide whether the preconditioner serves the present matrix as well (collective)."""
-        active, keep = restriction.equations.active, False
-        if self.iterative and reuse and self._made_with is not None:
-            changed = (active != self._made_with).sum()
-            changed, present = self.config.comm.allreduce(np.array([changed, active.sum()]))
+        keep, before = False, self._made_with
+        if self.iterative and before is not None:
+            same = np.array_equal(equations.node, before.node)
+            changed = (equations.active != before.active).sum() if same else len(before) + 1
+            changed, present = self.config.comm.allreduce(np.array([changed, before.active.sum()]))
             keep = changed <= KEPT_CHANGES * present and self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
-            self._made_with, self._first_pace = active, 0.0
+            self._made_with, self._first_pace = equations, 0.0
+        self._new = not keep
         self.ksp.getPC().setReusePreconditioner(bool(keep))
 
     def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import zlib
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -20,7 +22,7 @@ from uem_dolfinx.conflicts import Resolution
 from uem_dolfinx.equations import UnitingEquations
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.floating import HARDLY_HELD, OPEN, find_floating
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.newton import United
 from uem_dolfinx.restriction import Restriction
 from uem_dolfinx.search import MeshTarget
@@ -84,7 +86,7 @@ class BodySystem:
         self.config, self.comm, self.u, self.bcs, self.solver = config, config.comm, config.u, list(bcs), solver
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self.tangent = Tangent(F, self.u, self.materials, dynamics)
-        with timed("compile forms"):
+        with compiling("the residual"):
             self._F = compat.form(F)
         self._b = compat.create_vector(config.V)
         self._u = compat.petsc_vector(self.u)
@@ -417,7 +419,8 @@ class BodySystem:
     def _curvature(self) -> PETSc.Mat | None:
         """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
         parts = [pair.curvature() for pair in self.pairs if pair.sliding == "finite"]
-        if not self.comm.allreduce(sum(len(nodes) for nodes, _ in parts)):
+        # a plane has none
+        if not self.comm.allreduce(any(blocks.any() for _, blocks in parts), op=MPI.LOR):
             return None
         return contact_curvature(parts, self._du_like())
 

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat
 from uem_dolfinx.errors import SpaceError
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import compiling, timed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +53,7 @@ class Tangent:
         self._dynamics, self._factor = dynamics, 0.0
         self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
-        with timed("compile forms"):
+        with compiling("the tangent"):
             self._form = compat.form(J)
         self.K: PETSc.Mat = compat.create_matrix(self._form)
         #: Grows with every assembly.
@@ -123,7 +123,7 @@ class Inversions:
         self.config = config
         self._J = ufl.det(ufl.Identity(config.gdim) + ufl.grad(config.u))
         one = fem.Constant(config.mesh, 1.0)
-        with timed("compile forms"):
+        with compiling("the search for cells turned inside out"):
             self._volume = compat.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
 
     def find(self) -> str | None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
@@ -92,6 +94,8 @@ class ContactPair:
         self._united: Ints = np.zeros(0, dtype=np.int64)
         self._reserved: Bools = np.zeros(n, dtype=bool)
         self._anchor: Projection | None = None
+        #: Positions of contactors and target of the last search, and what it found.
+        self._searched: tuple[Array, Array, Projection] | None = None
         self._target_moves: Bools | None = None
         self._facet_changes: FacetChanges | None = None
         if sliding == "finite" and isinstance(target, MeshTarget) and not target.averaged:
@@ -109,7 +113,7 @@ class ContactPair:
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective)."""
         if self.sliding == "finite":
-            self.projection = self._held_at_end(self.target.project(self.points))
+            self.projection = self._held_at_end(self._nearest())
             if self._facet_changes is not None:
                 self.projection = self._facet_changes.place(self.projection, self.trial, self.points)
         elif self._anchor is None:
@@ -141,6 +145,16 @@ class ContactPair:
         assert isinstance(self.target, MeshTarget)
         i = np.flatnonzero(self.trial.active & (self.trial.slips > 1) & (nearest.beyond * self.free != 0).any(axis=1))
         return nearest.reaching_out(i, self.target.shape) if len(i) else nearest
+
+    def _nearest(self) -> Projection:
+        """The contactors on the nearest places of the target; nothing is searched again where nothing has moved (collective)."""
+        if not isinstance(self.target, MeshTarget):
+            return self.target.project(self.points)
+        points, x = self.points, self.config.x[self.target.facets.dofs]
+        same = self._searched is not None and np.array_equal(points, self._searched[0]) and np.array_equal(x, self._searched[1])
+        if self._searched is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+            self._searched = points, x, self.target.project(points)
+        return self._searched[2]
 
     @property
     def _corners(self) -> Corners | None:
