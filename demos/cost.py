@@ -227,7 +227,9 @@ with uem.figure(args.plot, comm, panels=2) as panels:
             continue
         n = [r["dofs"] for r in own]
         for stage in STAGES:
-            panel.loglog(n, [max(r[stage], 1e-4) for r in own], "--" if stage in CONTACT else "-", marker=".", lw=1, label=stage)
+            seconds = [r[stage] for r in own]
+            if max(seconds) > 1e-3 * max(r["contact_seconds"] for r in own):
+                panel.loglog(n, seconds, "--" if stage in CONTACT else "-", marker=".", lw=1, label=stage)
         for name, style in (("contact_seconds", "k-o"), ("uncontacted_seconds", "k--s")):
             panel.loglog(n, [r[name] for r in own], style, label=name.replace("_seconds", ", all"))
         panel.set(xlabel="degrees of freedom", ylabel="time [s]", title=f"{dim}D, linear bodies, one step from scratch")

@@ -26,7 +26,7 @@ SHORTEST_STEP = 1.0 / 64
 ENOUGH_DECREASE = 0.9
 #: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
 PASSING = 1e-4
-#: One that may be the last leaves this part of what convergence asks for.
+#: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 LAST = 0.1
 #: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
 LARGEST_ROUNDING = 1e-4
@@ -181,8 +181,8 @@ def solve_united(
         driving = rhs.norm()
         thrust = max(thrust, driving if k == 0 else 0.0)
         passing = not cautious and (not system.linear or state.changed or (k == 0 and system.in_contact))
-        enough = LAST * rtol * forces / driving if driving > 0 else 0.0
-        dq, iterations = system.solve(rhs, max(enough, PASSING if passing else 0.0))
+        needed = LAST * rtol * forces / driving if driving > 0 else 0.0
+        dq, iterations = system.solve(rhs, min(max(needed, PASSING if passing else 0.0), LAST))
         residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
         history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
         _report(history, verbose)

@@ -48,7 +48,8 @@ class UnitedProblem:
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces; none is fine.
         petsc_options_prefix: prefix of the linear solver's options.
-        petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size.
+        petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
+            iterative solve is as accurate as its Newton iteration can use.
         load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped, or
             a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only. Of time
             steps it is a function of the time.
