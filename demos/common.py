@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +55,17 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
 def cg(amg: str = "", rtol: float = 1e-10) -> dict[str, Any]:
     """PETSc options of CG with algebraic multigrid, hypre where PETSc has it."""
     return {"ksp_type": "cg", "ksp_rtol": rtol} | multigrid_options(amg)
+
+
+def numbers(text: str, mark: str = ",") -> list[int]:
+    """Whole numbers of a list, parted by a mark."""
+    return [int(float(word)) for word in text.split(mark) if word]
+
+
+def outside_mpi() -> dict[str, str]:
+    """Environment for a process that is told from this one's MPI."""
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
 
 
 def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) -> fem.DirichletBC:

@@ -31,6 +31,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.surfaces import Configuration, surface_nodes
 
 args = common.arguments(
     __doc__,
@@ -48,9 +49,9 @@ STAGES = (*CONTACT, "cross out prescribed components", *BODIES)
 TOLERANCE = 1e-8
 
 
-def numbers(text: str) -> list[tuple[int, ...]]:
-    """Of a list parted by commas, of pairs parted by colons."""
-    return [tuple(int(float(k)) for k in word.split(":")) for word in text.split(",") if word]
+def pairs(text: str) -> list[list[int]]:
+    """Dimensions and numbers of unknowns."""
+    return [common.numbers(word, ":") for word in text.split(",") if word]
 
 
 # %% [markdown]
@@ -155,7 +156,7 @@ def row(dim: int, dofs: int, finite: bool) -> dict[str, object]:
     scene = Hertz(dim, dofs)
     bare, path, memory = measure(scene, False, finite)
     spent, history, more = measure(scene, True, finite)
-    contactors = len(scene.problem(True, finite).system.pairs[0].nodes)
+    contactors = len(surface_nodes(Configuration(fem.Function(scene.V)), scene.tags[scene.surface]))
     return {
         "scene": "finite" if finite else "linear",
         "dim": dim,
@@ -192,16 +193,14 @@ def iterations(scene: Hertz, stiffness: float) -> dict[str, object]:
 
 
 # %%
-for dim in sorted({pair[0] for pair in numbers(args.linear) + numbers(args.finite)}):
+for dim in sorted({pair[0] for pair in pairs(args.linear) + pairs(args.finite)}):
     for finite in (False, True):
         # whatever is compiled or imported at first use
         for contact in (False, True):
             Hertz(dim, 2000).problem(contact, finite).solve()
-rows = [row(dim, dofs, False) for dim, dofs in numbers(args.linear)] + [
-    row(dim, dofs, True) for dim, dofs in numbers(args.finite)
-]
+rows = [row(dim, dofs, False) for dim, dofs in pairs(args.linear)] + [row(dim, dofs, True) for dim, dofs in pairs(args.finite)]
 cg = []
-for (dofs,) in numbers(args.cg):
+for dofs in common.numbers(args.cg):
     scene, first = Hertz(3, dofs), not cg
     cg += [iterations(scene, s) for s in ([float(s) for s in args.stiffness.split(",")] if first else [1.0])]
 growth = []

@@ -43,7 +43,7 @@ UNITED = {"uem": "fixed", "uem_finite": "finite"}
 PEERS = {"calculix": by_calculix, "getfem": by_getfem}
 CLOCK = "MUMPS or CG by size, 1 step; time from the mesh in memory; feet found "
 SETTINGS = {"uem": CLOCK + "once", "uem_finite": CLOCK + "in every iteration"} | {c: p.SETTINGS for c, p in PEERS.items()}
-sizes, codes = [int(size) for size in args.sizes.split(",")], args.codes.split(",")
+sizes, codes = common.numbers(args.sizes), args.codes.split(",")
 if unknown := set(codes) - set(UNITED) - set(PEERS):
     raise ValueError(f"--codes {args.codes}: {', '.join(unknown)} not known here: expected some of {', '.join(UNITED | PEERS)}")
 

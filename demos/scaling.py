@@ -19,7 +19,6 @@ python3 demos/scaling.py --json scaling.json --plot scaling.png
 
 # %%
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -56,12 +55,6 @@ STAGES = {
     "P and P'KP": ["restriction matrix P", "united matrix P'KP", "cross out prescribed components"],
     "multigrid and CG": ["factorisation or preconditioner set-up", "linear solve"],
 }
-
-
-def numbers(text: str) -> list[int]:
-    """Of a list parted by commas."""
-    return [int(word) for word in text.split(",") if word]
-
 
 # %% [markdown]
 # ## The scene
@@ -132,9 +125,9 @@ def here(dofs: int, sizes: str, searches: str) -> dict[str, list]:
         # whatever is compiled or imported at first use
         solve(min(dofs, 2000), 1)
         found["ranks"].append(solve(dofs, args.runs))
-    for n in numbers(sizes):
+    for n in common.numbers(sizes):
         found["plates"].append({"ranks": comm.size} | search_traffic(plates(n)))
-    for n in numbers(searches):
+    for n in common.numbers(searches):
         surfaces = plates(n)
         found["search"].append({"contactors": sum(comm.allgather(len(surfaces.points))), "seconds": best_time(surfaces)})
     return found
@@ -152,8 +145,7 @@ def apart(ranks: int, **options: object) -> dict[str, list]:
         raise RuntimeError(
             f"no mpiexec beside {sys.executable} or on the PATH: install one, or call this script with --where here"
         )
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    environment = common.outside_mpi()
     # Open MPI 4 and 5: more ranks than cores, none of them bound to the cores of another run
     environment |= {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
     environment |= {"OMPI_MCA_hwloc_base_binding_policy": "none", "PRTE_MCA_hwloc_default_binding_policy": "none"}
@@ -177,8 +169,10 @@ if args.where == "here" or comm.size > 1:
     results = here(args.dofs, args.plates, args.searches)
 else:
     results = {
-        "ranks": [row for k in numbers(args.ranks) if args.dofs for row in apart(k, dofs=args.dofs)["ranks"]],
-        "plates": [row for k in numbers(args.plate_ranks) if args.plates for row in apart(k, plates=args.plates)["plates"]],
+        "ranks": [row for k in common.numbers(args.ranks) if args.dofs for row in apart(k, dofs=args.dofs)["ranks"]],
+        "plates": [
+            row for k in common.numbers(args.plate_ranks) if args.plates for row in apart(k, plates=args.plates)["plates"]
+        ],
         "search": apart(1, searches=args.searches)["search"] if args.searches else [],
     }
 

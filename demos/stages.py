@@ -21,7 +21,6 @@ python3 demos/stages.py --plot stages.png
 
 # %%
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -86,13 +85,10 @@ def run(name: str, options: list[str]) -> tuple[dict[str, int], dict[str, float]
     timers = [timer for stage in STAGES.values() for timer in stage]
     if args.output:
         options = [*options, "--output", str(Path(args.output).resolve() / name)]
-    # a process of its own, told from this one's MPI
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "timers.json"
         command = [sys.executable, "-c", RUNNER, str(HERE / f"{name}.py"), str(file), json.dumps(timers), *options]
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        done = subprocess.run(command, cwd=folder, env=common.outside_mpi(), capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"{name} {' '.join(options)} failed:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
         told = json.loads(file.read_text(encoding="utf-8"))

@@ -342,8 +342,12 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     return difference, full, plain
 
 
+def outside_mpi() -> dict[str, str]:
+    """Environment for a process that is told from this one's MPI."""
+    own = ("OMPI_", "PMI", "HYD", "MPI_")
+    return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+
+
 def start_process(script: str) -> subprocess.Popen[str]:
     """A Python process of its own that runs a script, told from this one's MPI."""
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
-    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
+    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=outside_mpi())

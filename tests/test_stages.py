@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, linear, run, scene, st_venant
+from helpers import at, blocks, box, clamp, linear, outside_mpi, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -29,11 +29,11 @@ serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes th
 
 SEARCH, PROJECTION = "search", "projection"
 P, PRODUCT, CROSSED = "restriction matrix P", "united matrix P'KP", "cross out prescribed components"
-TANGENT, FACTORISATION = "assemble tangent", "factorisation or preconditioner set-up"
+TANGENT, FACTORISATION, SOLVE = "assemble tangent", "factorisation or preconditioner set-up", "linear solve"
 MASS = ("assemble mass", "redistribute mass", "first acceleration", "inertia forces")
 HISTORY = ("return mapping", "commit history")
 OUTPUT = ("write fields", "write table", "write checkpoint", "read checkpoint")
-STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, TANGENT, FACTORISATION, *MASS, *HISTORY, *OUTPUT)
+STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, TANGENT, FACTORISATION, SOLVE, *MASS, *HISTORY, *OUTPUT)
 
 
 class Calls(dict):
@@ -252,8 +252,7 @@ HEAVY = ("gmsh", "matplotlib", "pyvista", "scipy", "tqdm", "vtk")
 
 def environment(**more: str) -> dict[str, str]:
     """For a process told from this one's MPI, with this checkout of the package."""
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    kept = outside_mpi()
     package = str(Path(uem.__file__).resolve().parent.parent)
     paths = [package, str(Path(__file__).parent), *filter(None, [kept.get("PYTHONPATH")])]
     return kept | {"PYTHONPATH": os.pathsep.join(paths)} | more

@@ -184,7 +184,7 @@ class UnitedSolver:
         self._keep_preconditioner(restriction.equations)
         self._key = key
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        if self.needs_near_null_space:
+        if self._new and self.needs_near_null_space:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.ksp.setOperators(self.A)
@@ -196,7 +196,7 @@ class UnitedSolver:
             same = np.array_equal(equations.node, before.node)
             changed = (equations.active != before.active).sum() if same else len(before) + 1
             changed, present = self.config.comm.allreduce(np.array([changed, before.active.sum()]))
-            keep = changed <= KEPT_CHANGES * present and self._pace <= KEPT_SLOWER * self._first_pace
+            keep = changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
             self._made_with, self._first_pace = equations, 0.0
         self._new = not keep

@@ -279,10 +279,14 @@ class TargetFacets:
     def _normal_field(self) -> fem.Function:
         return fem.Function(self.config.V)
 
+    @property
+    def x(self) -> Array:
+        """Nodes of the facets where they are now ``(m, nn, gdim)``."""
+        return self.config.X[self.dofs] + self.config.displacement[self.dofs]
+
     def current(self) -> FacetData:
         """Facets where they are now (collective: the nodal normals are summed over ranks)."""
-        config, gdim = self.config, self.config.gdim
-        x = config.x[self.dofs]
+        gdim, x = self.config.gdim, self.x
         # every node sees its facet under the angle-free area weight
         field = self._normal_field
         field.x.array[:] = 0.0

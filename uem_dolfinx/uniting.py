@@ -150,7 +150,7 @@ class ContactPair:
         """The contactors on the nearest places of the target; nothing is searched again where nothing has moved (collective)."""
         if not isinstance(self.target, MeshTarget):
             return self.target.project(self.points)
-        points, x = self.points, self.config.x[self.target.facets.dofs]
+        points, x = self.points, self.target.facets.x
         same = self._searched is not None and np.array_equal(points, self._searched[0]) and np.array_equal(x, self._searched[1])
         if self._searched is None or not self.config.comm.allreduce(same, op=MPI.LAND):
             self._searched = points, x, self.target.project(points)

@@ -6,7 +6,6 @@ long it took.
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from common import outside_mpi
 
 from uem_dolfinx import compat
 
@@ -133,9 +133,7 @@ def run(command: Sequence[str], folder: Path, timeout: float) -> str:
     Raises:
         PeerError: it failed, or was stopped.
     """
-    own = ("OMPI_", "PMI", "HYD", "MPI_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
-    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = outside_mpi() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     name = Path(command[0]).name
     try:
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=timeout)
