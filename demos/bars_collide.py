@@ -21,7 +21,7 @@ from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, dim=2, n=100, n_width=2, cfl=0.7071, v1=4.0, v2=-6.0)
 E, rho, L, gap, width = 900.0, 1.0, 10.0, 0.1, 1.0
@@ -63,7 +63,7 @@ problem = uem.UnitedProblem(
 # %%
 volume = L * width ** (d - 1)
 means = [
-    compat.form(dynamics.velocity[1] / volume * compat.cell_measure(mesh, tags[name].entities)) for name in ("lower", "upper")
+    compat.form(dynamics.velocity[1] / volume * forms.cell_measure(mesh, tags[name].entities)) for name in ("lower", "upper")
 ]
 book = uem.EnergyBook(problem, material.energy(u) * ufl.dx, path=f"{args.output}/energy.csv" if args.output else None)
 writer = uem.ResultsWriter(f"{args.output}/bars_collide", problem) if args.output else None
@@ -71,7 +71,7 @@ meet = gap / (args.v1 - args.v2)
 rows = []
 for step in uem.time_steps(problem, args.cfl * L / args.n / c, meet + 3 * L / c, event_tolerance=1e-3):
     book.write(step)
-    rows.append((step.time, *(compat.assemble_scalar(form, comm) for form in means), contact.resultant().force[1]))
+    rows.append((step.time, *(forms.assemble_scalar(form, comm) for form in means), contact.resultant().force[1]))
     if writer is not None and step.number % 10 == 0:
         writer.write(step)
 book.close()

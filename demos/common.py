@@ -16,7 +16,7 @@ import numpy as np
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx.solver import multigrid_options
+from uem_dolfinx.algebra.linear_solver import multigrid_options
 
 if TYPE_CHECKING:
     import uem_dolfinx as uem

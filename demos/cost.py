@@ -30,8 +30,9 @@ from evidence.measure import machine
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.surfaces import Configuration, surface_nodes
+from uem_dolfinx import compat, forms
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import surface_nodes
 
 args = common.arguments(
     __doc__,
@@ -116,7 +117,7 @@ def measure(scene: Hertz, contact: bool, finite: bool) -> tuple[dict[str, float]
     """Solve some times: seconds of the stages and of "all" in the quickest, its history, and bytes of memory (collective)."""
     best: tuple[dict[str, float], list] | None = None
     gc.collect()
-    compat.free_petsc_garbage(comm)
+    forms.free_petsc_garbage(comm)
     forget_peak()
     for _ in range(args.runs):
         comm.barrier()
@@ -127,7 +128,7 @@ def measure(scene: Hertz, contact: bool, finite: bool) -> tuple[dict[str, float]
         if best is None or spent["all"] < best[0]["all"]:
             best = spent, history
         gc.collect()
-        compat.free_petsc_garbage(comm)
+        forms.free_petsc_garbage(comm)
     assert best is not None
     return *best, peak()
 
@@ -188,7 +189,7 @@ def iterations(scene: Hertz, stiffness: float) -> dict[str, object]:
         # the one before looks for the contact, later ones may keep its preconditioner
         found[name] = solves[1] if contact else solves[0]
         gc.collect()
-        compat.free_petsc_garbage(comm)
+        forms.free_petsc_garbage(comm)
     return {"dofs": scene.dofs, "stiffness": stiffness} | found
 
 

@@ -23,7 +23,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__, h=1 / 60, ratio=1.5, gap=0.05, weight=1000.0, steps=1, degree=1, normals=("facet", "averaged")
@@ -64,7 +64,7 @@ steps = list(uem.load_steps(problem, args.steps))
 # The weight is that of the mesh, whose arc is a polygon.
 
 # %%
-weight = compat.assemble_scalar(compat.form(density * ufl.dx), comm)
+weight = forms.assemble_scalar(compat.form(density * ufl.dx), comm)
 P = contact.resultant().force
 p0 = np.sqrt(P[1] * E / (2 * (1 - nu**2)) / (np.pi * R))
 results = {

@@ -24,7 +24,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__,
@@ -88,11 +88,11 @@ seconds = time.perf_counter() - start
 P = 2 * contact.resultant().force[1]
 E_star = E / (2 * (1 - nu**2))
 p0 = np.sqrt(P * E_star / (np.pi * R))
-arc = compat.surface_measure(mesh, tags["disc_arc"].entities)
+arc = forms.surface_measure(mesh, tags["disc_arc"].entities)
 balance = contact.balance()
 results = {
     "P": float(P),
-    "a": compat.assemble_scalar(compat.form(contact.active * arc), comm),
+    "a": forms.assemble_scalar(compat.form(contact.active * arc), comm),
     "a_hertz": float(2 * P / (np.pi * p0)),
     "p0_hertz": float(p0),
     "p_max": contact.max_pressure(),

@@ -26,9 +26,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.solver import rigid_body_modes
-from uem_dolfinx.surfaces import Configuration
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.linear_solver import rigid_body_modes
+from uem_dolfinx.geometry.configuration import Configuration
 
 args = common.arguments(__doc__, N=30, degree=1)
 R, d = 0.5, 0.02
@@ -91,7 +91,7 @@ def row(force: float, p_max: float, newton: int, linear: int, seconds: float) ->
 
 # %%
 pen, X = fem.Constant(mesh, 1.0), ufl.SpatialCoordinate(mesh)
-ds = compat.surface_measure(mesh, tags["top"].entities, {"quadrature_degree": 2})
+ds = forms.surface_measure(mesh, tags["top"].entities, {"quadrature_degree": 2})
 pressure = pen * ufl.max_value(u[2] + d - (X[0] ** 2 + X[1] ** 2) / (2 * R), 0.0)
 residual = F + pressure * v[2] * ds
 form_b, form_A, form_F = map(compat.form, (residual, ufl.derivative(residual, u, ufl.TrialFunction(V)), pressure * ds))
@@ -101,7 +101,7 @@ def penalty(value: float) -> dict[str, float]:
     """Solve by penalty."""
     u.x.array[:] = 0.0
     pen.value = value
-    A, b, ksp = compat.create_matrix(form_A), compat.create_vector(V), PETSc.KSP().create(comm)
+    A, b, ksp = forms.create_matrix(form_A), compat.create_vector(V), PETSc.KSP().create(comm)
     for key, option in OPTIONS.items():
         PETSc.Options()["penalty_" + key] = option
     ksp.setOptionsPrefix("penalty_")
@@ -110,7 +110,7 @@ def penalty(value: float) -> dict[str, float]:
     A.setNearNullSpace(near_null_space(b, fixed))
     start, newton, linear, first = time.perf_counter(), 0, 0, None
     while newton < 50:
-        compat.assemble_vector(b, form_b)
+        forms.assemble_vector(b, form_b)
         b.array[fixed] = 0.0
         first = first or b.norm()
         if b.norm() <= 1e-8 * first:
@@ -127,7 +127,7 @@ def penalty(value: float) -> dict[str, float]:
     seconds = time.perf_counter() - start
     depth = (u.x.array.reshape(-1, 3)[top, 2] - h(X_top)).max(initial=0.0)
     p_max = value * max(comm.allgather(depth))
-    return {"penalty": value} | row(4 * compat.assemble_scalar(form_F, comm), p_max, newton, linear, seconds)
+    return {"penalty": value} | row(4 * forms.assemble_scalar(form_F, comm), p_max, newton, linear, seconds)
 
 
 def near_null_space(b: PETSc.Vec, fixed: np.ndarray) -> PETSc.NullSpace:

@@ -26,7 +26,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, h=0.0005, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=1, d=2.5e-5, refinements=3)
 E, nu, R = 1e6, 0.3, 1.0
@@ -65,8 +65,8 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
     seconds = time.perf_counter() - start
 
     P = float(4 * contact.resultant().force[2])
-    cap, balance = compat.surface_measure(mesh, tags["sphere_cap"].entities), contact.balance()
-    area = 4 * compat.assemble_scalar(compat.form(contact.active * cap), comm)
+    cap, balance = forms.surface_measure(mesh, tags["sphere_cap"].entities), contact.balance()
+    area = 4 * forms.assemble_scalar(compat.form(contact.active * cap), comm)
     return problem, {
         "h": h,
         "P": P,

@@ -24,7 +24,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, n=4, quads=0, dim=("both", "2", "3"), degree=("both", "1", "2"))
 E, nu, p = 100.0, 0.3, 1.0
@@ -54,7 +54,7 @@ def solve(dim: int, degree: int, n: tuple[int, int], passes: tuple[str, ...]) ->
     V = compat.function_space(mesh, degree, (dim,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d")
-    F = material.residual(u, v) * ufl.dx + p * v[dim - 1] * compat.surface_measure(mesh, tags["top_2"].entities)
+    F = material.residual(u, v) * ufl.dx + p * v[dim - 1] * forms.surface_measure(mesh, tags["top_2"].entities)
     bcs = [dirichlet(V, tags["bottom_1"], dim - 1, 0.0)]
     bcs += [dirichlet(V, tags[sides], i, 0.0) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
     lower, upper = tags["top_1"], tags["bottom_2"]

@@ -33,7 +33,7 @@ from evidence.peers import by_calculix, by_getfem
 from evidence.problems import hertz_answer
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__, sizes="1500,6000,25000,100000", codes="uem,uem_finite,calculix,getfem", runs=3, timeout=300.0, reference=1 / 240
@@ -57,7 +57,7 @@ def united(mesh, tags, sliding):
     found = []
 
     def once():
-        compat.free_petsc_garbage(comm)
+        forms.free_petsc_garbage(comm)
         comm.barrier()
         start = time.perf_counter()
         V = compat.function_space(mesh, 1, (2,))

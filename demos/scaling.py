@@ -34,7 +34,7 @@ from dolfinx import fem
 from evidence.traffic import Surfaces, plates, search_traffic
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__,
@@ -74,7 +74,7 @@ def solve(dofs: int, runs: int) -> dict[str, object]:
         u = fem.Function(V, name="displacement")
         F = uem.LinearElastic(1e6, 0.3).residual(u, ufl.TestFunction(V)) * ufl.dx
         contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], sliding="small")
-        compat.free_petsc_garbage(comm)
+        forms.free_petsc_garbage(comm)
         comm.barrier()
         before, start = clocks(), time.perf_counter()
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="scaling_", verbose=args.verbose)

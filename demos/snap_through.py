@@ -24,7 +24,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, dw=0.05)
 depth, per_unit = 28, max(round(1 / args.dw), 1)  # whole w are always among the stations
@@ -84,7 +84,7 @@ def station(w: float) -> dict:
         "gap": float(comm.allreduce(contact.pair.gap.sum())),
         "to_end": float(np.linalg.norm(at("A") - at("end") + [40.0, 2.0])),
         "lower_tip": float(np.linalg.norm(at("end"))),
-        "energy": compat.assemble_scalar(energy, comm),
+        "energy": forms.assemble_scalar(energy, comm),
         "active": contact.n_active,
     }
 

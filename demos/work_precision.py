@@ -33,7 +33,7 @@ from evidence.measure import at_a_glance, grouped, label, machine, measure, name
 from evidence.problems import bar_impact, hertz_answer, hertz_cylinder, indenter
 from evidence.signorini import signorini
 
-from uem_dolfinx.tables import CsvTable
+from uem_dolfinx.output.tables import CsvTable
 
 args = common.arguments(
     __doc__, sizes=4, runs=5, problems="signorini,hertz_cylinder,hertz_penalty,bar_impact", methods=",".join(methods.METHODS)

@@ -23,7 +23,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -81,7 +81,7 @@ class Scene:
         mesh, tdim = self.mesh, self.mesh.topology.dim
         for a, b in ((tdim - 1, 0), (tdim - 1, tdim), (tdim, tdim - 1)):
             mesh.topology.create_connectivity(a, b)
-        on = where(self.drawing[self.input_nodes[compat.vertex_nodes(mesh)]])
+        on = where(self.drawing[self.input_nodes[forms.vertex_nodes(mesh)]])
         f2v, f2c = mesh.topology.connectivity(tdim - 1, 0), mesh.topology.connectivity(tdim - 1, tdim)
         index = mesh.topology.index_map(tdim - 1)
         facets = [

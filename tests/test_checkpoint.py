@@ -24,8 +24,9 @@ from dolfinx import fem
 from helpers import CELLS, at, blocks, box, clamp, highest, modulus, scene, st_venant, start_process
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, numbering
-from uem_dolfinx.pair_state import PairState
+from uem_dolfinx import compat, forms
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.restart import numbering
 
 COMM = MPI.COMM_WORLD
 serial = pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
@@ -54,7 +55,7 @@ def spaces(mesh):
     found = {f"P{k}{shape}": (compat.function_space(mesh, k, shape), None) for k, shape in product((1, 2), ((), (g,), (g, g)))}
     found |= {f"DG0{shape}": (compat.dg0_space(mesh, shape), middle) for shape in ((), (g,))}
     for k, shape in ((2, ()), (3, (4,))):
-        found[f"Q{k}{shape}"] = compat.quadrature_space(mesh, k, shape), compat.quadrature_rule(mesh, k)[0]
+        found[f"Q{k}{shape}"] = compat.quadrature_space(mesh, k, shape), forms.quadrature_rule(mesh, k)[0]
     return found
 
 
@@ -63,7 +64,7 @@ def places(V, points):
     g, n = V.mesh.geometry.dim, V.dofmap.index_map.size_local
     if points is None:
         return V.tabulate_dof_coordinates()[:n, :g]
-    N = compat.create_lagrange_element(compat.cell_name(V.mesh), 1).tabulate(0, points)[0, :, :, 0]
+    N = forms.create_lagrange_element(compat.cell_name(V.mesh), 1).tabulate(0, points)[0, :, :, 0]
     x = np.empty((n + V.dofmap.index_map.num_ghosts, g))
     x[compat.cell_dofs(V)] = np.einsum("pa,cag->cpg", N, V.mesh.geometry.x[compat.geometry_dofs(V.mesh)][:, :, :g])
     return x[:n]
@@ -144,7 +145,7 @@ def test_cells_keep_the_order_of_their_vertices(cell):
     # Gmsh goes round a quadrilateral, DOLFINx row by row
     rows = {"quadrilateral": [0, 1, 3, 2], "hexahedron": [0, 1, 3, 2, 4, 5, 7, 6]}.get(cell, slice(None))
     nodes = np.asarray(mesh.geometry.input_global_indices)[compat.geometry_dofs(mesh)]
-    assert all(COMM.allgather(np.array_equal(nodes, cells[compat.original_cells(mesh)][:, rows])))
+    assert all(COMM.allgather(np.array_equal(nodes, cells[forms.original_cells(mesh)][:, rows])))
 
 
 def test_fingerprint():
@@ -380,7 +381,7 @@ def test_falling_body_goes_on(folder):
         b = blocks(COMM, "hexahedron", 2, 4, gap=0.25)
         weight = fem.Constant(b.scene.mesh, np.zeros(3))
         F = st_venant(b.u, modulus(b.scene, 1.0, 2.0), 0.0)
-        F -= ufl.inner(weight, ufl.TestFunction(b.V)) * compat.surface_measure(b.scene.mesh, b.top.entities)
+        F -= ufl.inner(weight, ufl.TestFunction(b.V)) * forms.surface_measure(b.scene.mesh, b.top.entities)
 
         def load(k):
             weight.value[:] = [0.0, 0.0, -0.0025 * k]

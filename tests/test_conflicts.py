@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.conflicts import Resolution
-from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.surfaces import Configuration
+from uem_dolfinx.algebra.dependent import Resolution
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.geometry.configuration import Configuration
 
 COMM = MPI.COMM_WORLD
 NU = 0.3

@@ -12,8 +12,8 @@ from helpers import at, blocks, box, clamp, linear, modulus, run, scene, st_vena
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.errors import agree
+from uem_dolfinx import compat, forms
+from uem_dolfinx.parallel import agree
 
 COMM = MPI.COMM_WORLD
 
@@ -207,7 +207,7 @@ def test_residual_that_becomes_infinite():
     b = blocks(COMM, "triangle", 2, 4)
     barrier = fem.Constant(b.scene.mesh, PETSc.ScalarType(1e-6))
     v = ufl.TestFunction(b.V)
-    wall = barrier * ufl.ln(0.005 + b.u[1]) * v[1] * compat.surface_measure(b.scene.mesh, b.top.entities)
+    wall = barrier * ufl.ln(0.005 + b.u[1]) * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
     problem = problem_of(
         b,
         uem.Contact(b.high, b.low),

@@ -23,8 +23,8 @@ from dolfinx import fem
 from helpers import at, box, clamp, scene, start_process
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.tables import CsvTable
+from uem_dolfinx import compat, forms
+from uem_dolfinx.output.tables import CsvTable
 
 COMM = MPI.COMM_WORLD
 serial = pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
@@ -58,7 +58,7 @@ class Impact:
         base = fem.locate_dofs_topological(V, 1, s.tag("base", 0, at(1, 0.0)).entities)
         self.bcs = [fem.dirichletbc(self.foot, base)] if moving else clamp(V, s.tag("base", 0, at(1, 0.0)))
         self.law = uem.VonMises(self.u, 100.0, 0.3, 3.0 if plastic else np.inf, 5.0, kind=kind, strain="green_lagrange")
-        top = compat.surface_measure(s.mesh, s.tag("top", 1, at(1, 1.9)).entities)
+        top = forms.surface_measure(s.mesh, s.tag("top", 1, at(1, 1.9)).entities)
         self.external = -self.push * w[1] * top
         self.contact = uem.Contact(s.tag("tip", 1, at(1, 1.05)), s.tag("face", 0, at(1, 1.0)), name="impact")
         moves = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=scheme, velocity=velocity, gravity=(0.0, -1.0), time=time)

@@ -20,8 +20,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import fsolve, linprog
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.mass import TAKEN
+from uem_dolfinx import compat, forms
+from uem_dolfinx.dynamics.mass import TAKEN
 
 COMM = MPI.COMM_WORLD
 BUILD = {"lumped": uem.lumped_mass, "consistent": uem.consistent_mass}
@@ -108,7 +108,7 @@ def test_consistent_mass_is_the_integral(cell, degree):
     v.x.array[:] = np.stack([np.sin(3 * x[:, i] + i) + x.sum(axis=1) for i in range(x.shape[1])], axis=1).ravel()
     y = mass.M.createVecLeft()
     mass.M.mult(compat.petsc_vector(v), y)
-    exact = compat.assemble_scalar(compat.form((1 + X[0]) * ufl.inner(v, v) * ufl.dx), COMM)
+    exact = forms.assemble_scalar(compat.form((1 + X[0]) * ufl.inner(v, v) * ufl.dx), COMM)
     assert y.dot(compat.petsc_vector(v)) == pytest.approx(exact, rel=1e-13)
 
 
@@ -144,7 +144,7 @@ def test_lumped_mass_cell_by_cell(cell, degree):
         shares = np.array([vertex] * (g + 1) + [edge] * (table.shape[1] - g - 1))
     else:
         # Simpson's rule: a middle counts four times as much as an end, in every direction
-        dims = [d for d, entities in enumerate(compat.reference_topology(cell)) for _ in entities]
+        dims = [d for d, entities in enumerate(forms.reference_topology(cell)) for _ in entities]
         shares = 4.0 ** np.array(dims) / 6.0**g
     assert shares.sum() == pytest.approx(1.0)
     expected = np.zeros(config.n_local)
@@ -185,7 +185,7 @@ def test_density_of_any_kind():
 def test_layout_is_that_of_the_tangent():
     V = block("tetrahedron", 2)
     u = fem.Function(V)
-    K = compat.create_matrix(compat.form(ufl.derivative(linear(u, 1.0), u)))
+    K = forms.create_matrix(compat.form(ufl.derivative(linear(u, 1.0), u)))
     for kind in KINDS:
         M = make(kind, V).M
         assert M.getSizes() == K.getSizes() and M.getBlockSizes() == K.getBlockSizes() and M.type == K.type
@@ -432,8 +432,8 @@ def test_bar_hits_wall(kind, courant):
     V = block("quadrilateral", [n, 1], size=[10.0, 10.0 / n], comm=MPI.COMM_SELF)
     u = fem.Function(V)
     form = compat.form(ufl.derivative(linear(u, 900.0, 0.0), u))
-    K = compat.create_matrix(form)
-    compat.assemble_matrix(K, form)
+    K = forms.create_matrix(form)
+    forms.assemble_matrix(K, form)
     heavy = BUILD[kind](V, 1.0)
     light = heavy.without(facing(heavy, 0, 0.0))
     t, p, energy, speed = impact(light, gathered_matrix(K), courant, n)

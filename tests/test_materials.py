@@ -13,7 +13,7 @@ import ufl
 from dolfinx import fem, mesh
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 LAWS = [uem.LinearElastic, uem.StVenantKirchhoff, uem.NeoHooke]
 FINITE = LAWS[1:]
@@ -31,7 +31,7 @@ def displacement(gradient: np.ndarray) -> fem.Function:
 
 
 def value(expression, u: fem.Function) -> float:
-    return compat.assemble_scalar(compat.form(expression * ufl.dx(domain=u.function_space.mesh)), MPI.COMM_SELF)
+    return forms.assemble_scalar(compat.form(expression * ufl.dx(domain=u.function_space.mesh)), MPI.COMM_SELF)
 
 
 def matrix(expression, u: fem.Function) -> np.ndarray:

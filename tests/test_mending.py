@@ -16,9 +16,9 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.tangent import contact_curvature
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.solve.tangent import contact_curvature
 
 COMM = MPI.COMM_WORLD
 LENGTH, E, DENSITY = 10.0, 900.0, 2.0

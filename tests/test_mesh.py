@@ -17,8 +17,8 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.mesh import Tag, read_gmsh
+from uem_dolfinx import compat, forms
+from uem_dolfinx.geometry.gmsh import Tag, read_gmsh
 
 PLATES = """
 DefineConstant[ h = {0.4, Name "mesh size", Min 0.01}, w = 2, // length; x = 3
@@ -88,11 +88,11 @@ def size(mesh, tag: Tag) -> float:
     """Length, area or volume of a tag over all ranks."""
     one = fem.Constant(mesh, 1.0)
     if tag.dim < mesh.topology.dim:
-        measure = compat.surface_measure(mesh, tag.entities)
+        measure = forms.surface_measure(mesh, tag.entities)
     else:
-        cells = compat.mesh_tags(mesh, tag.dim, tag.entities, 1)
+        cells = forms.mesh_tags(mesh, tag.dim, tag.entities, 1)
         measure = ufl.Measure("dx", domain=mesh, subdomain_data=cells)(1)
-    return compat.assemble_scalar(compat.form(one * measure), mesh.comm)
+    return forms.assemble_scalar(compat.form(one * measure), mesh.comm)
 
 
 def n_owned(mesh, tag: Tag) -> int:
@@ -190,7 +190,7 @@ def test_without_groups_all_cells_are_taken(write, comm):
     mesh, tags = read_gmsh(write("plain.geo", "h = 0.5; w = 2;" + BODIES), comm)
     assert len(tags) == 0
     one = fem.Constant(mesh, 1.0)
-    assert compat.assemble_scalar(compat.form(one * ufl.dx(domain=mesh)), comm) == pytest.approx(6)
+    assert forms.assemble_scalar(compat.form(one * ufl.dx(domain=mesh)), comm) == pytest.approx(6)
     with pytest.raises(uem.TagError, match="no physical group"):
         tags["body"]
 

@@ -18,7 +18,7 @@ from helpers import CELLS, at, blocks, box, clamp, complementary, highest, linea
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 COMM = MPI.COMM_WORLD
 NU = 0.3
@@ -105,7 +105,7 @@ def test_body_held_by_contact_alone(cell):
     g = b.gdim
     load = fem.Constant(b.scene.mesh, PETSc.ScalarType(0.0))
     v = ufl.TestFunction(b.V)
-    F = linear(b.u, modulus(b.scene, 1.0, 2.0)) + 0.01 * load * v[g - 1] * compat.surface_measure(b.scene.mesh, b.top.entities)
+    F = linear(b.u, modulus(b.scene, 1.0, 2.0)) + 0.01 * load * v[g - 1] * forms.surface_measure(b.scene.mesh, b.top.entities)
     bcs = [*clamp(b.V, b.bottom, g - 1)]
     for c, end, body in product(range(g - 1), (0.0, 1.0), (0, 1)):
         bcs += clamp(b.V, b.scene.tag("side", body, at(c, end)), c)
@@ -261,7 +261,7 @@ def test_first_step_from_touching_is_cut():
     b = blocks(COMM, "triangle", 2, 4)
     load = fem.Constant(b.scene.mesh, PETSc.ScalarType(0.0))
     v = ufl.TestFunction(b.V)
-    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + 0.1 * load * v[1] * compat.surface_measure(b.scene.mesh, b.top.entities)
+    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + 0.1 * load * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
     bcs = [*clamp(b.V, b.bottom, 1)]
     for end, body in product((0.0, 1.0), (0, 1)):
         bcs += clamp(b.V, b.scene.tag("side", body, at(0, end)), 0)
@@ -277,7 +277,7 @@ def test_loose_body_is_no_solution():
     b = blocks(COMM, "triangle", 2, 2, gap=0.5)
     load = fem.Constant(b.scene.mesh, PETSc.ScalarType(0.0))
     v = ufl.TestFunction(b.V)
-    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) - load * v[1] * compat.surface_measure(b.scene.mesh, b.top.entities)
+    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) - load * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
     problem = uem.UnitedProblem(
         F, b.u, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)], load=load, max_iterations=5
     )
@@ -324,7 +324,7 @@ def test_failure_after_all_cuts_keeps_the_last_step():
     load = fem.Constant(b.scene.mesh, PETSc.ScalarType(0.0))
     v = ufl.TestFunction(b.V)
     # St Venant-Kirchhoff in compression carries no more than 0.19 M: there is no equilibrium at the full load
-    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + 0.5 * load * v[1] * compat.surface_measure(b.scene.mesh, b.top.entities)
+    F = st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + 0.5 * load * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
     bcs = [*clamp(b.V, b.bottom, 1)]
     for end, body in product((0.0, 1.0), (0, 1)):
         bcs += clamp(b.V, b.scene.tag("side", body, at(0, end)), 0)

@@ -19,7 +19,8 @@ from petsc4py import PETSc
 from scipy.optimize import root
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, plasticity
+from uem_dolfinx import compat, forms
+from uem_dolfinx.materials import von_mises as plasticity
 
 KINDS = {3: "plane_stress", 4: "plane_strain", 6: "3d"}
 E, NU, FY, H = 200.0, 0.3, 0.4, 15.0
@@ -187,15 +188,15 @@ def wiggle(u: fem.Function, size: float) -> None:
 def vector(form: ufl.Form, V: Any) -> np.ndarray:
     """Assembled owned entries."""
     b = compat.create_vector(V)
-    compat.assemble_vector(b, compat.form(form))
+    forms.assemble_vector(b, compat.form(form))
     return np.array(b.array_r)
 
 
 def matrix(form: ufl.Form) -> PETSc.Mat:
     """Assembled."""
     compiled = compat.form(form)
-    A = compat.create_matrix(compiled)
-    compat.assemble_matrix(A, compiled)
+    A = forms.create_matrix(compiled)
+    forms.assemble_matrix(A, compiled)
     return A
 
 
@@ -327,7 +328,7 @@ def test_without_yield_it_is_the_elastic_law(comm, cell, degree, kind, strain, l
         pressed = E / (3 * (1 - 2 * NU)) / 2 * ufl.tr(elastic.strain(u)) ** 2
         parts += [-pressed * dx, pressed * dx_pressure]
     rounding = 1e-7 if tables[degree][1] == 0 else 1e-13
-    wanted = sum(compat.assemble_scalar(compat.form(part), comm) for part in parts)
+    wanted = sum(forms.assemble_scalar(compat.form(part), comm) for part in parts)
     assert material.energy() == pytest.approx(wanted, rel=10 * rounding)
     forces = sum(vector(ufl.derivative(part, u, v), V) for part in parts)
     scale = highest(comm, np.abs(forces))
@@ -538,7 +539,7 @@ def beams(comm: MPI.Comm) -> tuple[np.ndarray, list[float]]:
     how = {"kind": "plane_stress", "strain": "green_lagrange"}
     material = uem.VonMises(u, E, NU, FY, H, cells=uem.Tag("root", 1, 2, s.mesh, root), **how)
     F = material.residual(v)
-    F += uem.StVenantKirchhoff(E, NU, "plane_stress").residual(u, v) * compat.cell_measure(s.mesh, rest)
+    F += uem.StVenantKirchhoff(E, NU, "plane_stress").residual(u, v) * forms.cell_measure(s.mesh, rest)
     bcs = clamp(V, s.tag("root", 0, at(0, 0.0))) + clamp(V, s.tag("tip", 0, at(0, 4.0)), 1, value=-0.4)
     problem = uem.UnitedProblem(F, u, bcs=bcs, materials=[material], petsc_options_prefix="b_")
     run(problem, 4)

@@ -37,9 +37,9 @@ from hypothesis import strategies as st
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.shapes import facet_shape
-from uem_dolfinx.surfaces import tributary_areas
+from uem_dolfinx import compat, forms
+from uem_dolfinx.geometry.shapes import facet_shape
+from uem_dolfinx.geometry.surfaces import tributary_areas
 
 COMM = MPI.COMM_WORLD
 MESHES = Path(__file__).parent.parent / "meshes"
@@ -107,7 +107,7 @@ def test_floating_block_of_degree_two(cell, tilt):
     s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], pose=lambda x: x @ R.T + 0.1 * np.eye(g)[-1])
     V = compat.function_space(s.mesh, 2, (g,))
     u = fem.Function(V)
-    top = compat.surface_measure(s.mesh, s.tag("top", 0, at(g - 1, 1.0)).entities)
+    top = forms.surface_measure(s.mesh, s.tag("top", 0, at(g - 1, 1.0)).entities)
     F = st_venant(u, fem.Constant(s.mesh, PETSc.ScalarType(1.0)), 0.0) + 0.02 * ufl.TestFunction(V)[g - 1] * top
     contact = uem.Contact(s.tag("bottom", 0, at(g - 1, 0.0)), uem.RigidPlane([0.0] * g, np.eye(g)[-1]))
     uem.UnitedProblem(F, u, contacts=[contact], rtol=1e-10).solve()
@@ -142,7 +142,7 @@ class Top:
         self.wave = fem.Constant(s.mesh, np.zeros(7))
         x, c = ufl.SpatialCoordinate(s.mesh), self.wave
         wave = sum(c[i] * ufl.sin(c[2 + i] * x[i] + c[4 + i]) for i in range(g - 1)) + c[6]
-        measure = compat.surface_measure(s.mesh, self.tag.entities, {"quadrature_degree": 6})
+        measure = forms.surface_measure(s.mesh, self.tag.entities, {"quadrature_degree": 6})
         self.push = compat.form(ufl.conditional(ufl.gt(wave, 0.0), wave, 0.0) * ufl.TestFunction(self.S) * measure)
 
     def open(self, gap, active=False):
@@ -223,7 +223,7 @@ def test_control_forces_of_a_pressure_press(top, seed, share):
     rng = np.random.default_rng(seed)
     top.wave.value[:] = np.concatenate([rng.normal(size=2), rng.uniform(1, 7, 2), rng.uniform(0, 6, 2), [share]])
     b = compat.create_vector(top.S)
-    compat.assemble_vector(b, top.push)
+    forms.assemble_vector(b, top.push)
     f = np.array(b.array_r)[top.pair.nodes]
     lam, nodal = control.forces(f, np.ones(len(f), bool))
     total = float(COMM.allreduce(f.sum()))

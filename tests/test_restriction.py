@@ -19,11 +19,12 @@ from helpers import blocks, clamp, gathered_matrix, gathered_vector, linear, sca
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.solver import UnitedSolver, rigid_body_modes
-from uem_dolfinx.surfaces import Configuration, find_bodies
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.linear_solver import UnitedSolver, rigid_body_modes
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.configuration import Configuration
 
 COMM = MPI.COMM_WORLD
 DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
@@ -102,8 +103,8 @@ class Case:
         one = fem.Constant(self.blocks.scene.mesh, PETSc.ScalarType(1.0))
         a = ufl.derivative(linear(self.blocks.u, one), self.blocks.u) + 0.1 * ufl.inner(u, v) * ufl.dx
         form = compat.form(a)
-        K = compat.create_matrix(form)
-        compat.assemble_matrix(K, form)
+        K = forms.create_matrix(form)
+        forms.assemble_matrix(K, form)
         return K
 
 

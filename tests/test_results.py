@@ -19,7 +19,8 @@ import pytest
 import ufl
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, pictures
+from uem_dolfinx import compat
+from uem_dolfinx.output import pictures
 
 comm = MPI.COMM_WORLD
 

@@ -18,9 +18,10 @@ from scipy.optimize import minimize
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.search import MeshTarget, candidate_pairs
-from uem_dolfinx.shapes import closest_point, facet_shape, unit_normals
-from uem_dolfinx.surfaces import Configuration, TargetFacets
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.search import MeshTarget, candidate_pairs
+from uem_dolfinx.geometry.shapes import closest_point, facet_shape, unit_normals
 
 COMM = MPI.COMM_WORLD
 EPS = np.finfo(float).eps

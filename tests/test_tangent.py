@@ -14,9 +14,10 @@ from dolfinx import fem
 from helpers import at, blocks, box, clamp, modulus, run, scene, st_venant, tangent_by_differences
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.search import MeshTarget
-from uem_dolfinx.surfaces import Configuration, TargetFacets
+from uem_dolfinx import compat, forms
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.search import MeshTarget
 
 COMM = MPI.COMM_WORLD
 
@@ -205,7 +206,7 @@ def test_one_ufl_residual_for_any_number_of_loads():
     p = fem.Constant(b.scene.mesh, 0.05)
     v, n = ufl.TestFunction(b.V), ufl.FacetNormal(b.scene.mesh)
     F = ufl.Identity(2) + ufl.grad(b.u)
-    pressure = p * ufl.inner(ufl.det(F) * ufl.inv(F).T * n, v) * compat.surface_measure(b.scene.mesh, b.top.entities)
+    pressure = p * ufl.inner(ufl.det(F) * ufl.inv(F).T * n, v) * forms.surface_measure(b.scene.mesh, b.top.entities)
     side = b.scene.tag("axis", 1, at(0, 0.0))
     problem = uem.UnitedProblem(
         st_venant(b.u, modulus(b.scene, 1.0, 1.0)) + pressure,
@@ -218,5 +219,5 @@ def test_one_ufl_residual_for_any_number_of_loads():
     assert max(orders(history)) >= 1.8
     # global equilibrium: what the pressure pushes on the current top arrives at the contact
     J = ufl.det(F) * ufl.dot(ufl.inv(F).T * n, ufl.as_vector([0.0, 1.0]))
-    pushed = compat.assemble_scalar(compat.form(p * J * compat.surface_measure(b.scene.mesh, b.top.entities)), COMM)
+    pushed = forms.assemble_scalar(compat.form(p * J * forms.surface_measure(b.scene.mesh, b.top.entities)), COMM)
     assert contact.resultant().force[1] == pytest.approx(pushed, rel=1e-9)

@@ -20,10 +20,10 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
-from .errors import MissingBackendError
+from uem_dolfinx.errors import MissingBackendError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -31,16 +31,6 @@ if TYPE_CHECKING:
 DOLFINX_VERSION: tuple[int, int] = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])  # type: ignore[assignment]
 
 # ---------------------------------------------------------------------------------------------- backends
-
-
-def has_hypre() -> bool:
-    """Whether PETSc was built with hypre (the PyPI wheel is not)."""
-    return bool(PETSc.Sys.hasExternalPackage("hypre"))
-
-
-def has_mumps() -> bool:
-    """Whether PETSc was built with MUMPS."""
-    return bool(PETSc.Sys.hasExternalPackage("mumps"))
 
 
 def has_vtx() -> bool:
@@ -101,84 +91,7 @@ def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
     """
     geometry = domain.geometry
     dofmap = geometry.dofmaps[0] if DOLFINX_VERSION >= (0, 11) else geometry.dofmap
-    return _cell_table(domain, dofmap)
-
-
-def original_cells(domain: Any) -> npt.NDArray[np.int64]:
-    """Number of every cell in the mesh's input.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        Global input index, shape ``(n_cells incl. ghosts,)``; empty for a mesh that was made from another one.
-    """
-    return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
-
-
-def vertex_nodes(domain: Any) -> npt.NDArray[np.int32]:
-    """Geometry node of every vertex.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        Local node index, shape ``(n_vertices incl. ghosts,)``.
-    """
-    topology = domain.topology
-    vertex_map = topology.index_map(0)
-    topology.create_connectivity(topology.dim, 0)
-    vertices = _cell_table(domain, topology.connectivity(topology.dim, 0))
-    nodes = np.zeros(vertex_map.size_local + vertex_map.num_ghosts, dtype=np.int32)
-    nodes[vertices] = geometry_dofs(domain)[:, : vertices.shape[1]]
-    return nodes
-
-
-def mesh_tags(domain: Any, dim: int, entities: npt.ArrayLike, values: npt.ArrayLike) -> Any:
-    """Create MeshTags from entities in any order.
-
-    Args:
-        domain: the mesh.
-        dim: dimension of the entities.
-        entities: local indices, shape ``(n,)``; of equal ones the first counts.
-        values: one integer for all, or one for each, shape ``(n,)``.
-
-    Returns:
-        The MeshTags.
-    """
-    indices = np.asarray(entities, dtype=np.int32).reshape(-1)
-    numbers = np.broadcast_to(np.asarray(values, dtype=np.int32), indices.shape)
-    unique, first = np.unique(indices, return_index=True)
-    return mesh.meshtags(domain, dim, unique, np.ascontiguousarray(numbers[first]))
-
-
-def surface_measure(domain: Any, facets: npt.ArrayLike, metadata: Mapping[str, Any] | None = None) -> Any:
-    """Boundary measure ``ds`` over the given facets only.
-
-    Args:
-        domain: the mesh.
-        facets: local indices of exterior facets, shape ``(n,)``; each rank integrates over those it owns.
-        metadata: form compiler data, e.g. ``{"quadrature_degree": 2}``.
-
-    Returns:
-        The UFL measure.
-    """
-    domain.topology.create_connectivity(domain.topology.dim - 1, domain.topology.dim)
-    tags = mesh_tags(domain, domain.topology.dim - 1, facets, 1)
-    return ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
-
-
-def cell_measure(domain: Any, cells: npt.ArrayLike) -> Any:
-    """Measure ``dx`` over the given cells only; a form may hold one of them, beside ``dx`` over all cells.
-
-    Args:
-        domain: the mesh.
-        cells: local indices, shape ``(n,)``; each rank integrates over those it owns.
-
-    Returns:
-        The UFL measure.
-    """
-    return ufl.Measure("dx", domain=domain, subdomain_data=mesh_tags(domain, domain.topology.dim, cells, 1))(1)
+    return cell_table(domain, dofmap)
 
 
 # ---------------------------------------------------------------------------------------------- spaces and functions
@@ -244,20 +157,6 @@ def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any
     return fem.FunctionSpace(domain, element)
 
 
-def quadrature_rule(domain: Any, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Quadrature on the reference cell that forms use by default.
-
-    Args:
-        domain: the mesh.
-        degree: of the polynomials integrated exactly.
-
-    Returns:
-        Points ``(n_points, tdim)`` and weights ``(n_points,)``.
-    """
-    points, weights = basix.make_quadrature(getattr(basix.CellType, cell_name(domain)), degree)
-    return np.asarray(points), np.asarray(weights)
-
-
 def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
     """Values of a compiled scalar or vector expression at its points of the given cells.
 
@@ -282,10 +181,10 @@ def cell_dofs(V: Any) -> npt.NDArray[np.int32]:
     Returns:
         Local blocked indices, shape ``(n_cells incl. ghosts, n_block_dofs_per_cell)``.
     """
-    return _cell_table(V.mesh, V.dofmap.list)
+    return cell_table(V.mesh, V.dofmap.list)
 
 
-def _cell_table(domain: Any, rows: Any) -> npt.NDArray[np.int32]:
+def cell_table(domain: Any, rows: Any) -> npt.NDArray[np.int32]:
     """Rows of equal length, one for each cell, from an array or an adjacency list."""
     if isinstance(rows, np.ndarray):
         return rows
@@ -336,42 +235,6 @@ def element_family(V: Any) -> tuple[str, int] | None:
         return "Discontinuous Lagrange" if element.discontinuous else "Lagrange", int(element.degree)
     except (AttributeError, NotImplementedError, ValueError):
         return None
-
-
-def create_lagrange_element(cell: str, degree: int) -> Any:
-    """Scalar Lagrange element of Basix, with the nodes that :func:`function_space` uses.
-
-    Args:
-        cell: ``"interval"``, ``"triangle"``, ...
-        degree: polynomial degree.
-
-    Returns:
-        The Basix element; ``tabulate(n, points)`` has shape ``(n_derivatives, n_points, n_nodes, 1)``.
-    """
-    return basix.create_element(basix.ElementFamily.P, getattr(basix.CellType, cell), degree, basix.LagrangeVariant.gll_warped)
-
-
-def reference_topology(cell: str) -> list[list[list[int]]]:
-    """Vertices of every sub-entity of a reference cell.
-
-    Args:
-        cell: ``"interval"``, ``"triangle"``, ...
-
-    Returns:
-        ``topology[dim][i]``: the vertices of sub-entity ``i`` of dimension ``dim``.
-    """
-    return [[list(entity) for entity in entities] for entities in basix.topology(getattr(basix.CellType, cell))]
-
-
-def sum_ghosts(u: Any) -> None:
-    """Add the ghost entries of a Function to their owners and send the sums back (collective).
-
-    Args:
-        u: the Function.
-    """
-    vector = petsc_vector(u)
-    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-    vector.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
 
 
 def petsc_vector(u: Any) -> PETSc.Vec:
@@ -461,35 +324,11 @@ def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
     )
 
 
-def _petsc_forms() -> Any:
+def petsc_forms() -> Any:
     """``dolfinx.fem.petsc``, which is heavy on some versions."""
     import dolfinx.fem.petsc
 
     return dolfinx.fem.petsc
-
-
-def create_matrix(a: Any) -> PETSc.Mat:
-    """Matrix with the layout, the block size and the sparsity of a compiled bilinear form.
-
-    Args:
-        a: the compiled form.
-
-    Returns:
-        A matrix without values.
-    """
-    return _petsc_forms().create_matrix(a)
-
-
-def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
-    """Assemble a compiled bilinear form into a matrix, without boundary conditions (collective).
-
-    Args:
-        A: from :func:`create_matrix`; zeroed first, fully assembled afterwards.
-        a: the compiled form.
-    """
-    A.zeroEntries()
-    _petsc_forms().assemble_matrix(A, a, [])
-    A.assemble()
 
 
 def create_vector(V: Any) -> PETSc.Vec:
@@ -502,48 +341,12 @@ def create_vector(V: Any) -> PETSc.Vec:
         The vector.
     """
     if DOLFINX_VERSION >= (0, 10):
-        b = _petsc_forms().create_vector(V)
+        b = petsc_forms().create_vector(V)
     else:
         b = la.create_petsc_vector(V.dofmap.index_map, V.dofmap.index_map_bs)
     with b.localForm() as local:
         local.set(0.0)
     return b
-
-
-def assemble_vector(b: PETSc.Vec, L: Any) -> None:
-    """Assemble a compiled linear form into a vector (collective).
-
-    Args:
-        b: ghosted vector; zeroed first. Ghost contributions are added to their owners; the ghost entries themselves
-            are left unspecified.
-        L: the compiled form.
-    """
-    with b.localForm() as local:
-        local.set(0.0)
-    _petsc_forms().assemble_vector(b, L)
-    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-
-
-def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
-    """Value of a compiled functional (collective).
-
-    Args:
-        M: the compiled form.
-        comm: communicator of the mesh.
-
-    Returns:
-        The sum over all ranks, known to all of them.
-    """
-    return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))
-
-
-def free_petsc_garbage(comm: MPI.Comm) -> None:
-    """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective).
-
-    Args:
-        comm: their communicator.
-    """
-    PETSc.garbage_cleanup(comm)
 
 
 def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
@@ -576,23 +379,6 @@ def set_bc_values(x: npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
 
 
 # ---------------------------------------------------------------------------------------------- files
-
-
-def open_xdmf(comm: MPI.Comm, path: str | Path, domain: Any) -> Any:
-    """Open an XDMF file and write the mesh (collective).
-
-    Args:
-        comm: communicator of the mesh.
-        path: name of the file; its folder exists.
-        domain: the mesh.
-
-    Returns:
-        The file, a context manager; ``write_function(u, t)`` takes P1 (geometry degree) and DG0 Functions, each
-        with a ``name`` of its own.
-    """
-    file = io.XDMFFile(comm, str(path), "w")
-    file.write_mesh(domain)
-    return file
 
 
 def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
@@ -651,25 +437,6 @@ def timing_calls(task: str) -> int:
 
 
 # ---------------------------------------------------------------------------------------------- Gmsh
-
-
-def import_gmsh() -> Any:
-    """Import Gmsh's Python module.
-
-    Returns:
-        The module.
-
-    Raises:
-        MissingBackendError: it cannot be imported.
-    """
-    try:
-        import gmsh
-    except (ImportError, OSError) as error:
-        raise MissingBackendError(
-            f"Reading a Gmsh model needs Gmsh's Python module ({error}): install the package python3-gmsh, "
-            "or the PyPI package gmsh."
-        ) from error
-    return gmsh
 
 
 def gmsh_is_initialized(gmsh: Any) -> bool:

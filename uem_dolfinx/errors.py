@@ -1,4 +1,4 @@
-"""Named exceptions, and the agreement between ranks that makes one rank's error everybody's.
+"""Named exceptions.
 
 First on the data's way because every later step may have to refuse its input.
 """
@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from mpi4py import MPI
 
 
 class UEMError(Exception):
@@ -91,29 +89,9 @@ class ConvergenceError(UEMError, RuntimeError):
     """The united Newton loop did not converge; the committed state has been restored.
 
     Attributes:
-        history: the iterations made, in order (see ``uem_dolfinx.newton.Iteration``).
+        history: the iterations made, in order (see ``uem_dolfinx.solve.newton.Iteration``).
     """
 
     def __init__(self, message: str, history: Sequence[object] = ()):
         super().__init__(message)
         self.history = list(history)
-
-
-def agree(comm: MPI.Comm, error: Exception | None) -> None:
-    """Raise on every rank the error of the first rank that has one (collective).
-
-    Ranks that each look at their own part of the mesh must not raise alone: the others would wait for ever
-    in the next collective call.
-
-    Args:
-        comm: the communicator whose ranks have to agree.
-        error: what this rank found wrong, or None.
-
-    Raises:
-        Exception: the same error on all ranks, if any rank had one.
-    """
-    if comm.size > 1:
-        errors = comm.allgather(error)
-        error = next((e for e in errors if e is not None), None)
-    if error is not None:
-        raise error

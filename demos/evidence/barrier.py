@@ -18,19 +18,21 @@ from scipy.sparse import coo_matrix
 
 from evidence.line_search import flat_length
 from evidence.pushed import PushedSystem
-from uem_dolfinx import compat
+from uem_dolfinx import forms
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.newton import United
-from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.search import MeshTarget
-from uem_dolfinx.surfaces import TargetFacets, tributary_areas
+from uem_dolfinx.solve.newton import United
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.surfaces import tributary_areas
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uem_dolfinx.contact import Contact
-    from uem_dolfinx.uniting import ContactPair
+    from uem_dolfinx.contact.contact import Contact
+    from uem_dolfinx.contact.pair import ContactPair
 
 Array = npt.NDArray[np.float64]
 
@@ -78,7 +80,7 @@ class BarrierSystem(PushedSystem):
                 faces = facets if facets.shape[1] == 3 else np.concatenate([facets[:, [0, 1, 3]], facets[:, [0, 3, 2]]])
                 faces = np.asfortranarray(np.unique(faces, axis=0).astype(np.int32))
                 self._mesh = ipctk.CollisionMesh(X, ipctk.edges(faces), faces)
-            self._mesh.can_collide = ipctk.make_vertex_patches_filter(config.bodies[0][self._nodes].astype(np.int32))
+            self._mesh.can_collide = ipctk.make_vertex_patches_filter(find_bodies(config)[0][self._nodes].astype(np.int32))
         self._collisions = ipctk.NormalCollisions()
         self._collisions.use_area_weighting = True
 
@@ -168,7 +170,7 @@ class BarrierSystem(PushedSystem):
             gap = np.where(pair.off, np.inf, pair.projection.gap)
             near = gap.min(initial=np.inf)
             if near < TOO_NEAR * self.distance:
-                body, _ = self.config.bodies
+                body, _ = find_bodies(self.config)
                 normal = pair.projection.normal[gap.argmin()]
                 self.config.displacement[body == body[pair.nodes[0]]] += (0.5 * self.distance - near) * normal
         self.place(returning=False)
@@ -191,7 +193,7 @@ class BarrierSystem(PushedSystem):
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Tangent of bodies and barrier; returns the right-hand side."""
-        compat.free_petsc_garbage(self.comm)
+        forms.free_petsc_garbage(self.comm)
         self.tangent.update()
         self._stiffness = self.tangent.K.getDiagonal()
         with timed("barrier"):

@@ -21,7 +21,7 @@ from evidence import methods
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -204,7 +204,7 @@ def judge(case: Case, column: Column) -> dict[str, Any]:
         cell |= {"verdict": "named error", "figure": type(error).__name__, "what": str(error), "tolerance": None}
     except Exception as error:
         cell |= {"verdict": "wrong", "figure": type(error).__name__, "what": str(error), "tolerance": None}
-    compat.free_petsc_garbage(COMM)
+    forms.free_petsc_garbage(COMM)
     return cell | {"iterations": trial.iterations}
 
 
@@ -266,7 +266,7 @@ class Scene:
         given = slice(None) if COMM.rank == 0 else slice(0)
         self.mesh = compat.create_mesh(COMM, cells[given], x[given], cell, 1)
         body = np.repeat(np.arange(len(parts)), [len(c) for _, c in parts])
-        self.body = body[compat.original_cells(self.mesh)]
+        self.body = body[forms.original_cells(self.mesh)]
         self.V = compat.function_space(self.mesh, 1, (self.g,))
         self.u = fem.Function(self.V, name="displacement")
         self.E = fem.Function(compat.dg0_space(self.mesh), name="E")
@@ -279,7 +279,7 @@ class Scene:
         mesh, t = self.mesh, self.mesh.topology.dim
         for a, b in ((t - 1, 0), (t - 1, t), (t, t - 1)):
             mesh.topology.create_connectivity(a, b)
-        self._at = self._drawing[np.asarray(mesh.geometry.input_global_indices)[compat.vertex_nodes(mesh)]]
+        self._at = self._drawing[np.asarray(mesh.geometry.input_global_indices)[forms.vertex_nodes(mesh)]]
 
     @property
     def moduli(self) -> list[float]:
@@ -330,7 +330,7 @@ class Scene:
     def push(self, tag: uem.Tag, traction: Sequence[float]) -> None:
         """Load a surface by a force per reference area."""
         v = ufl.TestFunction(self.V)
-        self.F -= ufl.inner(ufl.as_vector(list(traction)), v) * compat.surface_measure(self.mesh, tag.entities)
+        self.F -= ufl.inner(ufl.as_vector(list(traction)), v) * forms.surface_measure(self.mesh, tag.entities)
 
     def weigh(self, body: int, force: Sequence[float]) -> None:
         """Load a body by a force per reference volume."""
@@ -339,10 +339,10 @@ class Scene:
 
     def volume(self, body: int) -> float:
         """Reference volume of a body (collective)."""
-        return compat.assemble_scalar(compat.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
+        return forms.assemble_scalar(compat.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
 
     def _volume(self, body: int) -> Any:
-        return compat.cell_measure(self.mesh, np.flatnonzero(self.body == body).astype(np.int32))
+        return forms.cell_measure(self.mesh, np.flatnonzero(self.body == body).astype(np.int32))
 
     def unite(self, contactor: uem.Tag, target: Any, **options: Any) -> uem.Contact:
         """Let two surfaces touch."""
@@ -369,7 +369,7 @@ class Scene:
     def residual(self) -> Array:
         """Internal minus external forces of the owned nodes ``(n_owned, gdim)`` (collective)."""
         b = compat.create_vector(self.V)
-        compat.assemble_vector(b, compat.form(self.F))
+        forms.assemble_vector(b, compat.form(self.F))
         return np.array(b.array_r).reshape(-1, self.g)
 
     def reaction(self, tag: uem.Tag) -> Array:

@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 import uem_dolfinx as uem
 from evidence.cases import BALANCE, COMM, OVERLAP, Array, Scene, Trial
-from uem_dolfinx.shapes import closest_point, unit_normals
+from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
 AS_NEAR = 1e-3

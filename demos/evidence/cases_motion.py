@@ -14,7 +14,7 @@ from dolfinx import fem
 import uem_dolfinx as uem
 from evidence.cases import COMM, FORCE, OVERLAP, Box, Case, Scene, Trial
 from evidence.cases_laws import overlap
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 RHO, V0 = 1.0, 1.0
 #: Fronts of waves spread over a few elements, and steps beyond the Courant limit do not resolve them.
@@ -40,7 +40,7 @@ class Motion:
         self._start_energy, self._start_momentum = self._energy(), self._dynamics.momentum()
 
     def _energy(self) -> float:
-        return self._dynamics.kinetic_energy() + compat.assemble_scalar(self._stored, COMM)
+        return self._dynamics.kinetic_energy() + forms.assemble_scalar(self._stored, COMM)
 
     def gained(self) -> float:
         """Energy won since the start, as part of that at the start; negative if lost (collective)."""

@@ -15,15 +15,15 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
-from uem_dolfinx import compat
-from uem_dolfinx.equations import UnitingEquations
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
-from uem_dolfinx.system import BodySystem
+from uem_dolfinx.solve.system import BodySystem
 
 if TYPE_CHECKING:
-    from uem_dolfinx.newton import United
-    from uem_dolfinx.uniting import ContactPair
+    from uem_dolfinx.solve.newton import United
+    from uem_dolfinx.contact.pair import ContactPair
 
 DIRECT = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 #: For large bodies that are held: Murphy, Golub and Wathen's block diagonal, with the Schur complement from the diagonal of K.
@@ -62,7 +62,7 @@ class LagrangeSystem(BodySystem):
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Saddle-point matrix; returns what drives the step, as the united system would feel it."""
-        compat.free_petsc_garbage(self.comm)
+        forms.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
             self.tangent.update()
             self._stiffness = self.tangent.K.getDiagonal()

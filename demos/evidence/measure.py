@@ -22,7 +22,7 @@ from evidence.scene import Scene
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import forms
 
 Point = dict[str, Any]
 
@@ -74,7 +74,7 @@ def measure(scene: Scene, method: str, parameter: float | None = None, runs: int
         for _ in range(runs + 1):
             scene.u.x.array[:] = 0.0
             contact, options = scene.contact(), scene.options(method)
-            compat.free_petsc_garbage(comm)
+            forms.free_petsc_garbage(comm)
             comm.barrier()
             start = time.perf_counter()
             problem = methods.create(

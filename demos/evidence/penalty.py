@@ -16,17 +16,19 @@ from petsc4py import PETSc
 
 from evidence.line_search import flat_length
 from evidence.pushed import PushedSystem
-from uem_dolfinx import compat
+from uem_dolfinx import forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.newton import United
-from uem_dolfinx.search import FacetProjection, MeshTarget, Projection
-from uem_dolfinx.surfaces import TargetFacets, tributary_areas
-from uem_dolfinx.system import ROUNDING
-from uem_dolfinx.tangent import contact_curvature
+from uem_dolfinx.solve.newton import United
+from uem_dolfinx.geometry.projection import FacetProjection, Projection
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.surfaces import tributary_areas
+from uem_dolfinx.solve.system import ROUNDING
+from uem_dolfinx.solve.tangent import contact_curvature
 
 if TYPE_CHECKING:
-    from uem_dolfinx.mesh import Tag
-    from uem_dolfinx.uniting import ContactPair
+    from uem_dolfinx.geometry.gmsh import Tag
+    from uem_dolfinx.contact.pair import ContactPair
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -244,7 +246,7 @@ class PenaltySystem(PushedSystem):
 
     def linearise(self, state: United, first: bool) -> PETSc.Vec:
         """Tangent of bodies and springs; returns the right-hand side."""
-        compat.free_petsc_garbage(self.comm)
+        forms.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
             self.tangent.update()
             self._stiffness = self.tangent.K.getDiagonal()

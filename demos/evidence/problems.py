@@ -17,8 +17,8 @@ from dolfinx import fem
 from evidence.scene import DIRECT, Scene, overlap
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
-from uem_dolfinx.surfaces import tributary_areas
+from uem_dolfinx import compat, forms
+from uem_dolfinx.geometry.surfaces import tributary_areas
 
 
 def gathered(contact: uem.Contact) -> tuple[np.ndarray, ...]:
@@ -92,7 +92,7 @@ def hertz_cylinder(h: float, degree: int, answer: HertzAnswer | None = None) -> 
             return {}
         X, p, areas, gap = gathered(contact)
         reference = np.interp(X[:, 0], answer.x, answer.pressure)
-        excess = compat.assemble_scalar(energy, comm) - answer.energy - (areas * reference * gap).sum()
+        excess = forms.assemble_scalar(energy, comm) - answer.energy - (areas * reference * gap).sum()
         return {
             "error_energy": float(np.sqrt(abs(excess) / answer.energy)),
             "error_pressure": norm(p - reference, areas) / norm(reference, areas),
@@ -117,7 +117,7 @@ def hertz_answer(h: float) -> HertzAnswer:
         for _ in scene.run(problem):
             pass
         (v,) = scene.F.arguments()
-        stored = compat.assemble_scalar(compat.form(0.5 * ufl.replace(scene.F, {v: scene.u})), comm)
+        stored = forms.assemble_scalar(compat.form(0.5 * ufl.replace(scene.F, {v: scene.u})), comm)
         X, p, _, _ = gathered(contact)
         order = np.argsort(X[:, 0])
         answers.append(HertzAnswer(stored, float(contact.resultant().force[1]), X[order, 0], p[order]))
@@ -168,7 +168,7 @@ def indenter(N: int) -> Scene:
     def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:
         found: dict[str, float | None] = {}
         for name, (difference, whole) in pairs.items():
-            found[name] = float(np.sqrt(compat.assemble_scalar(difference, comm) / compat.assemble_scalar(whole, comm)))
+            found[name] = float(np.sqrt(forms.assemble_scalar(difference, comm) / forms.assemble_scalar(whole, comm)))
         found["error_pressure"] = norm(gathered(contact)[1] - pressure, areas) / norm(pressure, areas)
         found["error_force"] = abs(float(contact.resultant().force[2]) / force - 1)
         found["overlap"] = overlap(contact) / d
@@ -231,8 +231,8 @@ def bar_impact(n: int, cfl: float, *, scheme: str = "trapezoidal", contactors: s
         inside = np.clip(np.minimum(time, leave) - np.maximum(time - length, touch), 0.0, None)
         square = (length * force**2 - 2 * inside * force * plateau).sum() + plateau**2 * (leave - touch)
         return {
-            "error_energy": float(np.sqrt(compat.assemble_scalar(differs, comm) / (rho * L * v0**2 / 2))),
-            "error_l2": float(np.sqrt(compat.assemble_scalar(misplaced, comm) / (L * there.value[1] ** 2))),
+            "error_energy": float(np.sqrt(forms.assemble_scalar(differs, comm) / (rho * L * v0**2 / 2))),
+            "error_l2": float(np.sqrt(forms.assemble_scalar(misplaced, comm) / (L * there.value[1] ** 2))),
             "error_pressure": float(np.sqrt(square / (plateau**2 * (leave - touch)))),
             "error_force": float(abs((length * force).sum() / (2 * rho * L * v0) - 1)),
             "overlap": float(deep.max() / (v0 * L / c)),

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.equations import UnitingEquations
-from uem_dolfinx.restriction import Restriction
-from uem_dolfinx.system import BodySystem
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.solve.system import BodySystem
 
 if TYPE_CHECKING:
-    from uem_dolfinx.newton import United
-    from uem_dolfinx.uniting import ContactPair
+    from uem_dolfinx.solve.newton import United
+    from uem_dolfinx.contact.pair import ContactPair
 
 
 class PushedSystem(BodySystem):

@@ -28,7 +28,7 @@ from dolfinx import fem
 from evidence.scene import Scene, overlap
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 #: Degree of quadrature of integrals with the exact solution.
 QUADRATURE = {"quadrature_degree": 6}
@@ -128,7 +128,7 @@ def signorini(
 
     outside = np.union1d(tags["lower_outside"].entities, tags["upper_outside"].entities).astype(np.int32)
     traction = ufl.dot(s_exact, ufl.FacetNormal(mesh))
-    F = material.residual(u, v) * ufl.dx - ufl.dot(traction, v) * compat.surface_measure(mesh, outside, QUADRATURE)
+    F = material.residual(u, v) * ufl.dx - ufl.dot(traction, v) * forms.surface_measure(mesh, outside, QUADRATURE)
     bcs = []
     for i in range(2):
         V_i, _ = V.sub(i).collapse()
@@ -141,7 +141,7 @@ def signorini(
             dofs = [part[held] for part in dofs]
         bcs.append(fem.dirichletbc(value, dofs, V.sub(i)))
 
-    dx, dC = ufl.dx(metadata=QUADRATURE), compat.surface_measure(mesh, tags[surfaces[contactor]].entities, QUADRATURE)
+    dx, dC = ufl.dx(metadata=QUADRATURE), forms.surface_measure(mesh, tags[surfaces[contactor]].entities, QUADRATURE)
     lam, mu = material.lam, material.mu
 
     def energy(strain: Any) -> Any:
@@ -154,7 +154,7 @@ def signorini(
         "error_l2": (ufl.inner(u - u_exact, u - u_exact) * dx, ufl.inner(u_exact, u_exact) * dx),
         "error_pressure": ((pressure - p_exact) ** 2 * dC, p_exact**2 * dC),
     }
-    forms = {name: tuple(map(compat.form, pair)) for name, pair in parts.items()}
+    compiled = {name: tuple(map(compat.form, pair)) for name, pair in parts.items()}
     largest = fem.Function(V)
     compat.interpolate_expression(largest, u_exact)
     size = float(max(comm.allgather(np.abs(largest.x.array).max(initial=0.0))))
@@ -163,7 +163,7 @@ def signorini(
         pressure.x.array[:] = contact.pressure.x.array
         found: dict[str, float | None] = {}
         for name, (difference, whole) in forms.items():
-            found[name] = float(np.sqrt(compat.assemble_scalar(difference, comm) / compat.assemble_scalar(whole, comm)))
+            found[name] = float(np.sqrt(forms.assemble_scalar(difference, comm) / forms.assemble_scalar(whole, comm)))
         direction = 1.0 if contactor == "upper" else -1.0
         found["error_force"] = abs(direction * contact.resultant().force[1] / exact.force - 1)
         found["overlap"] = overlap(contact) / size

@@ -19,8 +19,10 @@ from dolfinx.mesh import locate_entities
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.search import MeshTarget
-from uem_dolfinx.surfaces import Configuration, TargetFacets, surface_nodes
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.surfaces import surface_nodes
 
 #: Gap between the plates in cells of the upper one.
 GAP = 0.01

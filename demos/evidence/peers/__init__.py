@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from common import outside_mpi
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 if TYPE_CHECKING:
-    from uem_dolfinx.mesh import Tags
+    from uem_dolfinx.geometry.gmsh import Tags
 
 #: One run, and the start of another one if it took less than this part of the time allowed.
 REPEATED = 0.1
@@ -100,7 +100,7 @@ def gathered(mesh: Any, tags: Tags, **scene: float) -> Hertz | None:
     tdim, topology, comm = mesh.topology.dim, mesh.topology, mesh.comm
     topology.create_connectivity(tdim - 1, 0)
     number = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
-    vertices, links = number[compat.vertex_nodes(mesh)], topology.connectivity(tdim - 1, 0).array.reshape(-1, 2)
+    vertices, links = number[forms.vertex_nodes(mesh)], topology.connectivity(tdim - 1, 0).array.reshape(-1, 2)
     lines = {str(name): vertices[links[tag.entities]] for name, tag in tags.items() if tag.dim == tdim - 1}
     n_owned = topology.index_map(tdim).size_local
     disc = np.isin(np.arange(n_owned), tags["disc"].entities)

@@ -1,0 +1,284 @@
+"""The linear solve of the united system: ``P'KP`` with its pattern reused, near-null space carried to q, KSP and PC by size.
+
+Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_options``.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.errors import LinearSolveError, MissingBackendError
+from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.log import timed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from uem_dolfinx.algebra.equations import UnitingEquations
+    from uem_dolfinx.algebra.restriction import Restriction
+    from uem_dolfinx.geometry.configuration import Configuration
+
+Array = npt.NDArray[np.float64]
+
+#: Up to so many bodies each have rigid-body modes of their own in the near-null space.
+MODES_OF_THEIR_OWN = 4
+#: A mode of which less than this part is new adds nothing to the near-null space.
+INDEPENDENT = 1e-6
+#: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
+MOST_ACCURATE = 1e-10
+#: A preconditioner is kept for matrices that differ from its own in less than this part of the equations,
+KEPT_CHANGES = 0.1
+#: and while it takes less than this times as many iterations for each digit as at first.
+KEPT_SLOWER = 2.0
+#: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
+DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+
+
+def has_hypre() -> bool:
+    """Whether PETSc was built with hypre (the PyPI wheel is not)."""
+    return bool(PETSc.Sys.hasExternalPackage("hypre"))
+
+
+def has_mumps() -> bool:
+    """Whether PETSc was built with MUMPS."""
+    return bool(PETSc.Sys.hasExternalPackage("mumps"))
+
+
+def default_options(size: int, gdim: int) -> dict[str, Any]:
+    """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG."""
+    if size <= DIRECT_UP_TO[gdim]:
+        options = {"ksp_type": "preonly", "pc_type": "lu"}
+        if compat.has_mumps():
+            options["pc_factor_mat_solver_type"] = "mumps"
+        return options
+    return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
+
+
+def multigrid_options(amg: str = "") -> dict[str, Any]:
+    """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or hypre where PETSc has it.
+
+    Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
+    """
+    amg = amg or ("hypre" if compat.has_hypre() else "gamg")
+    if amg == "gamg":
+        return {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
+    boomeramg = {
+        "strong_threshold": 0.15,
+        "coarsen_type": "HMIS",
+        "interp_type": "ext+i",
+        "P_max": 4,
+        "relax_type_all": "Chebyshev",
+    }
+    return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
+
+
+def check_options(options: dict[str, Any]) -> None:
+    """Refuse options that ask for a library PETSc was built without.
+
+    Raises:
+        MissingBackendError: naming the option.
+    """
+    for key, value in options.items():
+        for name, there in (("hypre", compat.has_hypre), ("mumps", compat.has_mumps)):
+            if str(value).lower() == name and not there():
+                raise MissingBackendError(
+                    f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
+                    + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
+                )
+
+
+class UnitedSolver:
+    """KSP for ``P'KP dq = P'(r - K c)``.
+
+    Args:
+        config: configuration of the displacement.
+        prefix: PETSc options prefix.
+        options: PETSc options without prefix; None chooses by size. Without ``ksp_rtol`` every solve is as accurate as its Newton
+            iteration can use.
+    """
+
+    def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
+        self.config = config
+        size = config.gdim * config.index_map.size_global
+        self.options = default_options(size, config.gdim) if options is None else dict(options)
+        check_options(self.options)
+        self._prefix = prefix
+        self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
+        self.ksp = self._create_ksp()
+        self._key: object = None
+        self._P: PETSc.Mat | None = None
+        self.A: Any = None
+        #: Whether the preconditioner has yet to see the present matrix.
+        self._new = False
+        #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
+        self._made_with: UnitingEquations | None = None
+        self._first_pace = self._pace = 0.0
+
+    def _create_ksp(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.config.comm)
+        ksp.setOptionsPrefix(self._prefix)
+        ksp.setErrorIfNotConverged(False)
+        with self._in_database():
+            ksp.setFromOptions()
+        return ksp
+
+    def forget(self) -> None:
+        """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
+        self._key = self._P = self.A = self._made_with = None
+        self.ksp.destroy()
+        self.ksp = self._create_ksp()
+
+    @contextmanager
+    def _in_database(self) -> Iterator[None]:
+        """Show PETSc the options; levels of a multigrid read theirs only when they are set up."""
+        database, prefix = PETSc.Options(), self._prefix
+        for key, value in self.options.items():
+            database[prefix + key] = value
+        try:
+            yield
+        finally:
+            for key in self.options:
+                del database[prefix + key]
+
+    @property
+    def iterative(self) -> bool:
+        """Whether solves have a tolerance."""
+        return bool(self.ksp.getType() != "preonly")
+
+    @property
+    def needs_near_null_space(self) -> bool:
+        """Whether the preconditioner can use the rigid-body modes."""
+        return self.ksp.getPC().getType() in ("gamg", "ml", "bddc")
+
+    def set_operator(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
+        """Build ``P'(K + curvature)P`` and give it to the KSP (collective).
+
+        Args:
+            restriction: of the current uniting equations.
+            K: tangent matrix without boundary conditions.
+            curvature: second derivatives of the gaps times contact forces, or None.
+        """
+        key: object = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
+        reuse = key == self._key and self.A is not None
+        P = None if restriction.M is None else restriction.P
+        with timed("united matrix P'KP" if P is not None else "cross out prescribed components"):
+            if P is None:
+                if reuse:
+                    K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                else:
+                    self.A = K.copy()
+                restriction.cross_out(self.A)
+            elif reuse:
+                P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                K.PtAP(self._P, result=self.A)
+            else:
+                self._P = P
+                self.A = K.PtAP(self._P)
+            if curvature is not None:
+                # an equation that depends on others acts on nodes that P does not join, and without equations P joins none
+                alone = restriction.stacked or restriction.M is None
+                pattern = PETSc.Mat.Structure
+                fits = pattern.DIFFERENT_NONZERO_PATTERN if alone else pattern.SUBSET_NONZERO_PATTERN
+                self.A.axpy(1.0, curvature.PtAP(restriction.P), fits)
+                key = None if alone else key
+            diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
+            idle = ~restriction.used.ravel()
+            diagonal.array[idle] = stiffness.array_r[idle]
+            self.A.setDiagonal(diagonal)
+        self._keep_preconditioner(restriction.equations)
+        self._key = key
+        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if self._new and self.needs_near_null_space:
+            self.A.setBlockSize(self.config.gdim)
+            self.A.setNearNullSpace(self._near_null_space(restriction))
+        self.ksp.setOperators(self.A)
+
+    def _keep_preconditioner(self, equations: UnitingEquations) -> None:
+        """Decide whether the preconditioner serves the present matrix as well (collective)."""
+        keep, before = False, self._made_with
+        if self.iterative and before is not None:
+            same = np.array_equal(equations.node, before.node)
+            changed = (equations.active != before.active).sum() if same else len(before) + 1
+            changed, present = self.config.comm.allreduce(np.array([changed, before.active.sum()]))
+            keep = changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
+        if not keep:
+            self._made_with, self._first_pace = equations, 0.0
+        self._new = not keep
+        self.ksp.getPC().setReusePreconditioner(bool(keep))
+
+    def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
+        """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
+
+        Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
+        across a contact would lock its sliding.
+        """
+        body, n_bodies = find_bodies(self.config)
+        body = body[: self.config.n_owned]
+        own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
+        joint = rigid_body_modes(self.config)
+        vectors: list[PETSc.Vec] = []
+        for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
+            full = self.A.createVecLeft()
+            full.array[:] = mode.ravel()
+            q = restriction.reduce(full)
+            before = q.norm()
+            # twice is enough
+            for other in [*vectors, *vectors]:
+                q.axpy(-q.dot(other), other)
+            if q.norm() > INDEPENDENT * before:
+                q.normalize()
+                vectors.append(q)
+        return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0) -> tuple[PETSc.Vec, int]:
+        """Solve for dq (collective).
+
+        Args:
+            rhs: right-hand side.
+            accuracy: part of it that may be left by an iterative solver whose options do not fix its ``ksp_rtol``.
+
+        Returns:
+            dq and the number of linear iterations.
+
+        Raises:
+            LinearSolveError: with PETSc's reason.
+        """
+        dq = rhs.duplicate()
+        if self.iterative and not self._fixed_accuracy:
+            self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
+        with self._in_database():
+            try:
+                if self._new:
+                    with timed("factorisation or preconditioner set-up"):
+                        self.ksp.setUp()
+                        self.ksp.setUpOnBlocks()
+                    self._new = False
+                with timed("linear solve"):
+                    self.ksp.solve(rhs, dq)
+            except PETSc.Error as error:
+                raise LinearSolveError(
+                    f"PETSc error {error.ierr} in the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()}: "
+                    "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
+                ) from error
+        reason = self.ksp.getConvergedReason()
+        if reason < 0 or not np.isfinite(dq.norm()):
+            raise LinearSolveError(
+                f"the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()} failed with KSP reason {reason} after "
+                f"{self.ksp.getIterationNumber()} iterations: a body may be free to move as a rigid body, the tangent may be "
+                "indefinite (use a direct solver), or ksp_max_it too small"
+            )
+        iterations = int(self.ksp.getIterationNumber())
+        self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
+        self._first_pace = self._first_pace or self._pace
+        return dq, iterations
+
+
+def rigid_body_modes(config: Configuration) -> list[Array]:
+    """Translations and linearised rotations of the current configuration, each ``(n_owned, gdim)``."""
+    return list(rigid_velocities(config.x[: config.n_owned]).transpose(1, 0, 2))

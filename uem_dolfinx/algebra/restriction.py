@@ -1,0 +1,327 @@
+"""From uniting equations to the restriction matrix P and the united system ``P'KP``.
+
+Fifth step on the data's way, pure algebra that knows nothing of contact. With the free unknowns q,
+
+    du = P dq + c                        P: n x n with idle columns, m = n - (number of equations) of them in use
+    P'KP dq = P'(r - K c)                [UEM, 6.6]
+
+Every equation eliminates one component of a node in a frame rotated to its direction [UEM, 4.1]:
+
+    du = T dq + M du + d    so    P = (1 + M + M^2 + ...) T,    c = (1 + M + M^2 + ...) d
+
+T rotates each node's free components, M lets an eliminated component follow other nodes, d closes gaps and carries prescribed
+increments. The powers of M end after as many terms as bodies are stacked upon each other.
+"""
+
+from __future__ import annotations
+
+import zlib
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, ROUNDING
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.algebra.equations import UnitingEquations
+    from uem_dolfinx.geometry.configuration import Configuration
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: Stacks of bodies higher than this are taken for a cycle.
+LONGEST_CHAIN = 16
+
+
+class Restriction:
+    """P and c of one set of uniting equations.
+
+    Args:
+        config: the space whose displacement is restricted.
+        equations: uniting equations of the nodes this rank owns.
+        free: components without Dirichlet condition, of the owned nodes ``(n_owned, gdim)``.
+        prescribed: increments that the Dirichlet conditions ask for ``(n_owned, gdim)``, zero where free.
+        stacked: whether a node that is followed may itself be eliminated.
+
+    Raises:
+        ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle.
+    """
+
+    def __init__(self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True):
+        self.config, self.equations, self.free, self.stacked = config, equations, free, stacked
+        self.comm = config.comm
+        g, n = config.gdim, config.n_owned
+        self._sizes = ((g * n, g * config.index_map.size_global),) * 2
+        self._first = g * int(config.index_map.local_range[0])
+        self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
+        #: Eliminated nodes, and those that only hold their place in the sparsity of P.
+        self.nodes: npt.NDArray[np.int32] = np.unique(equations.node)
+        self.frames, self.lift = self._eliminate()
+        #: Columns of P that are in use ``(n_owned, gdim)``.
+        self.used: Bools = free.copy()
+        self.used[self.nodes] = (self.frames != 0).any(axis=1)
+        closure = np.array(prescribed)
+        known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
+        np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
+        self.d = self._vector(closure)
+        self.M: Any = self._coupling() if self._n_rows else None
+        #: Number of terms with M in the series of P and c.
+        self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
+
+    def _vector(self, values: Array) -> PETSc.Vec:
+        v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.config.gdim, comm=self.comm)
+        v.array[:] = values.ravel()
+        return v
+
+    # -- elimination in each node's frame ------------------------------------------------------------------------------
+
+    def _eliminate(self) -> tuple[Array, Array]:
+        """Blocks of T at ``nodes (k, g, g)``, and how each equation acts on its node ``(m, g)``."""
+        g, eq = self.config.gdim, self.equations
+        frames = self.free[self.nodes, None, :] * np.eye(g)
+        lift = np.zeros_like(eq.direction)
+        which = np.flatnonzero(eq.active)
+        order = which[np.argsort(eq.node[which], kind="stable")]
+        nodes, first, counts = np.unique(eq.node[order], return_index=True, return_counts=True)
+        error = None
+        for k in np.unique(counts):
+            at = nodes[counts == k]
+            rows = order[first[counts == k][:, None] + np.arange(k)]
+            A = eq.direction[rows] * self.free[at, None, :]
+            if k > g or (np.linalg.svd(A, compute_uv=False)[:, -1] < MOSTLY_PRESCRIBED).any():
+                error = error or self._conflict(at, A)
+                continue
+            pinv = np.linalg.pinv(A)
+            lift[rows] = pinv.transpose(0, 2, 1)
+            frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
+        agree(self.comm, error)
+        return frames, lift
+
+    def _conflict(self, nodes: npt.NDArray[np.int32], A: Array) -> ConflictError:
+        bad = 0 if A.shape[1] > A.shape[2] else int(np.argmin(np.linalg.svd(A, compute_uv=False)[:, -1]))
+        fixed = [c for c, f in zip("xyz", self.free[nodes[bad]]) if not f]
+        return ConflictError(
+            f"the contactor at {self.config.describe(int(nodes[bad]))} has {A.shape[1]} uniting equation(s) but its displacement "
+            f"in {', '.join(fixed) or 'no direction'} is prescribed, so nothing is left to eliminate: release the Dirichlet "
+            "condition there, or make the other surface the contactor"
+        )
+
+    def _coupling(self) -> PETSc.Mat:
+        """M: rows of the eliminated nodes, columns of the nodes they follow."""
+        return self._matrix(*self._coupling_entries)
+
+    def _matrix(self, rows: Ints, columns: Ints, values: Array) -> PETSc.Mat:
+        """Matrix from sorted local rows, global columns and values."""
+        n = self.config.gdim * self.config.n_owned
+        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(PETSc.IntType)
+        return PETSc.Mat().createAIJ(
+            self._sizes, bsize=self.config.gdim, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
+        )
+
+    @cached_property
+    def _coupling_entries(self) -> tuple[Ints, Ints, Array]:
+        """Local rows, global columns and values of M, zeros stored so that the sparsity does not depend on directions."""
+        g, eq = self.config.gdim, self.equations
+        values = self.lift[eq.row][:, :, None] * eq.coefficients[:, None, :]
+        rows = np.broadcast_to((eq.node[eq.row, None] * g + np.arange(g))[:, :, None], values.shape)
+        columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
+        return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
+
+    @property
+    def _eliminated(self) -> PETSc.Mat:
+        """Projector of a displacement onto what the equations eliminate of it."""
+        g, eq = self.config.gdim, self.equations
+        blocks = self.lift[:, :, None] * eq.direction[:, None, :]
+        rows = np.broadcast_to((eq.node[:, None] * g + np.arange(g))[:, :, None], blocks.shape)
+        columns = self._first + rows.transpose(0, 2, 1)
+        return self._matrix(*_sum_duplicates(rows.ravel().astype(np.int64), columns.ravel().astype(np.int64), blocks.ravel()))
+
+    def _longest_chain(self) -> int:
+        """How many equations follow one another from node to node.
+
+        Raises:
+            ConflictError: if they never end.
+        """
+        assert self.M is not None
+        path = self.M.matMult(self._eliminated)
+        indptr, columns, values = path.getValuesCSR()
+        # an equation may follow what is left free of an eliminated node
+        path.setValuesCSR(indptr, columns, (np.abs(values) > ROUNDING).astype(float))
+        path.assemble()
+        at = self._vector(np.ones((self.config.n_owned, self.config.gdim)))
+        for length in range(1, LONGEST_CHAIN + 1):
+            at = path * at
+            if at.norm(PETSc.NormType.INFINITY) == 0.0:
+                return length
+            # only whether a path exists matters
+            at.array[:] = at.array_r > 0
+        rows = np.flatnonzero(at.array_r)
+        error = None
+        if len(rows):
+            error = ConflictError(
+                f"the contactor at {self.config.describe(int(rows[0]) // self.config.gdim)} follows itself through its targets: "
+                "two surfaces are contactor and target of each other; drop one of the two contacts"
+            )
+        agree(self.comm, error)
+        return LONGEST_CHAIN
+
+    # -- P as a matrix -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    @timed("restriction matrix P")
+    def P(self) -> PETSc.Mat:
+        """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
+        if self.chain == 0 or not self.stacked:
+            P = self._rows_of_P()
+            # a followed component that is prescribed is no unknown
+            P.diagonalScale(None, self._vector(self.used.astype(float)))
+            return P
+        T = X = self._rows_of_P(coupled=False)
+        P = T.copy()
+        for _ in range(self.chain):
+            X = self.M.matMult(X)
+            P.axpy(1.0, X, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        return P
+
+    def _rows_of_P(self, coupled: bool = True) -> PETSc.Mat:
+        """T, with the entries of M in the rows of the eliminated nodes if coupled."""
+        g, n = self.config.gdim, self.config.n_owned
+        k = np.arange(g)
+        block = np.broadcast_to((self.nodes[:, None] * g + k)[:, :, None], self.frames.shape).ravel().astype(np.int64)
+        parts = [(block, self._first + block.reshape(-1, g, g).transpose(0, 2, 1).ravel(), self.frames.ravel())]
+        if coupled and self._n_rows:
+            parts.append(self._coupling_entries)
+        rows, columns, values = _sum_duplicates(*(np.concatenate(p) for p in zip(*parts)))
+        plain = np.ones((n, g), dtype=bool)
+        plain[self.nodes] = False
+        counts = np.where(plain.ravel(), 1, np.bincount(rows, minlength=n * g))
+        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
+        all_columns = np.empty(indptr[-1], dtype=PETSc.IntType)
+        all_values = np.empty(indptr[-1])
+        alone = np.flatnonzero(plain.ravel())
+        all_columns[indptr[alone]], all_values[indptr[alone]] = self._first + alone, self.free.ravel()[alone]
+        united = np.repeat(~plain.ravel(), counts)
+        all_columns[united], all_values[united] = columns, values
+        return PETSc.Mat().createAIJ(self._sizes, bsize=g, csr=(indptr, all_columns, all_values), comm=self.comm)
+
+    def cross_out(self, A: PETSc.Mat) -> None:
+        """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""
+        used = self._vector(self.used.astype(float))
+        A.diagonalScale(used, used)
+
+    # -- P as a map ----------------------------------------------------------------------------------------------------
+
+    @property
+    def c(self) -> PETSc.Vec:
+        """Increment that closes the gaps and carries the prescribed displacements."""
+        return self._series(self.d)
+
+    def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """``P dq``, without c."""
+        q = dq.array_r.reshape(-1, self.config.gdim)
+        du = q * self.free
+        du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
+        return self._series(self._vector(du))
+
+    def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
+        """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F``."""
+        y, part = F.copy(), F
+        for _ in range(self.chain):
+            moved = y.duplicate()
+            self.M.multTranspose(part, moved)
+            part = moved
+            y.axpy(1.0, part)
+        return y
+
+    def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
+        """``T' y``; with y from ``pass_on`` this is ``P'F``."""
+        full = y.array_r.reshape(-1, self.config.gdim)
+        q = full * self.free
+        q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
+        return self._vector(q)
+
+    def multipliers(self, y: PETSc.Vec) -> Array:
+        """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed."""
+        nodal = y.array_r.reshape(-1, self.config.gdim)
+        return np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
+
+    def _series(self, v: PETSc.Vec) -> PETSc.Vec:
+        """``(1 + M + M^2 + ...) v``."""
+        total, part = v.copy(), v
+        for _ in range(self.chain):
+            part = self.M * part
+            total.axpy(1.0, part)
+        return total
+
+    def fingerprint(self, *, values: bool) -> int:
+        """Hash of this rank's part of P: of its sparsity, or of its values too, but for rounding."""
+        eq = self.equations
+        parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), bytes([self.chain])]
+        if values:
+            # feet that have moved by rounding make no new P
+            rounded = (np.rint(v / ROUNDING).astype(np.int64) for v in (eq.direction, eq.coefficients))
+            parts += [*(v.tobytes() for v in rounded), eq.active.tobytes()]
+        return zlib.crc32(b"".join(parts))
+
+
+def _frames(A: Array, pinv: Array, free: Bools) -> Array:
+    """Blocks of T: an orthonormal frame of what the equations leave free; eliminated and prescribed columns are zero.
+
+    A single direction is reflected onto the nearest axis (Householder), so that the frame stays close to the axes and the
+    two tangential unknowns keep the places of the components they resemble.
+
+    Args:
+        A: directions in the free components ``(k, r, g)``.
+        pinv: their pseudo-inverses ``(k, g, r)``.
+        free: free components ``(k, g)``.
+    """
+    k, r, g = A.shape
+    eye = np.eye(g)
+    n_free = free.sum(axis=1)
+    left = n_free - r
+    blocks = np.zeros((k, g, g))
+    axis = np.zeros((k, g))
+    if r == 1:
+        single = left > 0
+        axis[single] = A[single, 0] / np.linalg.norm(A[single, 0], axis=1, keepdims=True)
+    else:
+        # the one direction left, from the projector onto the null space
+        single = left == 1
+        null = free[single, None, :] * eye - pinv[single] @ A[single]
+        column = np.argmax(np.einsum("kgg->kg", null), axis=1)
+        t = null[np.arange(len(column)), :, column]
+        axis[single] = t / np.linalg.norm(t, axis=1, keepdims=True)
+    H, main = _reflection(axis[single])
+    keep = free[single].copy()
+    if r == 1:
+        keep[np.arange(len(main)), main] = False
+    else:
+        keep = np.arange(g)[None, :] == main[:, None]
+    blocks[single] = H * keep[:, None, :]
+    return blocks
+
+
+def _reflection(axis: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Householder matrices that map the nearest coordinate axis onto ``axis (k, g)`` up to sign, and which it is."""
+    main = np.argmax(np.abs(axis), axis=1)
+    rows = np.arange(len(axis))
+    v = axis.copy()
+    v[rows, main] += np.where(axis[rows, main] >= 0, 1.0, -1.0)
+    vv = np.einsum("kg,kg->k", v, v)[:, None, None]
+    return np.eye(axis.shape[1]) - 2.0 * v[:, :, None] * v[:, None, :] / vv, main
+
+
+def _sum_duplicates(rows: Ints, columns: Ints, values: Array) -> tuple[Ints, Ints, Array]:
+    """Coordinate triplets sorted by row and column, equal places added."""
+    order = np.lexsort((columns, rows))
+    rows, columns, values = rows[order], columns[order], values[order]
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
+    return rows[new], columns[new], np.add.reduceat(values, np.flatnonzero(new)) if len(rows) else values

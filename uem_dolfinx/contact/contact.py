@@ -1,0 +1,272 @@
+"""Contact: what the user declares about two surfaces, and what can be read from it after a step.
+
+It turns tags into a contact pair before the first step and a pair's state into fields and resultants after every one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.gmsh import Tag
+from uem_dolfinx.geometry.projection import FacetProjection, Target
+from uem_dolfinx.geometry.rigid import RigidSurface, finite_point
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.surfaces import check_distinct, check_tag, surface_nodes, tributary_areas
+
+if TYPE_CHECKING:
+    from uem_dolfinx.solve.system import BodySystem
+
+Array = npt.NDArray[np.float64]
+
+#: Default bound on the initial penetration, as part of the model's size.
+MAX_PENETRATION = 0.05
+
+
+@dataclass(frozen=True)
+class Resultant:
+    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D."""
+
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Relative imbalance of the forces and of the moments of a pair."""
+
+    force: float
+    moment: float
+
+
+def _moments(x: Array, f: Array) -> Array:
+    """Moments about the origin of forces ``f (n, gdim)`` at ``x``, ``(n, 1)`` in 2D and ``(n, 3)`` in 3D."""
+    if x.shape[1] == 2:
+        return (x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0])[:, None]
+    return np.cross(x, f)
+
+
+class Contact:
+    """A contactor surface that may touch a target.
+
+    Args:
+        contactor: facets whose nodes are the contactors, or points, which have forces but no pressures.
+        target: facets of the other body, or a rigid surface.
+        sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
+        normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
+        max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
+        thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
+            than this lies behind the body, not in it. None takes the body to have no back.
+        chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
+            the true facet, so that the answer is the same, after more iterations.
+        name: for messages and files; None takes the names of the tags.
+
+    Raises:
+        ValueError: for an unknown word, or a thickness that is not positive.
+    """
+
+    def __init__(
+        self,
+        contactor: Tag,
+        target: Tag | Target,
+        *,
+        sliding: str = "finite",
+        normals: str = "facet",
+        max_penetration: float | None = None,
+        thickness: float | None = None,
+        chords: bool = False,
+        name: str | None = None,
+    ):
+        for value, known in ((sliding, ("finite", "small", "fixed")), (normals, ("facet", "averaged"))):
+            if value not in known:
+                raise ValueError(f"'{value}' is not known here: expected one of {', '.join(known)}")
+        if thickness is not None and not thickness > 0.0:
+            raise ValueError(f"thickness = {thickness}: expected a positive length, or None")
+        self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
+        self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
+        target_name = getattr(target, "name", type(target).__name__)
+        self.name = name or f"{contactor.name} on {target_name}"
+        self._pair: ContactPair | None = None
+        self._fields: dict[str, fem.Function] = {}
+
+    def attach(self, system: BodySystem) -> ContactPair:
+        """Build the pair of this contact in a problem (collective).
+
+        Raises:
+            TagError: if a tag is empty or of the wrong dimension.
+            SpaceError: if a tag belongs to another mesh.
+            SurfaceError: if contactor and target share nodes.
+            OrientationError: if a target facet lies inside a body.
+        """
+        config = self.config = system.config
+        check_tag(config, self.contactor, "contactor")
+        nodes = surface_nodes(config, self.contactor)
+        target: Target
+        if isinstance(self.target, Tag):
+            check_tag(config, self.target, "target")
+            facets = TargetFacets(config, self.target)
+            check_distinct(config, nodes, facets, (str(self.contactor.name), str(self.target.name)))
+            target = MeshTarget(facets, averaged=self.normals == "averaged")
+        else:
+            target = self.target
+        self._pair = ContactPair(
+            config,
+            nodes,
+            target,
+            free=system.free[: config.n_owned],
+            name=self.name,
+            sliding=self.sliding,
+            max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
+            thickness=np.inf if self.thickness is None else self.thickness,
+            chords=self.chords and config.degree == 2,
+        )
+        self._system = system
+        return self._pair
+
+    @property
+    def pair(self) -> ContactPair:
+        """The pair behind this contact."""
+        if self._pair is None:
+            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+        return self._pair
+
+    # -- results -------------------------------------------------------------------------------------------------------
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks (collective)."""
+        return self.pair.n_active
+
+    @property
+    def initial_overlap(self) -> float:
+        """How deep contactors were inside the target before the first step, a length; 0 if none was."""
+        return self.pair.initial_overlap
+
+    def max_gap(self) -> float:
+        """Largest gap of an active contactor, a length (collective)."""
+        return self.pair.largest_gap()
+
+    @cached_property
+    def _areas(self) -> Array:
+        """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (collective)."""
+        return tributary_areas(self.config, self.contactor)[self.pair.nodes]
+
+    @property
+    def pressures(self) -> Array:
+        """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)`` (collective)."""
+        areas = self._areas if self.pair.control is None else self.pair.control.areas(self._areas)
+        return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
+
+    def max_pressure(self) -> float:
+        """Largest contact pressure, a force per area (collective)."""
+        return float(max(self.config.comm.allgather(self.pressures.max(initial=0.0))))
+
+    @property
+    def pressure(self) -> fem.Function:
+        """Contact pressure as a scalar field, zero off the contactor (collective)."""
+        return self._field("pressure", self.pressures)
+
+    @property
+    def gap(self) -> fem.Function:
+        """Gap as a scalar field, a length; zero off the contactor (collective)."""
+        return self._field("gap", self.pair.projection.gap)
+
+    @property
+    def active(self) -> fem.Function:
+        """1 at active contactors, 0 elsewhere (collective)."""
+        return self._field("active", self.pair.trial.active)
+
+    @property
+    def force(self) -> fem.Function:
+        """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
+        if "force" not in self._fields:
+            self._fields["force"] = fem.Function(self.config.V, name=_identifier(f"contact_force_{self.name}"))
+        f, g, pair = self._fields["force"], self.config.gdim, self.pair
+        f.x.array[:] = 0.0
+        total = compat.petsc_vector(f)
+        p, i = pair.projection, np.flatnonzero((pair.trial.force != 0).any(axis=1))
+        nodes = np.concatenate([self.config.to_global(pair.nodes[i])[:, None], p.nodes[i]], axis=1)
+        share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
+        rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        total.setValues(rows, (share[..., None] * pair.trial.force[i, None, :]).ravel(), addv=PETSc.InsertMode.ADD)
+        total.assemble()
+        f.x.scatter_forward()
+        return f
+
+    def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
+        """Force and moment that the contact exerts on one of the bodies (collective).
+
+        Args:
+            about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
+                the surface's reference point where it is now: a tool's moment is about the point it turns about.
+            on: ``"contactor"``, or ``"target"``: a meshed one receives its forces at the feet of the contactors, a rigid one,
+                which has no nodes, where the contactors are.
+
+        Raises:
+            ValueError: for an unknown body, or a point that is not finite.
+        """
+        if on not in ("contactor", "target"):
+            raise ValueError(f"'{on}' is not known here: expected one of contactor, target")
+        target, p, g = self.pair.target, self.pair.projection, self.config.gdim
+        centre = np.zeros(g) if about is None else finite_point(about, "about", g)
+        x, f = self.pair.points, self.pair.trial.force
+        if on == "target":
+            f = -f
+            if isinstance(p, FacetProjection):
+                x = p.foot
+            if about is None and isinstance(target, RigidSurface):
+                centre = target.reference(g)
+        parts = self.config.comm.allgather((f.sum(axis=0), _moments(x - centre, f).sum(axis=0)))
+        return Resultant(np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0))
+
+    def balance(self) -> Balance | None:
+        """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
+
+        The contactors' forces come from the residual, the target's from handing them on to its nodes.
+
+        Returns:
+            Imbalances relative to the sums of absolute nodal forces and moments; None for a rigid target, which has no nodes.
+        """
+        if self.pair.target.n_nodes == 0:
+            return None
+        n, g = self.config.n_owned, self.config.gdim
+        f = self.force.x.array.reshape(-1, g)[:n]
+        x = self.config.x[:n]
+        m = _moments(x, f)
+        sums = [
+            f.sum(axis=0),
+            m.sum(axis=0),
+            np.linalg.norm(f, axis=1).sum(),
+            (np.linalg.norm(f, axis=1) * np.linalg.norm(x, axis=1)).sum(),
+        ]
+        force, moment, all_f, all_m = (sum(part) for part in zip(*self.config.comm.allgather(sums)))
+        return Balance(
+            float(np.linalg.norm(force) / all_f) if all_f > 0 else 0.0,
+            float(np.linalg.norm(moment) / all_m) if all_m > 0 else 0.0,
+        )
+
+    def _field(self, what: str, values: npt.ArrayLike) -> fem.Function:
+        if what not in self._fields:
+            S = compat.function_space(self.config.mesh, self.config.degree)
+            self._fields[what] = fem.Function(S, name=_identifier(f"contact_{what}_{self.name}"))
+        f = self._fields[what]
+        f.x.array[:] = 0.0
+        f.x.array[self.pair.nodes] = values
+        f.x.scatter_forward()
+        return f
+
+
+def _identifier(text: str) -> str:
+    """Name of a Function that the form compiler can use in code."""
+    return re.sub(r"\W+", "_", text)

@@ -1,0 +1,226 @@
+"""Contactors in the concave corners of a faceted target: held by two facets on an edge, by three in a vertex.
+
+A part of the fourth step on the data's way. Facet normals jump from facet to facet; where two facets form a valley, a contactor
+drawn to it belongs to both, and would flip between them for ever if it had to choose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.geometry.projection import gap_hessians
+from uem_dolfinx.geometry.shapes import closest_point
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from uem_dolfinx.geometry.search import MeshTarget
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: Facets whose slopes differ by less are one plane.
+ON_PLANE = 1e-9
+#: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
+STEEP = 0.05
+#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+IN_PLANE = 4
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where contactors stand relative to the edge or vertex that several facets share.
+
+    Attributes:
+        which: their places among the pair's contactors ``(k,)``.
+        count: number of facets, 2 to gdim ``(k,)``.
+        meets: whether the facets share a place to be held at ``(k,)``.
+        loose: whether that is a vertex of two facets in space, whose planes meet in a line through it ``(k,)``.
+        rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
+        normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
+        axes: orthonormal; the first ``count`` span the normals, the very first is their mean ``(k, gdim, gdim)``.
+        nodes: global nodes of the first facet ``(k, nn)``.
+        weights: shape functions at the closest point of the shared place ``(k, nn)``.
+        foot: that point ``(k, gdim)``.
+        x: positions of the nodes ``(k, nn, gdim)``.
+        dN: derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``.
+        ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
+    """
+
+    which: Ints
+    count: Ints
+    meets: Bools
+    loose: Bools
+    rising: Array
+    normals: Array
+    axes: Array
+    nodes: Ints
+    weights: Array
+    foot: Array
+    x: Array
+    dN: Array
+    ddN: Array
+
+    @property
+    def concave(self) -> Bools:
+        """Corners that can hold a contactor ``(k,)``."""
+        return self.meets & (self.rising > np.where(self.loose, STEEP, ON_PLANE))
+
+    @property
+    def flat(self) -> Bools:
+        """Facets that lie in one plane, between which nothing changes ``(k,)``."""
+        return np.abs(self.rising) <= ON_PLANE
+
+    def gaps(self, points: Array) -> Array:
+        """Distances of ``points (k, gdim)`` from the shared place along the axes ``(k, gdim)``."""
+        return np.einsum("krg,kg->kr", self.axes, points - self.foot)
+
+    def pulls(self, force: Array) -> Array:
+        """What each facet contributes to the contact forces, along its own outward normal.
+
+        Args:
+            force: on the contactors ``(k, gdim)``.
+
+        Returns:
+            Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or, where they span less than the
+            space, to the part of it in their span; of those possible the least in norm. A facet whose coefficient is negative pulls.
+            They are infinite beyond ``count``, where there is no facet.
+        """
+        shares = np.einsum("kgr,kg->kr", np.linalg.pinv(self.normals.transpose(0, 2, 1)).transpose(0, 2, 1), force)
+        shares[np.arange(shares.shape[1])[None, :] >= self.count[:, None]] = np.inf
+        return shares
+
+    def hessians(self, force: Array) -> Array:
+        """Second derivatives of the gaps times their forces: it is the direction of the force that stays on an edge."""
+        size = np.linalg.norm(force, axis=1)
+        n = force / np.where(size > 0, size, 1.0)[:, None]
+        on_edge = (self.dN != 0).any(axis=(1, 2))
+        k, nn, d = self.dN.shape
+        H = np.zeros((k, (1 + nn) * n.shape[1], (1 + nn) * n.shape[1]))
+        if d:
+            i = np.flatnonzero(on_edge)
+            H[i] = gap_hessians(
+                n[i], np.zeros(len(i)), self.weights[i], self.dN[i], self.ddN[i], self.x[i], np.zeros((len(i), d, n.shape[1]))
+            )
+        return size[:, None, None] * H
+
+
+def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints, facets: Ints) -> Corners | None:
+    """Corners that sets of facets form with each other; None if no rank asks for any (collective).
+
+    Args:
+        comm: communicator.
+        target: whose facets they are.
+        points: positions of the contactors ``(k, gdim)``.
+        which: their places among the pair's contactors ``(k,)``.
+        facets: at least two for each, the rest -1 ``(k, gdim)``.
+    """
+    if not comm.allreduce(len(which)):
+        return None
+    k, gdim = facets.shape
+    first = target.project_on(points, facets[:, 0])
+    normals = np.zeros((k, gdim, gdim))
+    normals[:, 0] = target.outward(first)
+    common = np.ones(first.nodes.shape, dtype=bool)
+    middle = first.x.mean(axis=1)
+    for j in range(1, gdim):
+        i = np.flatnonzero(facets[:, j] >= 0)
+        other = target.project_on(points[i], facets[i, j])
+        normals[i, j] = target.outward(other)
+        common[i] &= (first.nodes[i][:, :, None] == other.nodes[:, None, :]).any(axis=2)
+        middle[i] = other.x.mean(axis=1)
+    count = (facets >= 0).sum(axis=1)
+    place = _shared_place(target, first.x, points, common, count, normals)
+    arm = middle - place.foot
+    arm /= np.linalg.norm(arm, axis=1, keepdims=True)
+    earlier = np.arange(gdim)[None, :] < count[:, None] - 1
+    rising = np.where(earlier, np.einsum("kg,kjg->kj", arm, normals), np.inf).min(axis=1)
+    return Corners(
+        which, count, place.found, place.loose, rising, normals, _axes(normals, count), first.nodes, place.weights, place.foot, first.x,
+        place.dN, place.ddN,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Place:
+    found: Bools
+    loose: Bools
+    weights: Array
+    foot: Array
+    dN: Array
+    ddN: Array
+
+
+def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, count: Ints, normals: Array) -> _Place:
+    """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three.
+
+    Two facets that share only a vertex stand for others beside them; their planes meet in a line.
+    """
+    k, nn = common.shape
+    shape = target.shape
+    d = shape.dim - 1
+    found, loose, weights = np.zeros(k, bool), np.zeros(k, bool), np.zeros((k, nn))
+    dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
+    for side, nodes, _, _ in shape.edges():
+        i = np.flatnonzero((count == 2) & common[:, nodes].all(axis=1) & ~found)
+        s, _ = closest_point(side, x[i][:, nodes], points[i])
+        tab = side.tabulate(s)
+        weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
+        found[i] = True
+    for node in range(len(shape.topology[0])):
+        i = np.flatnonzero(common[:, node] & ~found)
+        weights[i, node] = 1.0
+        found[i] = True
+        if d:
+            i = i[count[i] == 2]
+            loose[i] = True
+            weights[i], dN[i, :, 0] = _on_line(target, x[i], points[i], node, normals[i])
+    foot = np.einsum("ka,kag->kg", weights, x)
+    return _Place(found, loose, weights, foot, dN, ddN)
+
+
+def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Array) -> tuple[Array, Array]:
+    """Closest points on the line through a vertex in which the planes of two facets meet.
+
+    Returns:
+        Shape functions of the first facet, continued as far as need be, and their derivatives along the line ``(k, nn)``.
+    """
+    along = np.cross(normals[:, 0], normals[:, 1])
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along /= np.where(length > 0, length, 1.0)
+    vertex = x[:, node]
+    foot = vertex + np.einsum("kg,kg->k", along, points - vertex)[:, None] * along
+    xi = np.tile(target.shape.nodes[node], (len(x), 1))
+    for _ in range(IN_PLANE):
+        tab = target.shape.tabulate(xi)
+        t = np.einsum("kaf,kag->kfg", tab.dN, x)
+        m = np.einsum("kfg,keg->kfe", t, t)
+        xi = xi + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, foot - np.einsum("ka,kag->kg", tab.N, x))[..., None])[..., 0]
+    tab = target.shape.tabulate(xi)
+    t = np.einsum("kaf,kag->kfg", tab.dN, x)
+    m = np.einsum("kfg,keg->kfe", t, t)
+    rate = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, along)[..., None])[..., 0]
+    return tab.N, np.einsum("kaf,kf->ka", tab.dN, rate)
+
+
+def _axes(normals: Array, count: Ints) -> Array:
+    """Orthonormal axes of the space that the normals span, their mean first ``(k, gdim, gdim)``."""
+    k, gdim, _ = normals.shape
+    spread = normals[:, 0] - normals[:, 1]
+    # two normals span a plane; whatever completes the axes is right for three
+    basis = np.concatenate([normals.sum(axis=1)[:, None], spread[:, None], np.tile(np.eye(gdim), (k, 1, 1))], axis=1)
+    axes = np.zeros((k, gdim, gdim))
+    for r in range(gdim):
+        rest = basis - np.einsum("kbg,krg,krh->kbh", basis, axes, axes)
+        length = np.linalg.norm(rest, axis=2)
+        # in this order, but never a direction that is spent
+        best = np.argmax(length > (1e-12 if r < 2 else 0.5), axis=1)
+        v = rest[np.arange(k), best]
+        v -= np.einsum("kg,krg,krh->kh", v, axes, axes)
+        axes[:, r] = v / np.linalg.norm(v, axis=1, keepdims=True)
+    return axes

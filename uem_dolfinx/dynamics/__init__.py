@@ -1,0 +1,1 @@
+"""Mass, inertia and time integration."""

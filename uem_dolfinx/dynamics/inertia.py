@@ -1,0 +1,315 @@
+"""Inertia: velocities, accelerations and the forces they make, by Newmark's rule or the generalised-alpha method.
+
+It turns a static residual into a dynamic one: the solver adds its forces to the residual and its multiple of M to K.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.dynamics.scheme import Scheme, newmark
+from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import ufl
+    from ufl.core.expr import Expr
+
+    from uem_dolfinx.algebra.restriction import Restriction
+    from uem_dolfinx.dynamics.mass import Mass
+    from uem_dolfinx.geometry.configuration import Configuration
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+class Dynamics:
+    """What a problem needs to move in time; hand it to ``UnitedProblem`` and step by ``time_steps``.
+
+    Args:
+        mass: of all bodies; bodies without mass are allowed where others or supports hold them.
+        scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``.
+        velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
+        gravity: acceleration of free fall ``(gdim,)``; every node weighs what its mass does, so that free fall strains nothing.
+        damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual.
+        contactors: ``"massless"`` hands the contactors' mass on to the nodes around, so that impact itself loses no energy
+            [UEM, 5]; ``"massy"`` leaves it.
+        time: at the start.
+
+    Attributes:
+        velocity: a Function; at components without mass it is the mean over the last step.
+        acceleration: a Function; zero at components without mass.
+        time: of the committed state.
+        start: time at the start.
+        number: of steps done.
+        longest: bound on the length of the next step, after steps that had to be cut.
+    """
+
+    velocity: fem.Function
+    acceleration: fem.Function
+
+    def __init__(
+        self,
+        mass: Mass,
+        *,
+        scheme: Scheme | None = None,
+        velocity: fem.Function | npt.ArrayLike | None = None,
+        gravity: npt.ArrayLike | None = None,
+        damping: Callable[[Expr], ufl.Form] | None = None,
+        contactors: str = "massless",
+        time: float = 0.0,
+    ):
+        if contactors not in ("massless", "massy"):
+            raise ValueError(f"contactors = '{contactors}': expected 'massless' or 'massy'")
+        if not np.isfinite(time):
+            raise ValueError(f"time = {time}: expected a number")
+        self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
+        self.time = self.start = self._until = float(time)
+        self.start_velocity, self.gravity = velocity, gravity
+        self.number, self.longest = 0, np.inf
+        #: Largest kinetic energy that a step has been judged by.
+        self.largest = 0.0
+        #: How often a checkpoint has been read into them.
+        self.resumed = 0
+        self._attached = False
+        #: Factor of M in the tangent.
+        self.factor = 0.0
+        #: Whether the acceleration fits the forces yet.
+        self.accelerated = False
+
+    # -- set-up ------------------------------------------------------------------------------------------------------
+
+    def attach(self, config: Configuration) -> ufl.Form | None:
+        """Take in the problem's displacement; returns the damping form (collective).
+
+        Raises:
+            SpaceError: if mass or velocity belong to another space, or these dynamics to another problem.
+            NotFiniteError: if the velocity or gravity is not finite.
+            ValueError: if they have the wrong shape.
+        """
+        if self._attached:
+            raise SpaceError("these dynamics belong to another problem: make new ones for every problem")
+        self._attached = True
+        self.config, g = config, config.gdim
+        self._n = g * config.n_owned
+        wanted = self._n, g * config.index_map.size_global
+        error = None
+        if tuple(self.mass.M.getSizes()[0]) != wanted:
+            error = SpaceError(
+                f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
+                "function space of the displacement"
+            )
+        # on other ranks the parts may be equally large by chance
+        agree(config.comm, error)
+        self.velocity = fem.Function(config.V, name="velocity")
+        self.acceleration = fem.Function(config.V, name="acceleration")
+        self._set_velocity()
+        down = np.zeros(g) if self.gravity is None else np.asarray(self.gravity, dtype=float)
+        if down.shape != (g,) or not np.isfinite(down).all():
+            raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
+        self._down = down
+        self._u = np.array(config.u.x.array)
+        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+        #: Inertia forces of the committed state, which balance all others.
+        self.forces = fem.Function(config.V)
+        self._moving = False
+        #: Virtual work of the damping forces.
+        self.damping_form: ufl.Form | None = None
+        if self.damping is not None:
+            self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
+            self._past.x.array[:] = self.velocity.x.array
+            self.damping_form = self.damping(self._rate * config.u + self._past)
+        return self.damping_form
+
+    def _set_velocity(self) -> None:
+        v, g = self.start_velocity, self.config.gdim
+        if isinstance(v, fem.Function):
+            error = None
+            if v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array):
+                error = SpaceError("the velocity belongs to another space: make it with the function space of the displacement")
+            agree(self.config.comm, error)
+            self.velocity.x.array[:] = v.x.array
+        elif v is not None:
+            if np.shape(v) != (g,):
+                raise ValueError(f"velocity = {v!r}: expected a Function of the displacement's space or {g} numbers")
+            self.velocity.x.array.reshape(-1, g)[:] = v
+        if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
+            raise NotFiniteError("the velocity at the start holds NaN or infinity")
+
+    def weigh(self, contactors: npt.NDArray[np.int32]) -> None:
+        """Take the mass of the contactors, this rank's nodes ``(n,)``, or warn that they keep it (collective).
+
+        Raises:
+            MassError: if the nodes around cannot carry it.
+        """
+        massy = int(self.config.comm.allreduce(int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
+        if massy and self.contactors == "massless":
+            self.mass = self.mass.without(contactors)
+        elif massy:
+            logger.warning(
+                "%d contactors have mass: impact will set them in vibration, and the trapezoidal rule then adds energy at every touch; "
+                "contactors='massless' avoids both",
+                massy,
+            )
+        #: Components that have mass, of the owned nodes ``(n_owned, gdim)``.
+        self.massy: Bools = self.mass.of_nodes > 0
+        self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
+
+    def _like(self, values: Array) -> PETSc.Vec:
+        vector = self.mass.M.createVecRight()
+        vector.array[:] = np.ravel(values)
+        return vector
+
+    # -- what the residual and the tangent get -----------------------------------------------------------------------
+
+    def begin(self, dt: float) -> None:
+        """Begin a step of length ``dt`` from the committed state."""
+        s = self.scheme
+        u, v, a = self._u, self._velocity, self._acceleration
+        self._until, self._moving = self.time + dt, True
+        # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
+        self._a_rate = 1.0 / (s.beta * dt**2)
+        self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
+        self._v_rate = s.gamma * dt * self._a_rate
+        self._v_past = v + dt * ((1.0 - s.gamma) * a + s.gamma * self._a_past)
+        self.factor = (1.0 - s.alpha_m) / (1.0 - s.alpha_f) * self._a_rate
+        if self.damping is not None:
+            self._rate.value = self._v_rate
+            self._past.x.array[:] = self._v_past - self._v_rate * u
+
+    def restore(self) -> None:
+        """Leave a step that has begun; the forces are those of the committed state again."""
+        self._until, self._moving = self.time, False
+
+    @timed("inertia forces")
+    def load(self) -> PETSc.Vec:
+        """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
+        load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
+        load.axpy(-1.0, self._weight)
+        return load
+
+    @property
+    def _increment(self) -> Array:
+        """How far the step has come ``(n_local incl. ghosts,)``."""
+        return np.asarray(self.config.u.x.array - self._u)
+
+    def _inertia(self) -> PETSc.Vec:
+        """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
+        s, n = self.scheme, self._n
+        a = (1.0 - s.alpha_m) * (self._a_rate * self._increment + self._a_past) + s.alpha_m * self._acceleration
+        inertia = self.mass.M * self._like(a[:n])
+        if s.alpha_f:
+            inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
+        inertia.scale(1.0 / (1.0 - s.alpha_f))
+        return inertia
+
+    # -- state -------------------------------------------------------------------------------------------------------
+
+    def accelerate(self, restriction: Restriction, F: PETSc.Vec) -> None:
+        """Acceleration at the start, of united bodies under the forces ``-F``: ``P'MP a = -P'F`` (collective).
+
+        Args:
+            restriction: of the contactors that touch at the start; c is not used.
+            F: static residual minus weight.
+
+        Raises:
+            NotFiniteError: if the forces are not finite.
+            LinearSolveError: if the masses are negative.
+        """
+        if not np.isfinite(F.norm()):
+            raise NotFiniteError(
+                f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
+            )
+        if restriction.M is None:
+            M = self.mass.M.copy()
+            restriction.cross_out(M)
+        else:
+            M = self.mass.M.PtAP(restriction.P)
+        rhs = restriction.reduce(restriction.pass_on(F))
+        diagonal = M.getDiagonal()
+        idle = diagonal.array_r <= 1e-12 * diagonal.max()[1]
+        diagonal.array[idle] = 1.0
+        M.setDiagonal(diagonal)
+        rhs.array[idle] = 0.0
+        ksp = PETSc.KSP().create(self.config.comm)
+        ksp.setType("cg")
+        ksp.getPC().setType("jacobi")
+        ksp.setTolerances(rtol=1e-13, max_it=10_000)
+        ksp.setOperators(M)
+        q = rhs.duplicate()
+        with timed("first acceleration"):
+            ksp.solve(-rhs, q)
+        if ksp.getConvergedReason() < 0:
+            raise LinearSolveError(
+                f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
+            )
+        a = restriction.expand(q)
+        self.acceleration.x.array[: self._n] = a.array_r * self.massy.ravel()
+        self.acceleration.x.scatter_forward()
+        self._acceleration = np.array(self.acceleration.x.array)
+        inertia = self.mass.M * self._like(self._acceleration[: self._n])
+        self.forces.x.array[: self._n] = inertia.array_r
+        self.forces.x.scatter_forward()
+        self.accelerated = True
+
+    def commit(self) -> None:
+        """Keep velocity and acceleration that belong to the present displacement."""
+        if self._moving:
+            n, dt = self._n, self._until - self.time
+            du, massy = self._increment[:n], self.massy.ravel()
+            self.forces.x.array[:n] = self._inertia().array_r
+            self.acceleration.x.array[:n] = np.where(massy, self._a_rate * du + self._a_past[:n], 0.0)
+            # what has no mass has no velocity of its own
+            self.velocity.x.array[:n] = np.where(massy, self._v_rate * du + self._v_past[:n], du / dt)
+            for field in (self.forces, self.acceleration, self.velocity):
+                field.x.scatter_forward()
+            self.time, self._moving = self._until, False
+        self.remember()
+
+    def remember(self) -> None:
+        """Take displacement, velocity and acceleration as they are for the start of the next step."""
+        self._u = np.array(self.config.u.x.array)
+        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a step has begun that is neither kept nor left."""
+        return self._moving
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the Functions."""
+        names = ("time", "start", "number", "longest", "accelerated", "largest")
+        return {name: getattr(self, name) for name in names}
+
+    def resume(self, numbers: dict[str, Any]) -> None:
+        """Go on from the Functions as they are and the numbers of a checkpoint."""
+        for name in self.numbers:
+            setattr(self, name, numbers[name])
+        self.resumed += 1
+        self.restore()
+        self.remember()
+
+    def weight(self) -> PETSc.Vec:
+        """Forces of gravity."""
+        return self._weight.copy()
+
+    def momentum(self) -> Array:
+        """Momentum ``(gdim,)`` (collective)."""
+        p = self.mass.M * self._like(self.velocity.x.array[: self._n])
+        total = p.array_r.reshape(-1, self.config.gdim).sum(axis=0)
+        return np.asarray(self.config.comm.allreduce(total))
+
+    def kinetic_energy(self) -> float:
+        """``v'Mv / 2`` (collective)."""
+        v = self._like(self.velocity.x.array[: self._n])
+        return 0.5 * float(v.dot(self.mass.M * v))

@@ -1,0 +1,421 @@
+"""Mass of the bodies, and bodies whose contactors are massless, so that impact itself takes no energy [UEM].
+
+Between surfaces and the equations of motion on the data's way: a density or nodal masses become a matrix with the layout of K.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import MassError, SpaceError
+from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mpi4py import MPI
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
+POSITIVE = 0.1
+#: Part of its own mass that a node gives up at most when the contactors of its body become massless.
+TAKEN = 0.5
+#: Parts of a body's moments of mass to which they are to be kept, and to which they have to be.
+ROUNDING, REQUIRED = 1e-14, 1e-10
+#: When coordinates are scaled, a body spreads in every direction by this part of its largest spread at least.
+THIN = 1e-4
+#: Bounds on the iterations that find where the contactors' mass goes, and on the halvings of each step.
+MOST_ITERATIONS, MOST_HALVINGS = 60, 20
+
+
+@dataclass(frozen=True, eq=False)
+class Mass:
+    """Mass matrix of a displacement; its components are not coupled.
+
+    Attributes:
+        M: with the layout and the block size of K.
+        config: nodes and bodies; the displacement in it is not used.
+        diagonal: whether M holds nothing but its diagonal.
+    """
+
+    M: PETSc.Mat
+    config: Configuration
+    diagonal: bool
+
+    # -- what it weighs ------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def of_nodes(self) -> Array:
+        """Diagonal of M at the owned nodes ``(n_owned, gdim)``: zero where a node is massless, else positive (collective)."""
+        diagonal = self.M.getDiagonal()
+        values = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
+        diagonal.destroy()
+        return values
+
+    @cached_property
+    def _row_sums(self) -> Array:
+        """Share of each owned node in the total ``(n_owned, gdim)`` (collective)."""
+        return self._times(np.ones((self.config.n_owned, self.config.gdim)))
+
+    @property
+    def total(self) -> Array:
+        """Mass that moves along each coordinate ``(gdim,)`` (collective)."""
+        return np.asarray(self.config.comm.allreduce(self._row_sums.sum(axis=0)))
+
+    @property
+    def centre(self) -> Array:
+        """Centre of all mass as the bodies are drawn, components taken together ``(gdim,)``; NaN without mass (collective)."""
+        m = self._row_sums.sum(axis=1)
+        sums = self.config.comm.allreduce(np.append(m @ self._X, m.sum()))
+        return np.asarray(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
+
+    def rigid(self) -> Array:
+        """What each body's rigid motions feel of M ``(n_bodies, n_rigid, n_rigid)`` (collective).
+
+        Motions as in ``surfaces.rigid_velocities``: translations, then rotations about the mean of the body's nodes; the first
+        block holds masses, the last one moments of inertia.
+        """
+        body, count = self._bodies
+        sums = _body_sums(self.config.comm, np.column_stack([np.ones(len(body)), self._X]), body, count)
+        modes = rigid_velocities(self._X - (sums[:, 1:] / sums[:, :1])[body]).transpose(0, 2, 1)
+        return self._moments(modes, np.ones(modes.shape[:2]))[0].sum(axis=1)
+
+    # -- massless contactors ---------------------------------------------------------------------------------------------------
+
+    def without(self, nodes: npt.ArrayLike) -> Mass:
+        """The same bodies with some nodes massless, whose mass goes to the other nodes of their body (collective).
+
+        With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``, where S is diagonal and scales
+        component c of node i by ``max(1 + p_c(X_i), sqrt(1 - b))``. The polynomials p_c, of degree 2 in each body, are such that
+        mass, first and second moments ``x_a' M x_b`` of each component are kept, hence the momentum and the energy of every
+        motion whose velocity is linear in X, rigid ones among them. Nodes give up at most the part b of their own mass, and
+        ``S M0 S`` is at least ``(1 - b) M0`` in its eigenvalues. For diagonal M this redistributes nodal masses, after Khenous,
+        Laborde and Renard, "Mass redistribution method for finite element contact problems in elastodynamics", Eur. J. Mech.
+        A/Solids 27 (2008) 918-932.
+
+        Args:
+            nodes: owned local nodes ``(n,)``, e.g. the contactors; every rank names its own.
+
+        Returns:
+            The new mass; this object itself if none of the nodes has any.
+
+        Raises:
+            MassError: if the other nodes of a body cannot take over the mass, or a node is not owned.
+        """
+        config = self.config
+        kept = ~self._marked(nodes)
+        if not config.comm.allreduce(int(self.of_nodes[~kept].any())):
+            return self
+        with timed("redistribute mass"):
+            M = self.M.copy()
+            left, right = M.createVecs()
+            left.array[:] = right.array[:] = (self._scaling(kept) * kept[:, None]).ravel()
+            M.diagonalScale(left, right)
+            left.destroy()
+            right.destroy()
+        return Mass(M, config, self.diagonal)
+
+    def _marked(self, nodes: npt.ArrayLike) -> Bools:
+        """Which owned nodes are named ``(n_owned,)`` (collective)."""
+        named = np.asarray(nodes, dtype=np.int64).ravel()
+        wrong = named[(named < 0) | (named >= self.config.n_owned)]
+        error = None
+        if len(wrong):
+            error = MassError(
+                f"node {wrong[0]} is none of the {self.config.n_owned} nodes that rank {self.config.comm.rank} owns: "
+                "name nodes by their local block number, each on the rank that owns it"
+            )
+        agree(self.config.comm, error)
+        marked = np.zeros(self.config.n_owned, dtype=bool)
+        marked[named] = True
+        return marked
+
+    def _scaling(self, kept: Bools) -> Array:
+        """Factors of the nodes that are kept with which these have the moments of all ``(n_owned, gdim)`` (collective).
+
+        Newton's method for the coefficients of the polynomials, for every component of every body at once.
+        """
+        g = self.config.gdim
+        xi = self._coordinates(kept)
+        a, b = np.triu_indices(g + 1)
+        phi = xi[..., a] * xi[..., b]
+        asked = self._moments(xi, np.ones(xi.shape[:2]))[0][..., a, b]
+        scale = np.maximum(np.abs(asked), asked[..., :1])
+        scale = np.where(scale > 0, scale, 1.0)
+        body, count = self._bodies
+        xi = xi * kept[:, None, None]
+
+        def look(alpha: Array) -> tuple[Array, Array, Array]:
+            """Factors, moments that are missing as parts of what is asked for, and products whose sums are the derivatives."""
+            s = np.maximum(1.0 + np.einsum("nck,nck->nc", phi, alpha[body]), np.sqrt(1.0 - TAKEN))
+            moments, momenta = self._moments(xi, s)
+            slopes = (xi[..., a] * momenta[..., b] + momenta[..., a] * xi[..., b]) * (s > np.sqrt(1.0 - TAKEN))[..., None]
+            return s, (asked - moments[..., a, b]) / scale, slopes
+
+        alpha = np.zeros((count, g, len(a)))
+        s, missing, slopes = look(alpha)
+        stuck = np.zeros((count, g), dtype=bool)
+        for _ in range(MOST_ITERATIONS):
+            size = np.abs(missing).max(axis=2)
+            done = stuck | (size <= ROUNDING)
+            if done.all():
+                break
+            J = self._products(slopes, phi) / scale[..., None]
+            step = np.einsum("bcij,bcj->bci", np.linalg.pinv(J, rcond=REQUIRED), missing)
+            step[done] = 0.0
+            for _ in range(MOST_HALVINGS):
+                s, new, slopes = look(alpha + step)
+                stuck = np.abs(new).max(axis=2) >= size
+                if done[stuck].all():
+                    break
+                step[stuck] *= 0.5
+            alpha, missing = alpha + step, new
+        lacking = np.flatnonzero((np.abs(missing) > REQUIRED).any(axis=(1, 2)))
+        if len(lacking):
+            raise self._unable(body == lacking[0], kept)
+        return s
+
+    def _coordinates(self, kept: Bools) -> Array:
+        """1 and coordinates of the order of 1 at the nodes, for every component ``(n_owned, gdim, gdim + 1)`` (collective).
+
+        In every body they start from the centre of what is kept and follow its principal axes, in units of its spread along
+        these, so that polynomials in them are well told apart.
+        """
+        g, body = self.config.gdim, self._bodies[0]
+        X = np.repeat(self._X[:, None], g, axis=1)
+        one = np.ones((*X.shape[:2], 1))
+        w = (self.of_nodes * kept[:, None])[..., None]
+        total = self._products(w, one)
+        total = np.where(total > 0, total, 1.0)
+        arm = X - (self._products(w, X) / total)[body, :, 0]
+        squares, axes = np.linalg.eigh(self._products(w * arm, arm) / total)
+        spread = np.sqrt(np.maximum(squares, THIN**2 * squares[..., -1:]))
+        spread = np.where(spread > 0, spread, self.config.size)
+        xi = np.einsum("ncg,ncgk->nck", arm, axes[body]) / spread[body]
+        return np.concatenate([one, xi], axis=2)
+
+    def _moments(self, xi: Array, s: Array) -> tuple[Array, Array]:
+        """Moments ``(s xi_a)' M (s xi_b)`` of each component of each body, and ``M (s xi_b)`` (collective).
+
+        Args:
+            xi: functions at the nodes ``(n_owned, gdim, k)``.
+            s: factors ``(n_owned, gdim)``.
+
+        Returns:
+            ``(n_bodies, gdim, k, k)`` and ``(n_owned, gdim, k)``.
+        """
+        fields = s[..., None] * xi
+        momenta = np.stack([self._times(fields[..., k]) for k in range(xi.shape[2])], axis=2)
+        return self._products(fields, momenta), momenta
+
+    def _unable(self, here: Bools, kept: Bools) -> MassError:
+        """What to tell about a body that cannot do without some of its nodes' mass (collective)."""
+        heavy = self.of_nodes.any(axis=1) & here
+        sums = [here.sum(), (heavy & ~kept).sum(), (heavy & kept).sum(), *self._X[here].sum(axis=0)]
+        n, contactors, others, *x = self.config.comm.allreduce(np.array(sums, dtype=float))
+        where = ", ".join(f"{c:.4g}" for c in np.array(x) / n)
+        return MassError(
+            f"the body with its middle at ({where}) cannot keep its mass, centre and inertia without the mass of "
+            f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
+            "refine the mesh behind its contact surface, or give nodal masses that are zero at the contactors"
+        )
+
+    # -- tools -------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def _X(self) -> Array:
+        """Owned nodes as drawn ``(n_owned, gdim)``."""
+        return self.config.X[: self.config.n_owned]
+
+    @property
+    def _bodies(self) -> tuple[Ints, int]:
+        """Body of each owned node ``(n_owned,)``, and their number (collective)."""
+        body, count = find_bodies(self.config)
+        return body[: self.config.n_owned], count
+
+    @cached_property
+    def _nodes_of_bodies(self) -> list[Ints]:
+        """Owned nodes of every body (collective)."""
+        body, count = self._bodies
+        return np.split(np.argsort(body, kind="stable"), np.cumsum(np.bincount(body, minlength=count))[:-1])
+
+    def _products(self, left: Array, right: Array) -> Array:
+        """Sums of ``left (n_owned, g, k)`` times ``right (n_owned, g, l)`` over bodies: ``(n_bodies, g, k, l)`` (collective)."""
+        sums = [left[here].transpose(1, 2, 0) @ right[here].transpose(1, 0, 2) for here in self._nodes_of_bodies]
+        return np.asarray(self.config.comm.allreduce(np.array(sums)))
+
+    def _times(self, field: Array) -> Array:
+        """M times a field at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        x, y = self.M.createVecs()
+        x.array[:] = field.ravel()
+        self.M.mult(x, y)
+        out = np.array(y.array_r).reshape(field.shape)
+        x.destroy()
+        y.destroy()
+        return out
+
+
+# -- masses of bodies ------------------------------------------------------------------------------------------------------------
+
+
+def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
+    """``rho u . v`` integrated over the bodies as drawn (collective).
+
+    Args:
+        V: space of the displacement.
+        rho: mass per reference volume: a number, a Function, e.g. of DG0, or any scalar UFL expression; zero where bodies are
+            massless.
+
+    Raises:
+        SpaceError: if V is no space of displacements, or rho lives on another mesh.
+        MassError: if rho is not scalar, not finite, or negative.
+    """
+    config = Configuration(fem.Function(V))
+    with timed("assemble mass"):
+        density = _density(config, rho)
+        _cell_masses(config, density)
+        a = compat.form(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx)
+        M = forms.create_matrix(a)
+        forms.assemble_matrix(M, a)
+    return Mass(M, config, diagonal=False)
+
+
+def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
+    """Diagonal mass with the total of ``consistent_mass`` (collective).
+
+    Nodal masses are the row sums of the consistent mass. In a body where these are not all positive, as with quadratic triangles
+    and tetrahedra, every cell's mass goes to its nodes in proportion to the diagonal of its consistent mass (Hinton, Rock and
+    Zienkiewicz, Earthquake Engng. Struct. Dyn. 4 (1976) 245-249), taken on the reference cell.
+
+    Args:
+        V: space of the displacement.
+        rho: mass per reference volume, as in ``consistent_mass``.
+
+    Raises:
+        SpaceError, MassError: as ``consistent_mass``.
+    """
+    config = Configuration(fem.Function(V))
+    with timed("assemble mass"):
+        density = _density(config, rho)
+        b = compat.create_vector(V)
+        forms.assemble_vector(b, compat.form(density * sum(ufl.TestFunction(V)) * ufl.dx))
+        rows = np.array(b.array_r).reshape(-1, config.gdim)[:, 0]
+        b.destroy()
+        of_cells = _cell_masses(config, density)
+        shares = np.diag(_reference_mass(config))
+        cells = compat.cell_dofs(V)[: len(of_cells)]
+        scaled = config.to_owners(cells.ravel(), np.outer(of_cells, shares / shares.sum()).ravel())[: config.n_owned]
+        body, count = find_bodies(config)
+        body = body[: config.n_owned]
+        refused = _body_sums(config.comm, (rows < POSITIVE * scaled).astype(float), body, count) > 0
+        m = np.where(refused[body], scaled, rows)
+    return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True)
+
+
+@timed("assemble mass")
+def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], npt.ArrayLike]) -> Mass:
+    """Masses given at the nodes (collective).
+
+    Args:
+        V: space of the displacement.
+        values: masses per node ``(n_owned,)``, or per node and component ``(n_owned, gdim)``, at this rank's owned nodes; or a
+            function of places in the reference configuration ``(n, gdim)`` that returns them, ``(n,)`` or ``(n, gdim)``.
+
+    Raises:
+        SpaceError: if V is no space of displacements.
+        MassError: naming what has the wrong shape, or a node whose mass is negative or not finite.
+    """
+    config = Configuration(fem.Function(V))
+    n, g = config.n_owned, config.gdim
+    m = np.asarray(values(config.X[:n]) if callable(values) else values, dtype=float)
+    error = None
+    if m.shape not in ((n,), (n, g)):
+        error = MassError(f"nodal masses have shape {m.shape}: expected ({n},) or ({n}, {g}) for the {n} nodes of this rank")
+    else:
+        m = np.broadcast_to(m if m.ndim == 2 else m[:, None], (n, g))
+        wrong = np.flatnonzero(~((m >= 0) & np.isfinite(m)).all(axis=1))
+        if len(wrong):
+            where = config.describe(wrong[0])
+            error = MassError(f"the mass {m[wrong[0]]} of the node at {where} is negative or not finite: give masses from 0 up")
+    agree(config.comm, error)
+    return Mass(_diagonal(config, m.ravel()), config, diagonal=True)
+
+
+def _density(config: Configuration, rho: Any) -> Any:
+    """The density as a UFL expression that forms can hold."""
+    if isinstance(rho, (Real, ufl.constantvalue.ConstantValue)):
+        # forms lose terms with a literal zero
+        return fem.Constant(config.mesh, float(rho))
+    if not isinstance(rho, ufl.core.expr.Expr):
+        raise MassError(f"the density {rho!r} is neither a number nor a Function nor a UFL expression: give one of them")
+    if rho.ufl_shape != ():
+        raise MassError(f"the density {rho} has shape {rho.ufl_shape}: give a scalar")
+    if any(domain != config.mesh.ufl_domain() for domain in ufl.domain.extract_domains(rho)):
+        raise SpaceError("the density lives on another mesh than the displacement: build both on one mesh")
+    return rho
+
+
+def _cell_masses(config: Configuration, density: Any) -> Array:
+    """Masses of the owned cells ``(n_cells,)``, refused if they cannot be (collective)."""
+    S = compat.dg0_space(config.mesh)
+    b = compat.create_vector(S)
+    forms.assemble_vector(b, compat.form(density * ufl.TestFunction(S) * ufl.dx))
+    n_cells = config.mesh.topology.index_map(config.tdim).size_local
+    masses = np.array(b.array_r)[compat.cell_dofs(S)[:n_cells, 0]]
+    b.destroy()
+    wrong = np.flatnonzero(~((masses >= 0) & np.isfinite(masses)))
+    error = None
+    if len(wrong):
+        where = ", ".join(f"{c:.6g}" for c in config.X[compat.cell_dofs(config.V)[wrong[0]]].mean(axis=0))
+        error = MassError(
+            f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}: give a density that is finite and not negative"
+        )
+    agree(config.comm, error)
+    return masses
+
+
+def _reference_mass(config: Configuration) -> Array:
+    """Mass of the reference cell of unit density, one component ``(n_nodes, n_nodes)``."""
+    cell = compat.cell_name(config.mesh)
+    points, weights = basix.make_quadrature(getattr(basix.CellType, cell), 2 * config.degree)
+    N = forms.create_lagrange_element(cell, config.degree).tabulate(0, points)[0, :, :, 0]
+    return np.asarray(N.T @ (weights[:, None] * N))
+
+
+def _diagonal(config: Configuration, values: Array) -> PETSc.Mat:
+    """Diagonal matrix from the owned entries ``(n_owned * gdim,)`` (collective)."""
+    sizes = (len(values), config.index_map.size_global * config.gdim)
+    M = PETSc.Mat().create(config.comm)
+    M.setSizes((sizes, sizes))
+    M.setBlockSize(config.gdim)
+    M.setType(PETSc.Mat.Type.AIJ)
+    M.setPreallocationNNZ((1, 0))
+    first = M.getOwnershipRange()[0]
+    rows = np.arange(first, first + len(values) + 1, dtype=PETSc.IntType)
+    M.setValuesCSR(rows - first, rows[:-1], values)
+    M.assemble()
+    return M
+
+
+def _body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
+    """Sums of nodal values ``(n, ...)`` over the bodies ``(n,)`` of the nodes, over all ranks ``(count, ...)`` (collective)."""
+    out = np.zeros((count, *values.shape[1:]))
+    np.add.at(out, body, values)
+    return np.asarray(comm.allreduce(out))

@@ -1,0 +1,69 @@
+"""How displacement, velocity and acceleration of a time step belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    pass
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How displacement, velocity and acceleration of a step belong together.
+
+    With G the static residual without contact forces, a step from n to n + 1 of length dt obeys
+
+        (1 - alpha_f) G(n+1) + alpha_f G(n) + M ((1 - alpha_m) a(n+1) + alpha_m a(n)) = contact forces, averaged likewise
+        u(n+1) = u(n) + dt v(n) + dt^2 ((1/2 - beta) a(n) + beta a(n+1))
+        v(n+1) = v(n) + dt ((1 - gamma) a(n) + gamma a(n+1))
+
+    Contact conditions hold at n + 1.
+    """
+
+    beta: float
+    gamma: float
+    alpha_m: float = 0.0
+    alpha_f: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.beta > 0.0 and self.gamma >= 0.5):
+            raise ValueError(
+                f"beta = {self.beta:g}, gamma = {self.gamma:g}: beta must be positive, since contact needs an implicit rule, and gamma "
+                "at least 1/2, since less makes every motion grow"
+            )
+
+
+def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:
+    """Newmark's rule; by default the trapezoidal rule, which keeps the energy of linear bodies [UEM, 5].
+
+    Args:
+        beta: weight of the new acceleration in the displacement.
+        gamma: the same in the velocity; more than 1/2 damps, at the price of first order.
+
+    Raises:
+        ValueError: if beta is not positive or gamma below 1/2.
+    """
+    return Scheme(beta, gamma)
+
+
+def generalised_alpha(rho_inf: float) -> Scheme:
+    """Second-order rule that damps what the step cannot resolve (Chung and Hulbert, J. Appl. Mech. 60, 1993, 371-375).
+
+    Args:
+        rho_inf: what a step leaves of the fastest motions, from 0 to 1 (none lost).
+
+    Raises:
+        ValueError: if ``rho_inf`` is not between 0 and 1.
+    """
+    if not 0.0 <= rho_inf <= 1.0:
+        raise ValueError(f"rho_inf = {rho_inf:g}: expected the part of the fastest motions that a step keeps, from 0 to 1")
+    alpha_m, alpha_f = (2 * rho_inf - 1) / (rho_inf + 1), rho_inf / (rho_inf + 1)
+    return Scheme((1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, alpha_m, alpha_f)

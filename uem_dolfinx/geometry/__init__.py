@@ -1,0 +1,1 @@
+"""From a gmsh mesh to points on surfaces: meshes and tags, facets, rigid surfaces, closest points."""

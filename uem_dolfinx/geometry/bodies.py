@@ -1,0 +1,68 @@
+"""Bodies as the cells connect them, and their rigid motions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import compat
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.configuration import Configuration
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+def rigid_velocities(arm: Array) -> Array:
+    """Velocities of points at ``arm (n, gdim)`` from a pole in the modes of a rigid body ``(n, n_modes, gdim)``.
+
+    Translations first, then the linearised rotations in the planes xy, xz and yz.
+    """
+    n, g = arm.shape
+    shifts = np.broadcast_to(np.eye(g), (n, g, g))
+    turns = []
+    for i in range(g):
+        for j in range(i + 1, g):
+            v = np.zeros_like(arm)
+            v[:, i], v[:, j] = -arm[:, j], arm[:, i]
+            turns.append(v)
+    return np.concatenate([shifts, np.stack(turns, axis=1)], axis=1)
+
+
+_FOUND: WeakKeyDictionary[Configuration, tuple[Ints, int]] = WeakKeyDictionary()
+
+
+def find_bodies(config: Configuration) -> tuple[Ints, int]:
+    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective; found once).
+
+    Every rank labels its own pieces; only the list of pieces that share nodes across ranks is known to all.
+    """
+    if config not in _FOUND:
+        _FOUND[config] = _find_bodies(config)
+    return _FOUND[config]
+
+
+def _find_bodies(config: Configuration) -> tuple[Ints, int]:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    comm, cells = config.comm, compat.cell_dofs(config.V)
+    pairs = np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(config.n_local,) * 2)
+    n_pieces, piece = connected_components(graph, directed=False)
+    sizes = comm.allgather(n_pieces)
+    mine = piece + sum(sizes[: comm.rank])
+    label = fem.Function(config.V)
+    view = label.x.array.reshape(-1, config.gdim)
+    view[:, 0] = mine
+    label.x.scatter_forward()
+    links = np.unique(np.column_stack([mine, view[:, 0].astype(np.int64)]), axis=0)
+    links = np.concatenate(comm.allgather(links))
+    total = sum(sizes)
+    count, body = connected_components(coo_matrix((np.ones(len(links)), links.T), shape=(total, total)), directed=False)
+    return body[mine].astype(np.int64), int(count)

@@ -1,0 +1,133 @@
+"""Nodes of a displacement and where they are: the configuration that every later step looks at."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError
+
+if TYPE_CHECKING:
+    pass
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Configuration:
+    """Nodes of a vector Lagrange space and where they are now: ``x = X + u``.
+
+    Args:
+        u: displacement, in a blocked Lagrange space with one component per coordinate.
+
+    Raises:
+        SpaceError: if ``u`` is not such a displacement.
+    """
+
+    def __init__(self, u: fem.Function):
+        V = u.function_space
+        self.u, self.V, self.mesh = u, V, V.mesh
+        self.comm = V.mesh.comm
+        self.gdim: int = V.mesh.geometry.dim
+        self.tdim: int = V.mesh.topology.dim
+        degree = compat.lagrange_degree(V)
+        if self.tdim != self.gdim:
+            raise SpaceError(
+                f"a body of dimension {self.tdim} in {self.gdim}D space has no inside: use a mesh with gdim = {self.tdim}"
+            )
+        if V.dofmap.index_map_bs != self.gdim or degree is None:
+            raise SpaceError(
+                f"the displacement has {V.dofmap.index_map_bs} component(s) in {self.gdim}D: "
+                f"use a vector Lagrange space of size {self.gdim}"
+            )
+        self.degree: int = degree
+        if degree > 2:
+            raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
+        self.index_map = V.dofmap.index_map
+        self.n_owned: int = self.index_map.size_local
+        self.n_local: int = self.n_owned + self.index_map.num_ghosts
+        # every rank takes a node's position from its owner, to the last bit
+        X = fem.Function(V)
+        X.x.array[:] = V.tabulate_dof_coordinates()[: self.n_local, : self.gdim].ravel()
+        X.x.scatter_forward()
+        self.X: Array = np.array(X.x.array.reshape(-1, self.gdim))
+
+    @property
+    def displacement(self) -> Array:
+        """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (a view)."""
+        return self.u.x.array.reshape(-1, self.gdim)
+
+    @property
+    def x(self) -> Array:
+        """Current positions of the local nodes ``(n_local, gdim)``, ghosts included."""
+        return self.X + self.displacement
+
+    def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Global block numbers of local nodes."""
+        flat = np.ascontiguousarray(nodes, dtype=np.int32).ravel()
+        return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
+
+    @cached_property
+    def _courier(self) -> fem.Function:
+        return fem.Function(self.V)
+
+    def from_owners(self, nodes: npt.NDArray[np.integer], values: Array, wanted: npt.NDArray[np.integer]) -> Array:
+        """Values that owners have at their ``nodes (n, k)``, at local nodes ``wanted (m, k)``, ghosts or not (collective)."""
+        out = np.empty((len(wanted), values.shape[1]))
+        carried = self._courier.x.array.reshape(-1, self.gdim)
+        for first in range(0, values.shape[1], self.gdim):
+            part = values[:, first : first + self.gdim]
+            carried[nodes, : part.shape[1]] = part
+            self._courier.x.scatter_forward()
+            out[:, first : first + self.gdim] = carried[wanted, : part.shape[1]]
+        return out
+
+    def to_owners(self, nodes: npt.NDArray[np.integer], values: Array) -> Array:
+        """Sums of values at local ``nodes (m,)``, ghosts or not, at every local node ``(n_local,)`` (collective)."""
+        carried = self._courier.x.array.reshape(-1, self.gdim)
+        carried[:] = 0.0
+        np.add.at(carried[:, 0], nodes, values)
+        forms.sum_ghosts(self._courier)
+        return np.array(carried[:, 0])
+
+    @cached_property
+    def _first_nodes(self) -> Ints:
+        """First global node of every rank, and one past the last."""
+        return np.array([*self.comm.allgather(self.index_map.local_range[0]), self.index_map.size_global], dtype=np.int64)
+
+    def owner_of(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Ranks that own global nodes."""
+        return np.searchsorted(self._first_nodes, nodes, side="right") - 1
+
+    def tell_owners(self, nodes: Ints) -> Ints:
+        """Owned local nodes that any rank names by their global number (collective)."""
+        owner = self.owner_of(nodes)
+        told = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
+        return np.unique(np.concatenate(told)) - self._first_nodes[self.comm.rank]
+
+    def ask_owners(self, nodes: Ints, values: Array) -> Array:
+        """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
+        owner = self.owner_of(nodes)
+        asked = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
+        answers = self.comm.alltoall([values[a - self._first_nodes[self.comm.rank]] for a in asked])
+        out = np.empty((len(nodes), values.shape[1]))
+        for r, answer in enumerate(answers):
+            out[owner == r] = answer
+        return out
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with."""
+        lo = -np.max(-self.X, axis=0, initial=-np.inf)
+        hi = np.max(self.X, axis=0, initial=-np.inf)
+        bounds = np.max(self.comm.allgather(np.concatenate([-lo, hi])), axis=0)
+        return float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
+
+    def describe(self, node: int) -> str:
+        """Where a local node is, for error messages."""
+        return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"

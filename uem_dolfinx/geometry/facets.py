@@ -1,0 +1,166 @@
+"""Facets of a surface in the current configuration, oriented outwards, each rank its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import OrientationError
+from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, unit_normals
+from uem_dolfinx.parallel import agree, count_keys
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.configuration import Configuration
+    from uem_dolfinx.geometry.gmsh import Tag
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
+
+
+@dataclass(frozen=True)
+class FacetData:
+    """Target facets of one rank in the current configuration.
+
+    Attributes:
+        x: node positions ``(m, nn, gdim)``.
+        nodes: global block numbers ``(m, nn)``.
+        nodal_normals: averaged outward normals at the nodes ``(m, nn, gdim)``.
+    """
+
+    x: Array
+    nodes: Ints
+    nodal_normals: Array
+
+
+class TargetFacets:
+    """Facets of a target surface that this rank holds, oriented outwards.
+
+    Args:
+        config: configuration of the displacement.
+        tag: the target's facets.
+
+    Raises:
+        OrientationError: if a facet lies between two cells, so that outward has no meaning.
+    """
+
+    def __init__(self, config: Configuration, tag: Tag):
+        self.config, self.tag = config, tag
+        mesh, tdim = config.mesh, config.tdim
+        fdim = tdim - 1
+        mesh.topology.create_connectivity(fdim, tdim)
+        mesh.topology.create_connectivity(tdim, fdim)
+        f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
+        n_cells = mesh.topology.index_map(tdim).size_local
+        sides = [(c, int(np.flatnonzero(c2f.links(c) == f)[0])) for f in tag.entities for c in f2c.links(f) if c < n_cells]
+        self.cells, self.sides = np.array(sides, dtype=np.int32).reshape(-1, 2).T
+        self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
+        cell_dofs = compat.cell_dofs(config.V)
+        table = _facet_closure(config, self.shape)
+        self.dofs = cell_dofs[self.cells[:, None], table[self.sides]]
+        self.nodes = config.to_global(self.dofs)
+        self._refuse_inner()
+        self._orient(cell_dofs)
+        self.open_sides = self._open_sides()
+        self.open_nodes = self._open_nodes()
+
+    @cached_property
+    def keys(self) -> Ints:
+        """What tells each facet from all others in any partition, its cell in the mesh's input and its side of it ``(m,)``."""
+        n_sides = len(forms.reference_topology(compat.cell_name(self.config.mesh))[self.config.tdim - 1])
+        return forms.original_cells(self.config.mesh)[self.cells] * n_sides + self.sides
+
+    def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
+        """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
+        X = self.config.X
+        middle = np.tile(self.shape.middle, (len(self.dofs), 1))
+        tab = self.shape.tabulate(middle)
+        x = X[self.dofs]
+        inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
+        height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
+        self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
+        #: How deep the cell behind each facet is, a length ``(m,)``.
+        self.depth: Array = np.abs(height).max(axis=1)
+
+    def _refuse_inner(self) -> None:
+        """Raise on facets that lie between two cells, wherever those cells live."""
+        corners = len(self.shape.topology[0])
+        inner = np.flatnonzero(count_keys(self.config.comm, np.sort(self.nodes[:, :corners], axis=1)) > 1)
+        error = None
+        if len(inner):
+            where = np.round(self.config.X[self.dofs[inner[0], :corners]].mean(axis=0), 6)
+            error = OrientationError(
+                f"target '{self.tag.name}' has a facet between two cells at {where}, where outward has no meaning: "
+                "a target must lie on the outside of a body, so mesh the bodies apart"
+            )
+        agree(self.config.comm, error)
+
+    def _open_sides(self) -> npt.NDArray[np.bool_]:
+        """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
+        corners = 1 if self.shape.dim == 1 else 2
+        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
+        keys = np.stack(sides, axis=1).reshape(-1, corners)
+        return (count_keys(self.config.comm, keys) == 1).reshape(len(self.nodes), len(sides))
+
+    def _open_nodes(self) -> npt.NDArray[np.bool_]:
+        """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""
+        mark = fem.Function(self.config.V)
+        marks = mark.x.array.reshape(-1, self.config.gdim)
+        for s, (_, nodes, _, _) in enumerate(self.shape.edges()):
+            marks[self.dofs[self.open_sides[:, s]][:, nodes].ravel()] = 1.0
+        forms.sum_ghosts(mark)
+        return marks[self.dofs, 0] > 0
+
+    @cached_property
+    def _normal_field(self) -> fem.Function:
+        return fem.Function(self.config.V)
+
+    @property
+    def x(self) -> Array:
+        """Nodes of the facets where they are now ``(m, nn, gdim)``."""
+        return self.config.X[self.dofs] + self.config.displacement[self.dofs]
+
+    def current(self) -> FacetData:
+        """Facets where they are now (collective: the nodal normals are summed over ranks)."""
+        gdim, x = self.config.gdim, self.x
+        # every node sees its facet under the angle-free area weight
+        field = self._normal_field
+        field.x.array[:] = 0.0
+        nodal = field.x.array.reshape(-1, gdim)
+        for a in range(self.dofs.shape[1]):
+            np.add.at(nodal, self.dofs[:, a], self._area_vector(x, a))
+        forms.sum_ghosts(field)
+        normals = nodal[self.dofs]
+        length = np.linalg.norm(normals, axis=2, keepdims=True)
+        return FacetData(x, self.nodes, normals / np.where(length > 0, length, 1.0))
+
+    def _area_vector(self, x: Array, node: int) -> Array:
+        """Outward normal of each facet at one of its nodes, weighted by the facet's size ``(m, gdim)``."""
+        xi = np.tile(self.shape.nodes[node], (len(x), 1))
+        tab = self.shape.tabulate(xi)
+        t = np.einsum("naf,nag->nfg", tab.dN, x)
+        n = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+        return self.sign[:, None] * n
+
+
+def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.int32]:
+    """Cell dofs of each local facet, in the numbering of the facet's own element ``(n_facets, nn)``."""
+    layout = config.V.dofmap.dof_layout
+    topology = forms.reference_topology(compat.cell_name(config.mesh))
+    rows = []
+    for vertices in topology[config.tdim - 1]:
+        row: list[int] = []
+        for dim, entities in enumerate(shape.topology):
+            for local in entities:
+                wanted = sorted(vertices[v] for v in local)
+                i = [sorted(e) for e in topology[dim]].index(wanted)
+                row += list(layout.entity_dofs(dim, i))
+        rows.append(row)
+    return np.array(rows, dtype=np.int32)

@@ -1,0 +1,441 @@
+"""From a Gmsh model or file to a distributed mesh with its physical groups as tags.
+
+The first data on the way: every body, surface and boundary condition of the later steps is named here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tempfile
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError, TagError, UEMError
+from uem_dolfinx.log import logger, timed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from mpi4py import MPI
+
+    import numpy.typing as npt
+
+Key: TypeAlias = "str | int | tuple[int, str | int]"
+
+CELLS = {
+    2: ("triangle", 1),
+    3: ("quadrilateral", 1),
+    4: ("tetrahedron", 1),
+    5: ("hexahedron", 1),
+    9: ("triangle", 2),
+    10: ("quadrilateral", 2),
+    11: ("tetrahedron", 2),
+    12: ("hexahedron", 2),
+}
+"""Gmsh's element types that make a body: name of the cell and degree of its geometry."""
+
+N_VERTICES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 8: 2, 9: 3, 10: 4, 11: 4, 12: 8, 15: 1}
+"""Vertices of Gmsh's element types, which always come first among an element's nodes."""
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A physical group of a mesh.
+
+    Attributes:
+        name: physical name; None for a group that has only a number.
+        number: physical number, unique within a dimension.
+        dim: dimension of the entities.
+        mesh: the mesh they belong to.
+        entities: local indices of the entities on this rank, ghosts included, ascending, shape ``(n,)``.
+    """
+
+    name: str | None
+    number: int
+    dim: int
+    mesh: Any = field(repr=False, compare=False)
+    entities: npt.NDArray[np.int32] = field(repr=False, compare=False)
+
+    def __str__(self) -> str:
+        """Name where there is one, else number."""
+        return f"'{self.name}'" if self.name else f"number {self.number}"
+
+
+class Tags(Mapping[Key, Tag]):
+    """Physical groups of a mesh by name, by number, or by ``(dim, name or number)``.
+
+    Args:
+        tags: all groups, alike on all ranks but for their entities.
+        sizes: number of entities of each over all ranks, shape ``(len(tags),)``.
+    """
+
+    def __init__(self, tags: list[Tag], sizes: npt.NDArray[np.int64]):
+        self._tags = tags
+        self._empty = {(tag.dim, tag.number) for tag, size in zip(tags, sizes) if size == 0}
+
+    def __getitem__(self, key: Key) -> Tag:
+        """Look a group up; no communication, and all ranks get the same answer.
+
+        Args:
+            key: name, number, or ``(dim, name or number)``.
+
+        Returns:
+            The group.
+
+        Raises:
+            TagError: no such group, several of them, or one without any entity in the mesh.
+        """
+        dim, label = key if isinstance(key, tuple) else (None, key)
+        found = [t for t in self._tags if label in (t.name, t.number) and label is not None and dim in (None, t.dim)]
+        if not found:
+            raise TagError(f"no physical group {key!r}{self._hint(label)}: {self._listing()}")
+        if len(found) > 1:
+            choices = " or ".join(f"({t.dim}, {label!r})" for t in found)
+            raise TagError(f"physical group {key!r} is ambiguous: ask for {choices}")
+        tag = found[0]
+        if (tag.dim, tag.number) in self._empty:
+            raise TagError(
+                f"physical group {tag} (dimension {tag.dim}) has no entity in the mesh: "
+                f"check that its geometry is meshed and belongs to the bodies; {self._listing()}"
+            )
+        return tag
+
+    def __iter__(self) -> Iterator[Key]:
+        """Keys of the groups that have entities: the name, or ``(dim, number)`` where there is no unique name."""
+        names = [t.name for t in self._tags]
+        for tag in self._tags:
+            if (tag.dim, tag.number) not in self._empty:
+                yield tag.name if tag.name and names.count(tag.name) == 1 else (tag.dim, tag.number)
+
+    def __len__(self) -> int:
+        """Number of groups that have entities."""
+        return len(self._tags) - len(self._empty)
+
+    def __repr__(self) -> str:
+        """List the groups."""
+        return f"Tags({self._listing()})"
+
+    def _hint(self, label: object) -> str:
+        near = difflib.get_close_matches(str(label), [t.name for t in self._tags if t.name], n=1)
+        return f", did you mean {near[0]!r}?" if near else ""
+
+    def _listing(self) -> str:
+        if not self._tags:
+            return "the mesh has no physical group"
+        return "the mesh has " + ", ".join(f"{t.name or t.number!r} (dimension {t.dim})" for t in self._tags)
+
+
+def read_gmsh(
+    source: Any, comm: MPI.Comm, gdim: int | None = None, parameters: Mapping[str, float] | None = None
+) -> tuple[Any, Tags]:
+    """Read a mesh and its physical groups from Gmsh (collective).
+
+    A ``.geo`` file is meshed; its ``DefineConstant`` values can be set from here. Cells come from the physical groups
+    of dimension ``gdim``, or are all the cells of that dimension where there is no such group. Groups may overlap, and
+    may be of any dimension.
+
+    Args:
+        source: path of a ``.geo`` or ``.msh`` file, or the live ``gmsh.model`` (meshed; rank 0 only, anything elsewhere).
+        comm: communicator of the mesh; rank 0 does the reading.
+        gdim: geometric dimension, 2 or 3; by default that of the model. The coordinate ``z`` is dropped in 2D.
+        parameters: numbers for the ``.geo`` file's ``DefineConstant``.
+
+    Returns:
+        The mesh and its tags.
+
+    Raises:
+        MissingBackendError: Gmsh cannot be imported.
+        MissingFileError: there is no such file.
+        MeshError: Gmsh refuses the file, a parameter is unknown, or the model has no cells this package can use.
+    """
+    with timed("read gmsh"):
+        raw, error = None, None
+        if comm.rank == 0:
+            try:
+                raw = _read(source, gdim, dict(parameters or {}))
+            except UEMError as e:
+                error = e
+        header = None if raw is None else (raw.cell, raw.degree, raw.points.shape[1], raw.nodes_per_cell, raw.groups)
+        error, header = comm.bcast((error, header), root=0)
+        if error is not None:
+            raise error
+        cell, degree, gdim, nodes_per_cell, groups = header
+        cells = np.empty((0, nodes_per_cell), dtype=np.int64) if raw is None else raw.cells
+        points = np.empty((0, gdim)) if raw is None else raw.points
+        mesh = compat.create_mesh(comm, cells, points, cell, degree)
+        tags = [Tag(g.name, g.number, g.dim, mesh, _local_entities(mesh, g)) for g in groups]
+        sizes = np.array([len(tag.entities) for tag in tags], dtype=np.int64)
+        result = Tags(tags, comm.allreduce(sizes))
+    logger.info("%s: %d %s cells of degree %d, %r", _label(source), comm.allreduce(len(cells)), cell, degree, result)
+    # what locating d.o.f. of tags needs, and newer DOLFINx no longer builds by itself
+    tdim = mesh.topology.dim
+    for dim in sorted({tdim - 1, *(group.dim for group in groups)} - {tdim}):
+        mesh.topology.create_connectivity(dim, tdim)
+    return mesh, result
+
+
+# ---------------------------------------------------------------------------------------------- on rank 0
+
+
+@dataclass(frozen=True)
+class _Group:
+    """A physical group as Gmsh has it.
+
+    Attributes:
+        name: physical name or None.
+        number: physical number.
+        dim: dimension.
+        rows: for the bodies, input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
+            input node index, shape ``(n, n_vertices)``.
+    """
+
+    name: str | None
+    number: int
+    dim: int
+    rows: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _RawMesh:
+    """A whole mesh on one rank.
+
+    Attributes:
+        cell: name of the cell.
+        degree: degree of the geometry.
+        points: coordinates, shape ``(n_nodes, gdim)``.
+        cells: node index in Gmsh's order, shape ``(n_cells, n_nodes_per_cell)``.
+        groups: the physical groups.
+    """
+
+    cell: str
+    degree: int
+    points: npt.NDArray[np.float64]
+    cells: npt.NDArray[np.int64]
+    groups: list[_Group]
+
+    @property
+    def nodes_per_cell(self) -> int:
+        """Number of nodes of a cell."""
+        return int(self.cells.shape[1])
+
+
+def _label(source: Any) -> str:
+    return str(source) if isinstance(source, (str, Path)) else "gmsh model"
+
+
+def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
+    """Read a file or a live model; Gmsh is left as it was found."""
+    if gdim not in (None, 2, 3):
+        raise MeshError(f"gdim is {gdim!r}: a body is of dimension 2 or 3")
+    if source is None:
+        raise MeshError("the source is None on rank 0: give the path of a .geo or .msh file, or gmsh.model")
+    gmsh = import_gmsh()
+    if not isinstance(source, (str, Path)):
+        if parameters:
+            raise MeshError("parameters belong to a .geo file: a live gmsh.model is already built")
+        if not compat.gmsh_is_initialized(gmsh):
+            raise MeshError("gmsh is not initialised on rank 0: call gmsh.initialize() and build the model first")
+        return _extract(source, gdim, "the live gmsh.model")
+    path = Path(source).expanduser().absolute()
+    if path.suffix not in (".geo", ".msh"):
+        raise MeshError(f"{source} is neither a .geo nor a .msh file")
+    if not path.is_file():
+        raise MissingFileError(f"mesh file {source} does not exist (looked for {path})")
+    if path.suffix == ".msh" and parameters:
+        raise MeshError(f"{source} is already meshed and takes no parameters ({', '.join(parameters)}): read a .geo file")
+    known = _constants(path) if parameters else []
+    for name, value in parameters.items():
+        if name not in known:
+            raise MeshError(f"{source} has no constant {name!r}: DefineConstant declares {', '.join(known) or 'nothing'}")
+        if not np.isfinite(value):
+            raise MeshError(f"parameter {name!r} of {source} is {value!r}: give a finite number")
+    return _open(gmsh, path, gdim, parameters)
+
+
+def _constants(path: Path) -> list[str]:
+    """Names that DefineConstant declares in a .geo file and the files it includes."""
+    text = path.read_text(errors="replace")
+    text = re.sub(r"/\*.*?\*/", "", text, flags=re.S)
+    text = re.sub(r"//[^\n]*", "", text)
+    names: list[str] = []
+    for block in re.findall(r"DefineConstant\s*\[(.*?)\]\s*;", text, flags=re.S):
+        block = re.sub(r'"[^"]*"', "", block)
+        while "{" in block and (inner := re.sub(r"\{[^{}]*\}", "", block)) != block:
+            block = inner
+        names += re.findall(r"(\w+)\s*=", block) or re.findall(r"\w+", block)
+    for included in re.findall(r'Include\s+"([^"]+)"', text):
+        inner_path = path.parent / included
+        if inner_path.is_file():
+            names += _constants(inner_path)
+    return list(dict.fromkeys(names))
+
+
+def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
+    """Open and mesh a file in a session of our own, or in a model of our own in the user's session."""
+    with _session(gmsh) as errors, tempfile.TemporaryDirectory() as folder:
+        # constants set before the file is included win over its DefineConstant, in this model only
+        wrapper = Path(folder) / f"{path.stem}.geo"
+        lines = [f"{name} = {float(value)!r};" for name, value in parameters.items()]
+        wrapper.write_text("\n".join([*lines, f'Include "{path}";', ""]))
+        try:
+            gmsh.open(str(wrapper if parameters else path))
+            dim = gdim or (3 if gmsh.model.getDimension() == 3 else 2)
+            if not errors() and not len(gmsh.model.mesh.getElements(dim)[0]):
+                gmsh.model.mesh.generate(dim)
+            found = errors()
+        except Exception as error:  # Gmsh raises bare Exceptions
+            found = [*errors(), str(error)]
+        if found:
+            values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
+            raise MeshError(f"Gmsh cannot read or mesh {path}{' with ' + values if values else ''}: {found[0]}")
+        return _extract(gmsh.model, gdim, str(path))
+
+
+@contextmanager
+def _session(gmsh: Any) -> Iterator[Callable[[], list[str]]]:
+    """Work in a Gmsh session that is left as it was found; yields the errors that Gmsh has logged in it."""
+    found_running = compat.gmsh_is_initialized(gmsh)
+    if not found_running:
+        gmsh.initialize(["gmsh"], False)
+    names = ("General.Terminal", "General.AbortOnError")
+    options = [(name, gmsh.option.getNumber(name)) for name in names]
+    current, n_models, n_messages = gmsh.model.getCurrent(), len(gmsh.model.list()), len(gmsh.logger.get())
+    # an error that aborted the parser would make it stumble over the next file, even in another session
+    for name in names:
+        gmsh.option.setNumber(name, 0)
+    gmsh.logger.start()
+    try:
+        yield lambda: [m.split(":", 1)[1].strip() for m in gmsh.logger.get()[n_messages:] if m.startswith("Error")]
+    finally:
+        if n_messages == 0:
+            gmsh.logger.stop()
+        if not found_running:
+            gmsh.finalize()
+        else:
+            if len(gmsh.model.list()) > n_models:
+                gmsh.model.remove()
+            gmsh.model.setCurrent(current)
+            for name, value in options:
+                gmsh.option.setNumber(name, value)
+
+
+def _extract(model: Any, gdim: int | None, label: str) -> _RawMesh:
+    """Take nodes, cells and physical groups out of a meshed model."""
+    groups = [(int(dim), int(number)) for dim, number in model.getPhysicalGroups()]
+    dims = [dim for dim in (3, 2) if len(model.mesh.getElements(dim)[0])]
+    if not dims:
+        raise MeshError(f"{label} has no cells of dimension 2 or 3: mesh it first, e.g. gmsh.model.mesh.generate()")
+    tdim = dims[0]
+    if gdim is not None and gdim != tdim:
+        raise MeshError(f"{label} has cells of dimension {tdim}, not {gdim}: read it with gdim={tdim}")
+    bodies = {number: model.getEntitiesForPhysicalGroup(tdim, number) for dim, number in groups if dim == tdim}
+    entities = sorted({int(e) for es in bodies.values() for e in es}) or [int(e) for _, e in model.getEntities(tdim)]
+    blocks = {e: _elements(model, tdim, e) for e in entities}
+    kinds = {kind for block in blocks.values() for kind in block}
+    if len(kinds) != 1 or not kinds <= CELLS.keys():
+        names = ", ".join(model.mesh.getElementProperties(kind)[0] for kind in sorted(kinds)) or "none"
+        raise MeshError(
+            f"the cells of {label} are {names}: they must all be one kind of triangle, quadrilateral, tetrahedron or "
+            "hexahedron, of order 1 or 2"
+        )
+    kind = kinds.pop()
+    cell, degree = CELLS[kind]
+    nodes_of = {e: block.get(kind, np.empty((0, 1), dtype=np.int64)) for e, block in blocks.items()}
+    filled = [rows for rows in nodes_of.values() if len(rows)]
+    node_tags, cells = np.unique(np.concatenate(filled), return_inverse=True)
+    cells = cells.reshape(-1, filled[0].shape[1])
+    first = dict(zip(entities, np.cumsum([0, *(len(nodes_of[e]) for e in entities)])))
+    numbering = {e: np.arange(first[e], first[e] + len(nodes_of[e])) for e in entities}
+    result = []
+    for dim, number in groups:
+        name = model.getPhysicalName(dim, number) or None
+        members = [int(e) for e in model.getEntitiesForPhysicalGroup(dim, number)]
+        if dim == tdim:
+            rows = np.concatenate([np.empty(0, dtype=np.int64), *(numbering[e] for e in members)])
+        else:
+            rows = _vertex_rows(model, dim, members, node_tags)
+        result.append(_Group(name, number, dim, rows.astype(np.int64)))
+    return _RawMesh(cell, degree, _points(model, node_tags, tdim, label), cells.astype(np.int64), result)
+
+
+def _elements(model: Any, dim: int, entity: int) -> dict[int, npt.NDArray[np.int64]]:
+    """Node tags of an entity's elements by element type, each of shape ``(n, n_nodes)``."""
+    kinds, tags, nodes = model.mesh.getElements(dim, entity)
+    return {int(k): np.asarray(n, dtype=np.int64).reshape(len(t), -1) for k, t, n in zip(kinds, tags, nodes) if len(t)}
+
+
+def _vertex_rows(model: Any, dim: int, entities: list[int], node_tags: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Vertices of a group's elements as ascending input node index; elements off the bodies are left out."""
+    rows = []
+    for entity in entities:
+        for kind, nodes in _elements(model, dim, entity).items():
+            vertices = nodes[:, : N_VERTICES[kind]]
+            rows.append(np.sort(np.searchsorted(node_tags, vertices[np.isin(vertices, node_tags).all(axis=1)]), axis=1))
+    return np.concatenate(rows) if rows else np.empty((0, dim + 1), dtype=np.int64)
+
+
+def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str) -> npt.NDArray[np.float64]:
+    """Coordinates of the nodes used, shape ``(n_nodes, tdim)``."""
+    tags, x, _ = model.mesh.getNodes()
+    order = np.argsort(tags)
+    points = np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)]
+    if tdim == 2:
+        size = np.ptp(points[:, :2], axis=0).max()
+        if np.ptp(points[:, 2]) > 1e-10 * size:
+            raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
+    return np.ascontiguousarray(points[:, :tdim])
+
+
+# ---------------------------------------------------------------------------------------------- on every rank
+
+
+def _local_entities(mesh: Any, group: _Group) -> npt.NDArray[np.int32]:
+    """Local index of a group's entities on this rank, ghosts included, ascending."""
+    topology = mesh.topology
+    if group.dim == topology.dim:
+        original = np.asarray(topology.original_cell_index)
+        return np.flatnonzero(np.isin(original, group.rows)).astype(np.int32)
+    topology.create_entities(group.dim)
+    index_map = topology.index_map(group.dim)
+    n_entities = index_map.size_local + index_map.num_ghosts
+    if n_entities == 0 or len(group.rows) == 0:
+        return np.empty(0, dtype=np.int32)
+    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[forms.vertex_nodes(mesh)]
+    if group.dim == 0:
+        vertices = np.arange(n_entities).reshape(-1, 1)
+    else:
+        topology.create_connectivity(group.dim, 0)
+        vertices = np.asarray(topology.connectivity(group.dim, 0).array).reshape(n_entities, -1)
+    if vertices.shape[1] != group.rows.shape[1]:
+        return np.empty(0, dtype=np.int32)
+    near = np.flatnonzero(np.isin(nodes, group.rows)[vertices].all(axis=1))
+    rows = np.sort(nodes[vertices[near]], axis=1)
+    _, number = np.unique(np.concatenate([group.rows, rows]), axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    return near[np.isin(number[len(group.rows) :], number[: len(group.rows)])].astype(np.int32)
+
+
+def import_gmsh() -> Any:
+    """Import Gmsh's Python module.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingBackendError: it cannot be imported.
+    """
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:
+        raise MissingBackendError(
+            f"Reading a Gmsh model needs Gmsh's Python module ({error}): install the package python3-gmsh, "
+            "or the PyPI package gmsh."
+        ) from error
+    return gmsh

@@ -1,0 +1,157 @@
+"""Where points stand relative to a target: gap, normal, weights and the second derivative of the gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.geometry.shapes import FacetShape
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+
+class Projection(Protocol):
+    """Where points stand relative to a target: the one thing the uniting equations ask of it."""
+
+    @property
+    def gap(self) -> Array:
+        """Signed distance ``(n,)``, positive outside."""
+
+    @property
+    def normal(self) -> Array:
+        """Unit normals out of the target ``(n, gdim)``."""
+
+    @property
+    def nodes(self) -> Ints:
+        """Global block numbers of the target's nodes ``(n, nn)``; ``nn = 0`` for a rigid target."""
+
+    @property
+    def weights(self) -> Array:
+        """Shape functions at the foot ``(n, nn)``."""
+
+    @property
+    def facet(self) -> Ints:
+        """Number of the facet over all ranks ``(n,)``."""
+
+    @property
+    def beyond(self) -> Array:
+        """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
+
+    def hessians(self, which: Ints) -> Array:
+        """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
+
+    def with_gap(self, gap: Array) -> Projection:
+        """The same projection of points that have moved along the normal."""
+
+
+class Target(Protocol):
+    """Anything that points can be projected onto, meshed or rigid.
+
+    Attributes:
+        n_nodes: that a contactor follows; 0 if the target is rigid.
+        stride: how far a contactor may move past it unseen, a length.
+    """
+
+    n_nodes: int
+    stride: float
+
+    def project(self, points: Array) -> Projection:
+        """Closest points in the current configuration (collective)."""
+
+    def follow(self, points: Array, old: Any) -> Projection:
+        """Gaps with the feet, normals and weights of an earlier projection of this target (small sliding, collective)."""
+
+
+@dataclass(frozen=True)
+class FacetProjection:
+    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the foot.
+
+    Attributes:
+        xi: reference coordinates of the foot ``(n, fdim)``.
+        foot: closest points ``(n, gdim)``.
+        averaged: interpolated nodal normals ``(n, gdim)``.
+        x: positions of the facet's nodes ``(n, nn, gdim)``.
+        dN: derivatives of the weights ``(n, nn, fdim)``.
+        ddN: second derivatives ``(n, nn, fdim, fdim)``.
+        bend: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero where the normal is the facet's.
+    """
+
+    gap: Array
+    normal: Array
+    nodes: Ints
+    weights: Array
+    facet: Ints
+    beyond: Array
+    xi: Array
+    foot: Array
+    averaged: Array
+    x: Array
+    dN: Array
+    ddN: Array
+    bend: Array
+
+    def with_gap(self, gap: Array) -> FacetProjection:
+        """The same projection of points that have moved along the normal."""
+        return replace(self, gap=gap)
+
+    def with_rows(self, which: Ints, values: Mapping[str, Array | float]) -> FacetProjection:
+        """Copy with some fields replaced at some points."""
+        updates = {name: np.array(getattr(self, name)) for name in values}
+        for name, value in values.items():
+            updates[name][which] = value
+        return replace(self, **updates)
+
+    def reaching_out(self, which: Ints, shape: FacetShape) -> FacetProjection:
+        """Copy in which some facets are continued past the target's open end, as far as their points lie beyond it."""
+        t = np.einsum("kaf,kag->kfg", self.dN[which], self.x[which])
+        m = np.einsum("kfg,keg->kfe", t, t)
+        step = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, self.beyond[which])[..., None])[..., 0]
+        xi = self.xi[which] + step
+        tab = shape.tabulate(xi)
+        foot = np.einsum("ka,kag->kg", tab.N, self.x[which])
+        return self.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
+
+    def hessians(self, which: Ints) -> Array:
+        """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
+
+        With the moving tangents ``t_a``, ``D_a`` the derivative of the foot's coordinate and ``N_a`` that of the facet's
+        slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
+        on a straight 2D facet this is the formula of the method's description.
+        """
+        fields = (getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "bend"))
+        return gap_hessians(*fields)
+
+
+def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array) -> Array:
+    """Second derivatives of the gap ``(k, (1 + nn) g, (1 + nn) g)``; arguments as the fields of ``FacetProjection``.
+
+    A side of a facet is served too: ``dN`` then has one column, and ``n`` is any direction across the side.
+    """
+    k, nn, fdim = dN.shape
+    gdim = n.shape[1]
+    size = (1 + nn) * gdim
+    t = np.einsum("kaf,kag->kfg", dN, x)
+    m = np.einsum("kfg,keg->kfe", t, t)
+    slope = np.einsum("kfg,keg->kfe", t, bend)
+    b = np.einsum("kg,kag,kafe->kfe", n, x, ddN) - 0.5 * (slope + slope.transpose(0, 2, 1))
+    # rows over (contactor, nodes) x gdim
+    N = np.zeros((k, fdim, 1 + nn, gdim))
+    N[:, :, 1:] = np.einsum("kaf,kg->kfag", dN, n)
+    T = g[:, None, None, None] * N
+    T[:, :, 0] = t
+    T[:, :, 1:] -= np.einsum("ka,kfg->kfag", w, t)
+    N, T = N.reshape(k, fdim, size), T.reshape(k, fdim, size)
+    D = np.linalg.solve(m - g[:, None, None] * b, T)
+    H = -np.einsum("kfi,kfj->kij", D, N)
+    H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
+    L = N + np.einsum("kfe,kei->kfi", b, D)
+    return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))

@@ -1,0 +1,287 @@
+"""Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
+
+Third step on the data's way. A point travels only to the ranks whose part of the target can be nearest, and only its answer
+travels back, so no rank ever sees a whole surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
+from uem_dolfinx.log import timed
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from uem_dolfinx.geometry.facets import FacetData, TargetFacets
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: An averaged normal that leans further from the facet's (its cosine) no longer tells where the facet is.
+LEAST_LEAN = 0.1
+#: Reference distance from a facet's side below which a foot counts as lying on it.
+ON_SIDE = 1e-10
+
+
+class MeshTarget:
+    """Target whose facets are spread over the ranks.
+
+    Args:
+        facets: the target's facets.
+        averaged: use nodal normals interpolated over the facet instead of the facet's own.
+    """
+
+    def __init__(self, facets: TargetFacets, averaged: bool = False):
+        self.facets, self.averaged = facets, averaged
+        self.shape: FacetShape = facets.shape
+        self.comm: MPI.Comm = facets.config.comm
+        self.n_nodes = facets.dofs.shape[1]
+        counts = self.comm.allgather(len(facets.dofs))
+        corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        # half of what the thinnest body of one cell, or its shortest facet, measures
+        self.stride = 0.5 * float(min(self.comm.allgather(min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf)))))
+        self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    def project(self, points: Array) -> FacetProjection:
+        """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
+        data, size = self.facets.current(), self.comm.size
+        if size == 1:
+            return self._ask(points, [np.arange(len(points))], data)
+        # the answer of the rank that seems nearest tells who else can be as near
+        near, far = self._bounds(points, data)
+        first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
+        found = self._ask(points, [np.flatnonzero(first == r) for r in range(size)], data)
+        reach = np.linalg.norm(points - found.foot, axis=1) * (1 + 1e-9) + ON_SIDE * self.stride
+        others = (near <= reach) & (first != np.arange(size)[:, None])
+        return self._ask(points, [np.flatnonzero(o) for o in others], data, found=found)
+
+    def project_on(self, points: Array, facet: Ints) -> FacetProjection:
+        """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
+        return self._ask(points, self._owners(facet), self.facets.current(), facet)
+
+    def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
+        """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
+        new = self._ask(points, self._owners(old.facet), self.facets.current(), old.facet, old.xi)
+        gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
+        return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
+
+    def outward(self, projection: FacetProjection) -> Array:
+        """The facets' own outward normals at the feet, also where ``normal`` is an averaged one ``(n, gdim)``."""
+        own = _unit_normals_of(projection)
+        return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
+
+    def keys_of(self, facet: Ints) -> Ints:
+        """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
+        owners = self._owners(facet)
+        asked = self.comm.alltoall([facet[i] for i in owners])
+        answers = self.comm.alltoall([self.facets.keys[a - self.first[self.comm.rank]] for a in asked])
+        keys = np.full(len(facet), -1, dtype=np.int64)
+        for i, answer in zip(owners, answers):
+            keys[i] = answer
+        return keys
+
+    def facets_of(self, keys: Ints) -> Ints:
+        """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""
+        size, mine = self.comm.size, self.facets.keys
+        number = self.first[self.comm.rank] + np.arange(len(mine))
+        # keys and numbers meet on a home rank
+        told = self.comm.alltoall([(mine[mine % size == r], number[mine % size == r]) for r in range(size)])
+        known, numbers = (np.concatenate(part) for part in zip(*told))
+        order = np.argsort(known)
+        known, numbers = np.append(known[order], -1), np.append(numbers[order], -1)
+        homes = [np.flatnonzero((keys >= 0) & (keys % size == r)) for r in range(size)]
+        found = []
+        for wanted in self.comm.alltoall([keys[i] for i in homes]):
+            at = np.searchsorted(known[:-1], wanted)
+            found.append(np.where(known[at] == wanted, numbers[at], -1))
+        facet = np.full(len(keys), -1, dtype=np.int64)
+        for i, answer in zip(homes, self.comm.alltoall(found)):
+            facet[i] = answer
+        return facet
+
+    def _owners(self, facet: Ints) -> list[Ints]:
+        """Per rank, which of the facets it holds."""
+        owner = np.searchsorted(self.first, facet, side="right") - 1
+        return [np.flatnonzero(owner == r) for r in range(self.comm.size)]
+
+    def _bounds(self, points: Array, data: FacetData) -> tuple[Array, Array]:
+        """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective)."""
+        nodes = data.x.reshape(-1, points.shape[1])
+        box = np.stack([nodes.min(axis=0), nodes.max(axis=0)]) if len(nodes) else None
+        near, far = np.full((2, self.comm.size, len(points)), np.inf)
+        for r, b in enumerate(self.comm.allgather(box)):
+            if b is not None:
+                slack = 0.0 if self.shape.degree == 1 else 0.25 * np.linalg.norm(b[1] - b[0])
+                outside = np.maximum(np.maximum(b[0] - points, points - b[1]), 0.0)
+                near[r] = np.linalg.norm(outside, axis=1) - slack
+                far[r] = np.linalg.norm(np.maximum(np.abs(points - b[0]), np.abs(points - b[1])), axis=1) + slack
+        return near, far
+
+    def _ask(
+        self,
+        points: Array,
+        requests: list[Ints],
+        data: FacetData,
+        facet: Ints | None = None,
+        xi: Array | None = None,
+        found: FacetProjection | None = None,
+    ) -> FacetProjection:
+        """Send each rank its points (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
+        comm = self.comm
+        known = [a for a in (points, facet, xi) if a is not None]
+        local = [[a[i] for a in known] for i in requests]
+        asked = comm.alltoall(local) if comm.size > 1 else local
+        p, *rest = (np.concatenate(a) for a in zip(*asked))
+        if rest:
+            rest[0] = rest[0] - self.first[comm.rank]
+        answer = self._project_here(p, data, *rest)
+        if comm.size == 1:
+            return answer
+        # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
+        ends = np.cumsum([0, *(len(a[0]) for a in asked)])
+        columns = self._judged(p, answer)
+        parts = comm.alltoall([[column[a:b] for column in columns] for a, b in pairwise(ends)])
+        if found is not None:
+            requests, parts = [*requests, np.arange(len(points))], [*parts, self._judged(points, found)]
+        d, h, *columns = (np.concatenate(column) for column in zip(*parts))
+        answers = FacetProjection(*columns)
+        best = _nearest(np.concatenate(requests), d, h, answers.facet)
+        return FacetProjection(*(column[best] for column in columns))
+
+    def _judged(self, points: Array, answer: FacetProjection) -> list[npt.NDArray[Any]]:
+        """What tells the nearest of several answers, distance and height over the facet's own plane, and the answer's fields."""
+        away = points - answer.foot
+        height = np.einsum("ng,ng->n", away, self.outward(answer))
+        return [np.linalg.norm(away, axis=1), height, *(getattr(answer, f.name) for f in fields(answer))]
+
+    def _project_here(
+        self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
+    ) -> FacetProjection:
+        """Project onto this rank's facets."""
+        if facet is None:
+            pairs, candidates = candidate_pairs(self.shape, data.x, points)
+            xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
+            tab = self.shape.tabulate(xi)
+            away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
+            height = np.einsum("ng,ng->n", away, unit_normals(tab, x)) * self.facets.sign[candidates]
+            best = _nearest(pairs, np.sqrt(d2), height, candidates)
+            facet, xi = candidates[best], xi[best]
+        elif xi is None:
+            xi, _ = closest_point(self.shape, data.x[facet], points)
+        return self._evaluate(points, facet, xi, data)
+
+    def _evaluate(self, points: Array, facet: Ints, xi: Array, data: FacetData) -> FacetProjection:
+        """Gap, normal and geometry at the feet ``xi`` on this rank's facets."""
+        tab = self.shape.tabulate(xi)
+        x = data.x[facet]
+        foot = np.einsum("na,nag->ng", tab.N, x)
+        facet_normal = unit_normals(tab, x) * self.facets.sign[facet, None]
+        raw = np.einsum("na,nag->ng", tab.N, data.nodal_normals[facet])
+        length = np.linalg.norm(raw, axis=1, keepdims=True)
+        averaged_normal = raw / np.where(length > 0, length, 1.0)
+        on_side = self.shape.side_distances(xi) < ON_SIDE
+        is_open = self.facets.open_sides[facet]
+        away = points - foot
+        # exactly on a shared side either facet's normal would be an arbitrary choice
+        at_side = np.linalg.norm(away, axis=1) <= ON_SIDE * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+        use_average = np.full(len(points), True) if self.averaged else at_side & (on_side & ~is_open).any(axis=1)
+        use_average &= length[:, 0] > 0
+        normal = np.where(use_average[:, None], averaged_normal, facet_normal)
+        bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / np.where(length > 0, length, 1.0)[:, :, None]
+        bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
+        bend[~use_average] = 0.0
+        # along an averaged normal, which leans, the way to the facet is longer than to its closest point
+        lean = np.einsum("ng,ng->n", normal, facet_normal)
+        gap = np.einsum("ng,ng->n", facet_normal, away) / np.where(lean > LEAST_LEAN, lean, 1.0)
+        beyond = away - gap[:, None] * normal
+        # a facet may touch the surface's end with a vertex alone
+        at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
+        beyond[~at_end] = 0.0
+        return FacetProjection(
+            gap,
+            normal,
+            data.nodes[facet],
+            tab.N,
+            facet + self.first[self.comm.rank],
+            beyond,
+            xi,
+            foot,
+            averaged_normal,
+            x,
+            tab.dN,
+            tab.ddN,
+            bend,
+        )
+
+
+def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints:
+    """The nearest of several candidates for each point, as indices.
+
+    Outside a convex edge the facets that share it are equally near; the point is then above the one over which it is highest,
+    so that it cannot hover in the plane of another. What is still tied goes by number.
+    """
+    closest = np.full(points.max(initial=-1) + 1, np.inf)
+    np.minimum.at(closest, points, distance)
+    farther = distance > closest[points] * (1 + 1e-9) + np.finfo(float).tiny
+    order = np.lexsort((number, -np.round(height / np.where(closest > 0, closest, 1.0)[points], 9), farther, points))
+    _, first = np.unique(points[order], return_index=True)
+    return order[first]
+
+
+def _unit_normals_of(p: FacetProjection) -> Array:
+    return unit_normals(Tabulated(p.weights, p.dN, p.ddN), p.x)
+
+
+@timed("search")
+def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
+    """All pairs (point, facet) that can be closest, from trees over the facets' middles, one per size class.
+
+    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
+    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere.
+
+    Args:
+        shape: kind of the facets.
+        x: facet nodes ``(m, nn, gdim)``.
+        points: ``(n, gdim)``.
+
+    Returns:
+        Indices of points and of facets, both ``(k,)``; every point occurs at least once if there are facets.
+    """
+    if len(points) == 0 or len(x) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    from scipy.spatial import cKDTree
+
+    tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
+    middle = np.einsum("na,nag->ng", tab.N, x)
+    arm, stretch = x - middle[:, None], 1.0 if shape.degree == 1 else 1.5
+    radius = stretch * np.linalg.norm(arm, axis=2).max(axis=1)
+    normal = unit_normals(tab, x)
+    bulge = stretch * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
+    bound, _ = cKDTree(middle).query(points)
+    bound = bound * (1 + 1e-12)
+    size_class = np.floor(np.log2(radius / radius.max()))
+    pairs, facets = [], []
+    for c in np.unique(size_class):
+        members = np.flatnonzero(size_class == c)
+        reach = bound + radius[members].max()
+        hits = cKDTree(middle[members]).query_ball_point(points, reach, return_sorted=False)
+        counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
+        pairs.append(np.repeat(np.arange(len(points)), counts))
+        facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
+    i, f = np.concatenate(pairs), np.concatenate(facets)
+    # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
+    away = points[i] - middle[f]
+    height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
+    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
+    return i[~too_far], f[~too_far]

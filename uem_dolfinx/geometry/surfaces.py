@@ -1,0 +1,84 @@
+"""Contact surfaces of a function space: the contactor's nodes and the target's facets, in the current configuration.
+
+Second step on the data's way: tags become nodes, facets, outward normals and tributary areas, each rank for its own part.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError, SurfaceError, TagError, UEMError
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.configuration import Configuration
+    from uem_dolfinx.geometry.facets import TargetFacets
+    from uem_dolfinx.geometry.gmsh import Tag
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+def check_tag(config: Configuration, tag: Tag, role: str) -> None:
+    """Refuse tags that are not facets of this mesh, nor points of it that a contactor may be (collective)."""
+    error: UEMError | None = None
+    if tag.mesh is not config.mesh:
+        error = SpaceError(f"{role} '{tag.name}' belongs to another mesh than the displacement: read both from one mesh")
+    elif tag.dim != config.tdim - 1 and (tag.dim != 0 or role == "target"):
+        points = "" if role == "target" else ", or points, dimension 0"
+        error = TagError(f"{role} '{tag.name}' has dimension {tag.dim}: expected facets, dimension {config.tdim - 1}{points}")
+    agree(config.comm, error)
+    if config.comm.allreduce(len(tag.entities)) == 0:
+        what = "facets" if tag.dim else "points"
+        raise TagError(f"{role} '{tag.name}' holds no {what}: check the physical group in the gmsh model")
+
+
+def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:
+    """Owned nodes on the closure of a tag's facets, or at its points, sorted (collective)."""
+    config.mesh.topology.create_connectivity(tag.dim, config.tdim)
+    nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
+    return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
+
+
+def tributary_areas(config: Configuration, tag: Tag) -> Array:
+    """Integral of each shape function over the reference surface, per local node; zero for points ``(n_local,)`` (collective)."""
+    if tag.dim == 0:
+        return np.zeros(config.n_local)
+    S = compat.function_space(config.mesh, config.degree)
+    v = ufl.TestFunction(S)
+    b = compat.create_vector(S)
+    forms.assemble_vector(b, compat.form(v * forms.surface_measure(config.mesh, tag.entities)))
+    areas = np.array(b.array_r)
+    b.destroy()
+    return areas
+
+
+def followed_nodes(config: Configuration, targets: list[TargetFacets]) -> npt.NDArray[np.bool_]:
+    """Which local nodes lie on any of the targets ``(n_local,)`` (collective)."""
+    mark = fem.Function(config.V)
+    for target in targets:
+        mark.x.array.reshape(-1, config.gdim)[target.dofs.ravel()] = 1.0
+    forms.sum_ghosts(mark)
+    return mark.x.array.reshape(-1, config.gdim)[:, 0] > 0
+
+
+def check_distinct(config: Configuration, contactor: npt.NDArray[np.int32], target: TargetFacets, names: tuple[str, str]) -> None:
+    """Refuse a contactor that is part of its own target (collective).
+
+    Raises:
+        SurfaceError: naming the first shared node.
+    """
+    shared = contactor[followed_nodes(config, [target])[contactor]]
+    error = None
+    if len(shared):
+        error = SurfaceError(
+            f"contactor '{names[0]}' and target '{names[1]}' share the node at {config.describe(int(shared[0]))}: "
+            "give each body its own nodes and its own surface"
+        )
+    agree(config.comm, error)

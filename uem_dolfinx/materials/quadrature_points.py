@@ -1,0 +1,140 @@
+"""Quadrature points of chosen cells: values of expressions there, Functions that hold what is known only there, sums and means.
+
+Between forms and the laws with history on the data's way: those compute on arrays with one row for each point.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError, TagError, UEMError
+from uem_dolfinx.log import compiling
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.gmsh import Tag
+
+Array = npt.NDArray[np.float64]
+
+#: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
+BESIDE_CENTRE = 1e-4
+#: Their directions by dimension: sums of all coordinates and of products of two different ones vanish, but for that of the plane.
+DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]}
+
+
+def owned_cells(domain: Any, tag: Tag | None) -> npt.NDArray[np.int32]:
+    """Cells of a tag, or all cells, that this rank owns (collective).
+
+    Args:
+        domain: the mesh.
+        tag: of cells; None is all of them.
+
+    Returns:
+        Local indices ``(n_cells,)``, ascending.
+
+    Raises:
+        SpaceError: if the tag belongs to another mesh.
+        TagError: if it is not one of cells, or holds none on any rank.
+    """
+    tdim = domain.topology.dim
+    owned = domain.topology.index_map(tdim).size_local
+    if tag is None:
+        return np.arange(owned, dtype=np.int32)
+    error: UEMError | None = None
+    if tag.mesh is not domain:
+        error = SpaceError(f"the cells {tag} belong to another mesh than the displacement: read both from one mesh")
+    elif tag.dim != tdim:
+        error = TagError(f"the tag {tag} has dimension {tag.dim}: expected cells, dimension {tdim}")
+    agree(domain.comm, error)
+    if domain.comm.allreduce(len(tag.entities)) == 0:
+        raise TagError(f"the tag {tag} holds no cells: check the physical group in the gmsh model")
+    return np.unique(tag.entities[tag.entities < owned]).astype(np.int32)
+
+
+class QuadraturePoints:
+    """Points of one quadrature rule in some of the cells this rank owns; all methods work on these alone.
+
+    Args:
+        domain: the mesh.
+        cells: local indices of owned cells ``(n_cells,)``.
+        degree: of the rule; 0 is the cells' centre, for use together with other rules. Points beside it stand for it: from a rule of
+            one point, FFCx takes gradients and Jacobians for constants of the cell and uses them at the points of other rules of
+            the same form.
+
+    Attributes:
+        points: on the reference cell, ``(n_points, tdim)``.
+        dx: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless others write there.
+        volumes: that belong to the points, ``(n_cells, n_points)``.
+    """
+
+    def __init__(self, domain: Any, cells: npt.NDArray[np.int32], degree: int):
+        self.mesh, self.cells, self.degree = domain, cells, degree
+        #: By the size of their values: the spaces made, and where the points are in them.
+        self._spaces: dict[int, tuple[fem.FunctionSpace, npt.NDArray[np.int32]]] = {}
+        metadata: dict[str, Any] = {"quadrature_degree": degree}
+        self.points, weights = forms.quadrature_rule(domain, degree)
+        if degree == 0:
+            self.points = self.points + BESIDE_CENTRE * np.array(DIRECTIONS[domain.topology.dim])
+            weights = np.full(len(self.points), weights[0] / len(self.points))
+            metadata = {
+                "quadrature_rule": "custom",
+                "quadrature_points": self.points.tolist(),
+                "quadrature_weights": weights.tolist(),
+            }
+        self.dx = ufl.dx(domain=domain, metadata=metadata)
+        jacobian = self.evaluate(self.compile(ufl.JacobianDeterminant(domain)))
+        self.volumes: Array = np.abs(jacobian.reshape(len(cells), len(weights))) * weights
+
+    def compile(self, expression: Any) -> fem.Expression:
+        """Prepare a scalar or vector UFL expression for ``evaluate``; once, as it takes a compiler."""
+        with compiling("stresses at the quadrature points"):
+            return fem.Expression(expression, self.points)
+
+    def evaluate(self, compiled: fem.Expression) -> Array:
+        """Present values ``(n_cells * n_points, size)``."""
+        values = compat.evaluate(compiled, self.mesh, self.cells)
+        return values.reshape(-1, values.shape[2])
+
+    def create_function(self, name: str, size: int = 1) -> fem.Function:
+        """A scalar or vector Function that is known at the points only, zero at first."""
+        if size not in self._spaces:
+            V = compat.quadrature_space(self.mesh, self.degree, () if size == 1 else (size,))
+            self._spaces[size] = V, compat.cell_dofs(V)[self.cells].ravel()
+        return fem.Function(self._spaces[size][0], name=name)
+
+    def _rows(self, f: fem.Function) -> tuple[Array, npt.NDArray[np.int32]]:
+        """All local values of a Function ``(n, size)``, a view, and the rows of the points."""
+        size = f.function_space.dofmap.index_map_bs
+        return f.x.array.reshape(-1, size), self._spaces[size][1]
+
+    def read(self, f: fem.Function) -> Array:
+        """Values of a Function ``(n_cells * n_points, size)``, a copy."""
+        values, rows = self._rows(f)
+        return np.asarray(values[rows])
+
+    def write(self, f: fem.Function, new: Array) -> None:
+        """Set the values of a Function; ghosts are left as they are."""
+        values, rows = self._rows(f)
+        values[rows] = new.reshape(len(rows), values.shape[1])
+
+    def integrate(self, values: Array) -> float:
+        """Integral of values ``(n_cells * n_points,)`` over the cells of all ranks (collective)."""
+        return float(self.mesh.comm.allreduce(values @ self.volumes.ravel()))
+
+    def average(self, values: Array, f: fem.Function) -> None:
+        """Fill a DG0 Function with the means over each cell of values ``(n_cells * n_points, size)`` (collective)."""
+        means = np.einsum("cp,cps->cs", self.volumes, values.reshape(*self.volumes.shape, values.shape[1]))
+        rows = compat.cell_dofs(f.function_space)[self.cells, 0]
+        f.x.array.reshape(-1, means.shape[1])[rows] = means / self.volumes.sum(axis=1, keepdims=True)
+        f.x.scatter_forward()
+
+    def where(self, point: int) -> str:
+        """Middle of the cell that holds a point, for error messages."""
+        nodes = compat.geometry_dofs(self.mesh)[self.cells[point // len(self.points)]]
+        return "(" + ", ".join(f"{x:.6g}" for x in self.mesh.geometry.x[nodes].mean(axis=0)[: self.mesh.geometry.dim]) + ")"

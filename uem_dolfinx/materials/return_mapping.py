@@ -1,0 +1,149 @@
+"""Return of stresses onto the von Mises yield surface, at many points at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    pass
+
+Array = npt.NDArray[np.float64]
+
+#: A stress outside the yield surface by no more than this part of the yield stress is on it.
+ON_SURFACE = 1e-10
+#: The plane-stress return ends with a Newton step below this part of the consistency parameter; the next one would be its square.
+RETURNED = 1e-10
+#: Bound on those steps; they come from one side and are quadratic, and random states took 7 at most.
+MAX_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Returned:
+    """Stress, history and tangent after a return, at n points.
+
+    Vectors hold the k components (11, 22, sqrt(2) 12) in plane stress, (11, 22, 33, sqrt(2) 12) in plane strain and
+    (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product is that of the tensors.
+
+    Attributes:
+        stress: the stress in plane stress, otherwise its deviator, ``(n, k)``.
+        plastic_strain: ``(n, k)``.
+        peeq: equivalent plastic strain ``(n,)``.
+        a, c, m: the tangent ``a I + c 1 x 1 - m x m``, with the unit tensor 1 of the normal components, ``(n,)``, ``(n,)``, ``(n, k)``.
+    """
+
+    stress: Array
+    plastic_strain: Array
+    peeq: Array
+    a: Array
+    c: Array
+    m: Array
+
+    @property
+    def tangent(self) -> Array:
+        """Derivative of ``stress`` by the strain ``(n, k, k)``."""
+        k = self.m.shape[1]
+        one = (np.arange(k) < (2 if k == 3 else 3)).astype(float)
+        plain = self.a[:, None, None] * np.eye(k) + self.c[:, None, None] * np.outer(one, one)
+        return plain - self.m[:, :, None] * self.m[:, None, :]
+
+
+def radial_return(
+    strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array
+) -> Returned:
+    """Return of the deviator along its own direction, for 3D and plane strain (Simo and Hughes, Computational Inelasticity, box 3.2).
+
+    Args:
+        strain: ``(n, k)`` with k = 4 or 6, components as in ``Returned``.
+        plastic_strain: committed, ``(n, k)``.
+        peeq: committed equivalent plastic strain ``(n,)``.
+        mu: shear modulus ``(n,)``.
+        yield_stress: at no plastic strain, ``(n,)``; infinite where elastic.
+        hardening: slope of the yield stress over ``peeq``, ``(n,)``.
+
+    Returns:
+        Deviator, history and the deviator's tangent.
+    """
+    s = strain - plastic_strain
+    s[:, :3] -= s[:, :3].mean(axis=1, keepdims=True)
+    s *= 2 * mu[:, None]
+    q = np.sqrt(1.5) * np.linalg.norm(s, axis=1)
+    flow = yield_stress + hardening * peeq
+    plastic_strain, peeq, a, m = plastic_strain.copy(), peeq.copy(), 2 * mu, np.zeros_like(s)
+    i = np.flatnonzero(q > (1 + ON_SURFACE) * flow)
+    stiff = 3 * mu[i] + hardening[i]
+    dp = (q[i] - flow[i]) / stiff
+    direction = s[i] / q[i, None]
+    # 1 - 3 mu dp / q without the difference of equals
+    kept = (flow[i] + hardening[i] * dp) / q[i]
+    peeq[i] += dp
+    plastic_strain[i] += 1.5 * dp[:, None] * direction
+    s[i] *= kept[:, None]
+    a[i] *= kept
+    m[i] = np.sqrt(9 * mu[i] ** 2 / stiff * flow[i] / q[i])[:, None] * direction
+    return Returned(s, plastic_strain, peeq, a, -a / 3, m)
+
+
+def plane_stress_return(
+    strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array
+) -> Returned:
+    """Return within the plane of stress (Simo and Taylor, Int. J. Numer. Meth. Engng 22 (1986) 649-670).
+
+    Elasticity and yield surface share the eigenmodes s11 + s22, s11 - s22 and s12, which shrink by 1 / (1 + r x) and 1 / (1 + x);
+    x is the consistency parameter times 2 mu and the root of
+
+        h(x) = flow / q(x) + 2 H x / (6 mu) - 1.
+
+    1 / q is the harmonic-like mean ``(y1^-2 + y2^-2)^(-1/2)`` of linear functions of x, so h is concave and grows: Newton's method
+    from x = 0 approaches the root from the left and needs no other safeguard.
+
+    Args:
+        strain: in the plane, ``(n, 3)``, components as in ``Returned``.
+        plastic_strain: committed, ``(n, 3)``.
+        peeq: committed equivalent plastic strain ``(n,)``.
+        E: Young's modulus ``(n,)``.
+        nu: Poisson's ratio ``(n,)``.
+        yield_stress: at no plastic strain, ``(n,)``; infinite where elastic.
+        hardening: slope of the yield stress over ``peeq``, ``(n,)``.
+
+    Returns:
+        Stress, history and tangent.
+    """
+    shear, area = E / (1 + nu), E / (1 - nu)
+    modes = _MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])
+    flow = yield_stress + hardening * peeq
+    i = np.flatnonzero(_plane_mises(modes[0] ** 2, modes[1] ** 2 + modes[2] ** 2) > (1 + ON_SURFACE) * flow)
+    b, flow, H, r = shear[i], flow[i], hardening[i], (area / shear)[i] / 3
+    ss, dd = modes[0, i] ** 2, modes[1, i] ** 2 + modes[2, i] ** 2
+    slope, x = 2 * H / (3 * b), np.zeros(len(i))
+    for _ in range(MAX_STEPS):
+        y, z = 1 / (1 + r * x), 1 / (1 + x)
+        q = _plane_mises(ss * y**2, dd * z**2)
+        step = (1 - slope * x - flow / q) / (flow / q**3 * (0.5 * r * ss * y**3 + 1.5 * dd * z**3) + slope)
+        x += step
+        if (np.abs(step) <= RETURNED * (1 + x)).all():
+            break
+    y, z = 1 / (1 + r * x), 1 / (1 + x)
+    modes[:, i] *= np.stack([y, z, z])
+    q = _plane_mises(modes[0, i] ** 2, modes[1, i] ** 2 + modes[2, i] ** 2)
+    plastic_strain, peeq, m = plastic_strain.copy(), peeq.copy(), np.zeros_like(strain)
+    normal = modes[:, i] / np.array([[3.0], [1.0], [1.0]])
+    plastic_strain[i] += (_MODES.T @ (normal * x / b)).T
+    peeq[i] += x / b * q / 1.5
+    area[i] *= y
+    shear[i] *= z
+    pushed = normal * np.stack([area[i], shear[i], shear[i]])
+    m[i] = (_MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + 4 / 9 * q**3 * H / flow))).T
+    return Returned((_MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m)
+
+
+#: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.
+_MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
+
+
+def _plane_mises(ss: Array, dd: Array) -> Array:
+    """Von Mises stress from the squares of the modes."""
+    return np.sqrt(0.5 * ss + 1.5 * dd)

@@ -1,0 +1,366 @@
+"""Von Mises plasticity: return mapping at quadrature points, consistent tangent, trial and committed history.
+
+A convenience on the data's way, beside the elastic laws: stress and tangent enter forms as functions known at quadrature points.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import NotFiniteError, SpaceError, UEMError
+from uem_dolfinx.log import timed
+from uem_dolfinx.materials.elastic import KINDS, green_lagrange
+from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
+from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from ufl.core.expr import Expr
+
+    from uem_dolfinx.geometry.gmsh import Tag
+
+Array = npt.NDArray[np.float64]
+
+STRAINS = ("small", "green_lagrange")
+#: Degrees of the quadrature of stress and of pressure, by the displacement's degree, on simplices and on tensor-product cells;
+#: 0 is the cell's centre.
+SIMPLEX_DEGREES = {1: (1, 1), 2: (2, 2)}
+TENSOR_DEGREES = {1: (2, 0), 2: (4, 2)}
+
+
+# -- kernels -----------------------------------------------------------------------------------------------------------
+
+
+# -- the law -----------------------------------------------------------------------------------------------------------
+
+
+class VonMises:
+    """Elasto-plasticity with the yield surface of von Mises, associated flow and linear isotropic hardening.
+
+        S = C : (E - E_p),    q(S) <= yield_stress + hardening * peeq
+
+    ``update`` returns the stresses at the present displacement from the *committed* history, ``commit`` makes the outcome the
+    history; what iterates did in between counts as neither loading nor unloading [UEM, 3]. The form is
+    ``residual(v)``; its tangent is ``ufl.derivative(residual(v), u) + stiffness(du, v)``.
+
+    Plastic flow keeps the volume, and cells that cannot follow it lock. In 3D and plane strain the pressure, elastic in this law, is
+    therefore integrated by a rule of its own. With the error of the limit load of Prandtl's punch in plane strain, perfectly plastic
+    at a strain of 0.001 and pressed in by 0.03 of its width, on 8 linear or 4 quadratic cells beneath half of it:
+
+    - degree 1 on quadrilaterals and hexahedra, 5.6 %: stress at 2 points per direction, pressure at the cell's centre, which is the
+      B-bar method (Hughes, Int. J. Numer. Meth. Engng 15 (1980) 1413-1418); with the pressure at the stress's points it would be
+      35 % and grow with the load. Hexahedra that are no parallelepipeds then pass the patch test approximately: with nodes
+      moved by 10 % of a cell's size stresses err by 0.08 %, by 25 % 0.6 %;
+    - degree 2 on quadrilaterals and hexahedra, 4.2 %: stress at 3 points per direction, pressure at 2; with both at 3 it
+      would be 12 %;
+    - degree 2 on triangles and tetrahedra, 7.0 %: both by the rule of degree 2, as a single point for the pressure leaves the
+      tangent singular;
+    - degree 1 on triangles and tetrahedra, 24 % and growing: one point. These cells **lock**, use one of the others.
+
+    Plane stress does not lock with any cell.
+
+    Args:
+        u: displacement, a Function of a vector Lagrange space.
+        E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
+        nu: Poisson's ratio.
+        yield_stress: in uniaxial tension; infinite where the body is elastic.
+        hardening: increase of the yield stress per equivalent plastic strain; 0 is perfect plasticity.
+        kind: ``"3d"``, ``"plane_strain"`` or ``"plane_stress"``.
+        strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange
+            strain, with the second Piola-Kirchhoff stress in the yield surface; for large rotations and moderate strains.
+        cells: the cells made of this material, which may be none on some ranks; None is all cells.
+        quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
+
+    Attributes:
+        stress, plastic_strain, peeq: at quadrature points, with the components of ``Returned``; ``stress`` as of the last
+            ``update``, the others committed; zero outside of ``cells``.
+        history: the committed Functions by name, all that the material remembers.
+
+    Raises:
+        ValueError: for an unknown word, or a parameter out of its range.
+        SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or the mesh of ``cells`` is another.
+        TagError: if ``cells`` are not cells, or none on any rank.
+    """
+
+    def __init__(
+        self,
+        u: fem.Function,
+        E: Any,
+        nu: Any,
+        yield_stress: Any,
+        hardening: Any = 0.0,
+        *,
+        kind: str = "3d",
+        strain: str = "small",
+        cells: Tag | None = None,
+        quadrature_degree: int | None = None,
+    ):
+        for name, word, words in (("kind", kind, KINDS), ("strain", strain, STRAINS)):
+            if word not in words:
+                raise ValueError(f"{name} = '{word}': expected one of {', '.join(words)}")
+        V = u.function_space
+        self.u, self.kind, self.strain = u, kind, strain
+        self.mesh, self.comm = V.mesh, V.mesh.comm
+        self.cells = owned_cells(self.mesh, cells)
+        self._points, self._pressure_points = (
+            QuadraturePoints(self.mesh, self.cells, degree) for degree in self._degrees(quadrature_degree)
+        )
+        self._read_parameters(E, nu, yield_stress, hardening)
+        self._create_functions()
+        self._strain = self._points.compile(self._vector(self._lagrangian(u)))
+        self._volume_change = self._pressure_points.compile(ufl.tr(self._lagrangian(u)))
+        self._spread = self._spreading()
+        #: Outcome of the last update.
+        self._trial: Returned
+        self.update()
+
+    # -- set-up ------------------------------------------------------------------------------------------------------
+
+    def _degrees(self, quadrature_degree: int | None) -> tuple[int, int]:
+        """Degrees of the quadrature of stress and of pressure."""
+        V, gdim = self.u.function_space, self.mesh.geometry.dim
+        degree = compat.lagrange_degree(V)
+        if V.dofmap.index_map_bs != gdim or self.mesh.topology.dim != gdim or degree not in (1, 2):
+            raise SpaceError(
+                f"plasticity needs a displacement in a vector Lagrange space of size {gdim} and degree 1 or 2 on a mesh of "
+                f"dimension {gdim}: got size {V.dofmap.index_map_bs}, degree {degree}, dimension {self.mesh.topology.dim}"
+            )
+        if (gdim == 3) != (self.kind == "3d"):
+            raise ValueError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components")
+        cell = compat.cell_name(self.mesh)
+        simplex = cell in ("triangle", "tetrahedron")
+        affine = simplex and compat.geometry_dofs(self.mesh).shape[1] == gdim + 1
+        # one point is for constant strains
+        lowest = 1 if affine and degree == 1 else 2
+        if quadrature_degree is not None and quadrature_degree < lowest:
+            raise ValueError(
+                f"quadrature_degree = {quadrature_degree}: expected {lowest} or more for degree {degree} on {cell} cells"
+            )
+        stress, pressure = (SIMPLEX_DEGREES if simplex else TENSOR_DEGREES)[degree]
+        stress = max(stress, lowest) if quadrature_degree is None else quadrature_degree
+        return stress, min(stress, max(pressure, lowest) if simplex else pressure)
+
+    def _spreading(self) -> Array:
+        """Values at the stress points of the pressure, which its own points give as a constant or (multi)linear: rows sum to 1."""
+        linear = forms.create_lagrange_element(compat.cell_name(self.mesh), 1)
+        at, known = (
+            linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in (self._points, self._pressure_points)
+        )
+        # the points beside a centre count as one
+        spread = at @ np.linalg.pinv(known, rcond=1e-2)
+        return spread / spread.sum(axis=1, keepdims=True)
+
+    def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
+        """Take the parameters of every cell, and repeat them for its points."""
+        E = self._cellwise("E", E, lambda value: (value > 0) & np.isfinite(value), "a positive number")
+        most = 1.0 if self.kind == "plane_stress" else 0.5
+        nu = self._cellwise("nu", nu, lambda value: (value > -1) & (value < most), f"a number between -1 and {most}")
+        yield_stress = self._cellwise("yield_stress", yield_stress, lambda value: value > 0, "a positive number")
+        hardening = self._cellwise(
+            "hardening", hardening, lambda value: (value >= 0) & np.isfinite(value), "0 or a positive number"
+        )
+        self._E, self._nu, self._yield_stress, self._hardening = (
+            np.repeat(values, len(self._points.points)) for values in (E, nu, yield_stress, hardening)
+        )
+        self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
+
+    def _cellwise(self, name: str, given: Any, good: Any, expected: str) -> Array:
+        """Values of a parameter in ``cells``, refused on all ranks if they are out of range on any (collective)."""
+        if isinstance(given, fem.Function):
+            V = given.function_space
+            dofs = compat.cell_dofs(V)
+            if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
+                raise SpaceError(
+                    f"{name} is a Function of {V}: expected a number, or a scalar DG0 Function of the displacement's mesh"
+                )
+            values = np.array(given.x.array[dofs[self.cells, 0]])
+        else:
+            values = np.full(len(self.cells), float(given))
+        bad = np.flatnonzero(~good(values))
+        found = None
+        if len(bad):
+            where = self._points.where(bad[0] * len(self._points.points))
+            found = f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {expected}"
+        found = next((text for text in self.comm.allgather(found) if text), None)
+        if found:
+            raise ValueError(found)
+        return values
+
+    def _create_functions(self) -> None:
+        """Functions at the quadrature points, zero outside of this material's cells."""
+        size, at = {"3d": 6, "plane_strain": 4, "plane_stress": 3}[self.kind], self._points
+        self.stress = at.create_function("stress", size)
+        self.plastic_strain = at.create_function("plastic_strain", size)
+        self.peeq = at.create_function("peeq")
+        self.history: dict[str, fem.Function] = {f.name: f for f in (self.plastic_strain, self.peeq)}
+        # what the forms hold: the deviator where the pressure goes its own way, and the tangent
+        self._s = self.stress if self.kind == "plane_stress" else at.create_function("deviator", size)
+        self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
+        self._kappa = fem.Function(compat.dg0_space(self.mesh), name="bulk_modulus")
+        self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
+
+    # -- forms -------------------------------------------------------------------------------------------------------
+
+    def _lagrangian(self, u: Any) -> Expr:
+        return ufl.sym(ufl.grad(u)) if self.strain == "small" else green_lagrange(u)
+
+    def _variation(self, v: Any) -> Expr:
+        """Derivative of the strain along ``v``."""
+        G = ufl.grad(v)
+        return ufl.sym(G if self.strain == "small" else G + ufl.grad(self.u).T * G)
+
+    def _vector(self, A: Any) -> Expr:
+        """Components of a symmetric tensor in the order of ``Returned``."""
+        root = 2**0.5
+        if self.kind == "3d":
+            return ufl.as_vector([A[0, 0], A[1, 1], A[2, 2], root * A[1, 2], root * A[0, 2], root * A[0, 1]])
+        across = [] if self.kind == "plane_stress" else [0]
+        return ufl.as_vector([A[0, 0], A[1, 1], *across, root * A[0, 1]])
+
+    def residual(self, v: Any) -> ufl.Form:
+        """Internal virtual work of the material's cells.
+
+        Args:
+            v: test function.
+
+        Returns:
+            The form, integrated over all cells, in those of other materials with zeros, so that it may be added to integrals over
+            any tagged cells.
+        """
+        variation = self._variation(v)
+        work = ufl.dot(self._s, self._vector(variation)) * self._points.dx
+        if self.kind == "plane_stress":
+            return work
+        return work + self._kappa * ufl.tr(self._lagrangian(self.u)) * ufl.tr(variation) * self._pressure_points.dx
+
+    def stiffness(self, du: Any, v: Any) -> ufl.Form:
+        """The part ``C : dE(u; du) : dE(u; v)`` of the tangent that ``ufl.derivative(residual(v), u)`` cannot see.
+
+        C is the consistent tangent of the last ``update``, symmetric; in 3D and plane strain its deviatoric part, as the derivative
+        sees the pressure.
+
+        Args:
+            du: trial function.
+            v: test function.
+
+        Returns:
+            The form.
+        """
+        A, B = self._variation(du), self._variation(v)
+        plain = self._a * ufl.inner(A, B) + self._c * ufl.tr(A) * ufl.tr(B)
+        return (plain - ufl.dot(self._m, self._vector(A)) * ufl.dot(self._m, self._vector(B))) * self._points.dx
+
+    # -- state -------------------------------------------------------------------------------------------------------
+
+    def update(self) -> None:
+        """Stress and tangent at the present displacement, from the committed history (collective).
+
+        Raises:
+            NotFiniteError: if a strain or a stress holds NaN or infinity.
+        """
+        with timed("return mapping"):
+            with np.errstate(over="ignore", invalid="ignore"):
+                trial = self._return(self._points.evaluate(self._strain))
+                stress = self._with_pressure(trial.stress)
+            agree(self.comm, self._not_finite(stress))
+            self._trial = trial
+            for f, values in ((self._s, trial.stress), (self._a, trial.a), (self._c, trial.c), (self._m, trial.m)):
+                self._points.write(f, values)
+            self._points.write(self.stress, stress)
+
+    def _with_pressure(self, stress: Array) -> Array:
+        """The stress whose deviator is given, or in plane stress the given one."""
+        if self.kind == "plane_stress":
+            return stress
+        pressure = self._bulk[:, None] * (self._volume_changes() @ self._spread.T)
+        stress = stress.copy()
+        stress[:, :3] += pressure.reshape(-1, 1)
+        return stress
+
+    def _volume_changes(self) -> Array:
+        """Trace of the strain at the pressure points ``(n_cells, n_pressure_points)``."""
+        return self._pressure_points.evaluate(self._volume_change).reshape(self._pressure_points.volumes.shape)
+
+    def _not_finite(self, stress: Array) -> UEMError | None:
+        """What to say if a stress is not finite."""
+        bad = np.flatnonzero(~np.isfinite(stress).all(axis=1))
+        if not len(bad):
+            return None
+        return NotFiniteError(
+            f"strain or stress of the cell at {self._points.where(bad[0])} is NaN or infinite: "
+            "check the displacement's initial values, the loads and the Dirichlet conditions, or take smaller load steps"
+        )
+
+    def _return(self, strain: Array) -> Returned:
+        """The kernel of this kind."""
+        E, nu = self._E, self._nu
+        before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
+        if self.kind == "plane_stress":
+            return plane_stress_return(strain, *before, E, nu, self._yield_stress, self._hardening)
+        return radial_return(strain, *before, E / (2 * (1 + nu)), self._yield_stress, self._hardening)
+
+    @timed("commit history")
+    def commit(self) -> None:
+        """Make the state of the last ``update`` the history (collective)."""
+        self._points.write(self.plastic_strain, self._trial.plastic_strain)
+        self._points.write(self.peeq, self._trial.peeq)
+        for f in self.history.values():
+            f.x.scatter_forward()
+
+    # -- results -----------------------------------------------------------------------------------------------------
+
+    def energy(self) -> float:
+        """Elastic energy stored at the present displacement (collective)."""
+        self.update()
+        stress = self._trial.stress
+        twice = (stress**2).sum(axis=1) * (1 + self._nu) / self._E
+        if self.kind == "plane_stress":
+            twice -= stress[:, :2].sum(axis=1) ** 2 * self._nu / self._E
+        pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
+        return self._points.integrate(twice) / 2 + self._pressure_points.integrate(pressed) / 2
+
+    def dissipation(self) -> float:
+        """Plastic work done since the start, as committed (collective).
+
+        On the yield surface ``S : dE_p = (yield_stress + hardening * peeq) d(peeq)``, so it follows from ``peeq`` alone.
+        """
+        peeq = self._points.read(self.peeq)[:, 0]
+        yield_stress = np.where(peeq > 0, self._yield_stress, 0.0)
+        return self._points.integrate((yield_stress + self._hardening * peeq / 2) * peeq)
+
+    def cell_averages(self) -> dict[str, fem.Function]:
+        """Means over the cells for output: ``stress`` and ``plastic_strain (3, 3)``, ``peeq`` and ``von_mises``, zero elsewhere.
+
+        Returns:
+            DG0 Functions by name, filled anew by every call (collective).
+        """
+        root = np.sqrt(0.5)
+        stress, plastic_strain = self._points.read(self.stress), self._points.read(self.plastic_strain)
+        full = {"stress": stress, "plastic_strain": plastic_strain}
+        for name, values in full.items():
+            if values.shape[1] == 3:
+                across = 0 * values[:, 0] if name == "stress" else -values[:, 0] - values[:, 1]
+                values = np.insert(values, 2, across, axis=1)
+            if values.shape[1] == 4:
+                values = np.insert(values, [3, 3], 0.0, axis=1)
+            full[name] = values * [1, 1, 1, root, root, root]
+        deviator = full["stress"] - np.array([1, 1, 1, 0, 0, 0]) * full["stress"][:, :3].mean(axis=1, keepdims=True)
+        fields = {name: values[:, [0, 5, 4, 5, 1, 3, 4, 3, 2]] for name, values in full.items()}
+        fields["peeq"] = self._points.read(self.peeq)
+        fields["von_mises"] = np.sqrt(1.5 * (deviator**2) @ [1, 1, 1, 2, 2, 2])[:, None]
+        for name, values in fields.items():
+            self._points.average(values, self._averages[name])
+        return dict(self._averages)
+
+    @cached_property
+    def _averages(self) -> dict[str, fem.Function]:
+        scalars, tensors = compat.dg0_space(self.mesh), compat.dg0_space(self.mesh, (3, 3))
+        spaces = {"stress": tensors, "plastic_strain": tensors, "peeq": scalars, "von_mises": scalars}
+        return {name: fem.Function(space, name=name) for name, space in spaces.items()}

@@ -1,0 +1,208 @@
+"""Energy book: where the energy of a run is after every step, what work was done, and the momentum beside.
+
+A part of the tenth step on the data's way; it reads a solved problem and changes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.log import logger
+from uem_dolfinx.output.results import contact_suffixes
+from uem_dolfinx.output.tables import CsvTable
+from uem_dolfinx.solve.steps import set_load
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+    import ufl
+
+    from uem_dolfinx.solve.problem import UnitedProblem
+    from uem_dolfinx.solve.steps import TimeStep
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies at an instant and work since the start.
+
+    Attributes:
+        time: of the instant.
+        kinetic: ``v'Mv / 2``.
+        stored: in the bodies' strain.
+        dissipated: by plastic flow.
+        damped: by the damping form.
+        external: work of the external forces, of gravity and of what drives the Dirichlet conditions.
+        contact: work of the contact forces; zero but for rounding, moving rigid targets and the step in which bodies meet.
+        defect: what the sum of energies has gained beyond the work of the external and contact forces.
+    """
+
+    time: float
+    kinetic: float
+    stored: float
+    dissipated: float
+    damped: float
+    external: float
+    contact: float
+    defect: float
+
+
+class EnergyBook:
+    """Book of energies and momenta, one row per time step, as a table in a CSV file if wanted.
+
+    Columns: those of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... that the
+    contactor's body has received. Works are integrated by the trapezoidal rule.
+
+    Args:
+        problem: with ``dynamics``.
+        stored: energy of the bodies' strain as a UFL form; that of materials with history is added.
+        external: virtual work of the external forces as a UFL form, linear in a test function: what F has it with a minus.
+        path: name of the CSV file; None writes none.
+        resume: keep what a file that is there says about the time up to now, and go on after it.
+
+    Raises:
+        SpaceError: if the problem has no dynamics.
+        CheckpointError, OSError: see ``CsvTable``.
+    """
+
+    def __init__(
+        self,
+        problem: UnitedProblem,
+        stored: ufl.Form | None = None,
+        *,
+        external: ufl.Form | None = None,
+        path: str | Path | None = None,
+        resume: bool = False,
+    ):
+        if problem.dynamics is None:
+            raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
+        self.problem, self.dynamics = problem, problem.dynamics
+        self._stored = compat.form(stored) if stored is not None else None
+        self._external = compat.form(external) if external is not None else None
+        damping = self.dynamics.damping_form
+        self._damping = compat.form(damping) if damping is not None else None
+        #: Rows written, in order.
+        self.rows: list[Energies] = []
+        #: Momenta ``(gdim,)`` and impulses on the contactors' bodies ``(n_contacts, gdim)`` of the rows.
+        self.momenta: list[Array] = []
+        self.impulses: list[Array] = []
+        axes, names = "xyz"[: problem.config.gdim], [f.name for f in fields(Energies)]
+        suffixes = contact_suffixes(problem.contacts)
+        columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
+        self.table = None
+        begin: dict[str, float] = {}
+        if path is not None:
+            self.table = CsvTable(path, problem.comm, columns, self.dynamics if resume else None)
+            begin = self.table.last
+        self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
+        self._impulse = np.array([[begin.get(f"impulse_{a}{s}", 0.0) for a in axes] for s in suffixes])
+        self._impulse = self._impulse.reshape(len(suffixes), len(axes))
+        if begin and begin["time"] != self.dynamics.time:
+            logger.warning(
+                "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
+                path, begin["time"], self.dynamics.time,
+            )  # fmt: skip
+        # the work of the first step begins with the load of this instant
+        set_load(problem, self.dynamics.time)
+        self._look()
+        # the sum at the start, from which the defect is counted
+        if self.table is not None and begin:
+            self._first = sum(self.table.first[name] for name in ("kinetic", "stored", "dissipated"))
+        else:
+            held = self._held()
+            self._first = sum(held)
+            self._enter(held)
+
+    def _look(self) -> None:
+        """Take the forces and the displacement of this instant (collective)."""
+        problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
+        self._u = np.array(problem.u.x.array[:n])
+        self._time = self.dynamics.time
+        contact = np.zeros(n)
+        for c in problem.contacts:
+            contact += c.force.x.array[:n]
+        problem.system.assemble_residual()
+        reaction = (problem.system.residual.array_r - contact) * ~problem.system.free[: problem.config.n_owned].ravel()
+        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
+        #: Forces of damping, from outside, and of contact ``(3, n)``.
+        self._forces = np.stack([self._assembled(self._damping), outer, contact])
+        self._resultants = np.array([c.resultant().force for c in problem.contacts]).reshape(-1, problem.config.gdim)
+
+    def _assembled(self, form: Any) -> Array:
+        """Nodal forces of a compiled linear form at the owned components, zero without one."""
+        b = compat.create_vector(self.problem.config.V)
+        if form is not None:
+            forms.assemble_vector(b, form)
+        values = np.array(b.array_r)
+        b.destroy()
+        return values
+
+    def _held(self) -> tuple[float, float, float]:
+        """Energies kinetic, stored and dissipated (collective)."""
+        stored = forms.assemble_scalar(self._stored, self.problem.comm) if self._stored is not None else 0.0
+        stored += sum(material.energy() for material in self.problem.materials)
+        dissipated = float(sum(material.dissipation() for material in self.problem.materials))
+        return self.dynamics.kinetic_energy(), stored, dissipated
+
+    def write(self, step: TimeStep | None = None) -> Energies:
+        """Enter the present state; call it after every step (collective).
+
+        Args:
+            step: what was stepped; the book reads the problem, so that it may be left out.
+
+        Returns:
+            The new row.
+        """
+        u, forces, resultants, time = self._u, self._forces, self._resultants, self._time
+        self._look()
+        self._works += self.problem.comm.allreduce(0.5 * (forces + self._forces) @ (self._u - u))
+        self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
+        return self._enter(self._held())
+
+    def _enter(self, held: tuple[float, float, float]) -> Energies:
+        damped, external, contact = (float(w) for w in self._works)
+        defect = sum(held) + damped - external - contact - self._first
+        row = Energies(self._time, *held, damped, external, contact, defect)
+        self.rows.append(row)
+        self.momenta.append(self.dynamics.momentum())
+        self.impulses.append(self._impulse.copy())
+        if self.table is not None:
+            self.table.write([*astuple(row), *map(float, self.momenta[-1]), *map(float, self._impulse.ravel())])
+        return row
+
+    def plot(self, panel: Any) -> None:
+        """Draw the energies over time into a panel of :func:`uem_dolfinx.figure`; None, where rank is not 0, draws nothing."""
+        if panel is None:
+            return
+        t = [row.time for row in self.rows]
+        kept = ("kinetic", "stored", "dissipated", "damped")
+        total = [sum(getattr(row, name) for name in kept) - row.external for row in self.rows]
+        for name in (*kept, "external", "contact"):
+            values = [getattr(row, name) for row in self.rows]
+            # what is never worth a line stays out
+            if max(map(abs, values)) > 1e-6 * max(map(abs, total)):
+                panel.plot(t, values, label=name, ls="--" if name in ("external", "contact") else "-")
+        panel.plot(t, total, "k", lw=1.2, label="sum less external work")
+        panel.set_xlabel("time")
+        panel.set_ylabel("energy")
+        panel.grid(alpha=0.25)
+        panel.legend(frameon=False, ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.table is not None:
+            self.table.close()
+
+    def __enter__(self) -> EnergyBook:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

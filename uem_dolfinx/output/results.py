@@ -1,0 +1,182 @@
+"""Results to keep: files for ParaView and a history in CSV.
+
+Tenth step on the data's way; it reads a solved problem and changes nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.log import timed
+from uem_dolfinx.output.tables import CsvTable
+from uem_dolfinx.solve.steps import LoadStep, TimeStep
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+
+    from uem_dolfinx.contact.contact import Contact
+    from uem_dolfinx.solve.problem import UnitedProblem
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class HistoryWriter:
+    """CSV file with one row per load step or time step, complete after every row.
+
+    Columns: ``factor`` or ``time``, ``newton_iterations``, and for every contact ``active``, ``max_gap``, the resultant
+    ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each followed by the contact's name where there
+    are several.
+
+    Args:
+        path: name of the file; its folder is made.
+        problem: what the rows are read from.
+        resume: keep what a file that is there says about the time up to now, and go on after it.
+    """
+
+    def __init__(self, path: str | Path, problem: UnitedProblem, *, resume: bool = False):
+        self.problem, dynamics = problem, problem.dynamics
+        axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
+        columns = ["factor" if dynamics is None else "time", "newton_iterations"]
+        for suffix in contact_suffixes(problem.contacts):
+            columns += [f"active{suffix}", f"max_gap{suffix}"]
+            columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
+        self.table = CsvTable(path, problem.comm, columns, dynamics if resume else None)
+
+    def write(self, step: LoadStep | TimeStep | float) -> None:
+        """Append a row (collective).
+
+        Args:
+            step: a converged step; or its factor or time alone, which leaves the number of iterations empty.
+        """
+        row: list[object] = [clock(step), "" if isinstance(step, (int, float)) else step.newton_iterations]
+        for contact in self.problem.contacts:
+            resultant = contact.resultant()
+            row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
+        self.table.write(row)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.table.close()
+
+    def __enter__(self) -> HistoryWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+class ResultsWriter:
+    """Time series of everything there is to see: fields for ParaView and the history.
+
+    Writes ``PATH.xdmf`` on every DOLFINx, ``PATH_vectors.bp`` and ``PATH_scalars.bp`` where it has ADIOS2, and
+    ``PATH.csv``. Fields: displacement; for every contact its pressure, gap, status and force; and whatever ``fields``
+    names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree 2 is interpolated.
+
+    Args:
+        path: name of the files without ending; its folder is made.
+        problem: what is written.
+        fields: further UFL expressions by name, scalar, vector or tensor; one value per cell, in XDMF only.
+        vtx: whether to write VTX; None does where DOLFINx can.
+
+    Raises:
+        MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
+    """
+
+    def __init__(
+        self, path: str | Path, problem: UnitedProblem, *, fields: Mapping[str, Any] | None = None, vtx: bool | None = None
+    ):
+        self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
+        stem = Path(path)
+        if comm.rank == 0:
+            stem.parent.mkdir(parents=True, exist_ok=True)
+        comm.barrier()
+        self._expressions = dict(fields or {})
+        self._cellwise = {name: self._cell_field(name, e) for name, e in self._expressions.items()}
+        degree = _geometry_degree(mesh)
+        self._nodal = {}
+        for name, u in self._sources().items():
+            space = compat.function_space(mesh, degree, u.ufl_shape)
+            self._nodal[name] = fem.Function(space, name=name)
+        self.history = HistoryWriter(stem.with_name(stem.name + ".csv"), problem)
+        self._xdmf = forms.open_xdmf(comm, stem.with_name(stem.name + ".xdmf"), mesh)
+        self._vtx = []
+        if compat.has_vtx() if vtx is None else vtx:
+            for rank, kind in enumerate(("scalars", "vectors")):
+                functions = [u for u in self._sources().values() if len(u.ufl_shape) == rank]
+                if functions:
+                    self._vtx.append(compat.open_vtx(comm, stem.with_name(f"{stem.name}_{kind}.bp"), functions))
+
+    def _cell_field(self, name: str, expression: Any) -> fem.Function:
+        return fem.Function(compat.dg0_space(self.problem.config.mesh, expression.ufl_shape), name=name)
+
+    def _sources(self) -> dict[str, fem.Function]:
+        """Functions of the problem by name, up to date (collective)."""
+        found = {"displacement": self.problem.u}
+        for contact, suffix in zip(self.problem.contacts, contact_suffixes(self.problem.contacts)):
+            found[f"contact_pressure{suffix}"] = contact.pressure
+            found[f"gap{suffix}"] = contact.gap
+            found[f"active{suffix}"] = contact.active
+            found[f"contact_force{suffix}"] = contact.force
+        return found
+
+    def write(self, step: LoadStep | TimeStep | float) -> None:
+        """Append the present state (collective).
+
+        Args:
+            step: a converged step, or a load factor or time; it becomes the time in the files.
+        """
+        time = clock(step)
+        with timed("write fields"):
+            for name, u in self._sources().items():
+                out = self._nodal[name]
+                out.interpolate(u)
+                out.x.scatter_forward()
+                self._xdmf.write_function(out, time)
+            for name, out in self._cellwise.items():
+                compat.interpolate_expression(out, self._expressions[name])
+                self._xdmf.write_function(out, time)
+            for writer in self._vtx:
+                writer.write(time)
+        self.history.write(step)
+
+    def close(self) -> None:
+        """Close all files (collective)."""
+        self.history.close()
+        self._xdmf.close()
+        for writer in self._vtx:
+            writer.close()
+        self._vtx = []
+
+    def __enter__(self) -> ResultsWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def clock(step: LoadStep | TimeStep | float) -> float:
+    """Load factor or time of a step."""
+    return float(step.time if isinstance(step, TimeStep) else step.factor if isinstance(step, LoadStep) else step)
+
+
+def contact_suffixes(contacts: Sequence[Contact]) -> list[str]:
+    """What tells the contacts apart in names of fields and columns; nothing where there is but one."""
+    if len(contacts) == 1:
+        return [""]
+    names = ["_" + re.sub(r"\W+", "_", contact.name).strip("_") for contact in contacts]
+    return [name if names.count(name) == 1 else f"{name}_{i}" for i, name in enumerate(names)]
+
+
+def _geometry_degree(mesh: Any) -> int:
+    n_vertices = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}[compat.cell_name(mesh)]
+    return 1 if compat.geometry_dofs(mesh).shape[1] == n_vertices else 2

@@ -1,0 +1,152 @@
+"""The order of a mesh's input: where rows that live on some rank belong in a table over all ranks, whatever the partition.
+
+A part of the last step on the data's way: checkpoints are written and read in this order, since partitions differ from run to run.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+Array = npt.NDArray[Any]
+Ints = npt.NDArray[np.int64]
+
+#: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
+CHUNK = 1024
+#: Bytes of a hash.
+DIGEST = 16
+
+
+class Numbering:
+    """Places of this rank's rows in a table over all ranks, in the order of keys that no partition changes.
+
+    Args:
+        comm: communicator.
+        keys: of this rank's rows ``(n,)``, each different from all others on all ranks.
+        bound: all keys are below it.
+
+    Attributes:
+        place: of each row in the table ``(n,)``.
+        total: number of rows in the table.
+        first: first row in this rank's part of the table.
+        count: number of rows in it.
+
+    Raises:
+        CheckpointError: if two rows have the same key.
+    """
+
+    def __init__(self, comm: MPI.Comm, keys: Ints, bound: int):
+        self.comm, size, rank = comm, comm.size, comm.rank
+        home = keys * size // max(bound, 1)
+        asking = [np.flatnonzero(home == r) for r in range(size)]
+        told = comm.alltoall([keys[i] for i in asking])
+        distinct, order = np.unique(np.concatenate(told), return_inverse=True)
+        error = None
+        if len(distinct) < len(order):
+            error = CheckpointError(
+                "the mesh does not know the numbering of its input, as meshes made from other meshes do not: "
+                "keep Functions on the mesh that was read"
+            )
+        agree(comm, error)
+        first = np.cumsum([0, *comm.allgather(len(distinct))])
+        answers = comm.alltoall(np.split(first[rank] + order.ravel(), np.cumsum([len(k) for k in told])[:-1]))
+        self.place: Ints = np.empty(len(keys), dtype=np.int64)
+        for i, answer in zip(asking, answers):
+            self.place[i] = answer
+        self.total = int(first[-1])
+        chunks = -(-self.total // CHUNK)
+        bounds = np.minimum(CHUNK * (chunks * np.arange(size + 1) // size), self.total)
+        self.first, self.count = int(bounds[rank]), int(bounds[rank + 1] - bounds[rank])
+        holder = np.searchsorted(bounds, self.place, side="right") - 1
+        self._sent = [np.flatnonzero(holder == r) for r in range(size)]
+        self._received = comm.alltoall([self.place[i] - bounds[r] for r, i in enumerate(self._sent)])
+
+    def to_table(self, rows: Array) -> Array:
+        """This rank's part of the table ``(count, ...)`` from everybody's rows ``(n, ...)`` (collective)."""
+        part = np.empty((self.count, *rows.shape[1:]), dtype=rows.dtype)
+        for at, values in zip(self._received, self.comm.alltoall([rows[i] for i in self._sent])):
+            part[at] = values
+        return part
+
+    def from_table(self, part: Array) -> Array:
+        """This rank's rows ``(n, ...)`` from everybody's parts of the table ``(count, ...)`` (collective)."""
+        rows = np.empty((len(self.place), *part.shape[1:]), dtype=part.dtype)
+        for i, values in zip(self._sent, self.comm.alltoall([part[at] for at in self._received])):
+            rows[i] = values
+        return rows
+
+
+def n_cells(mesh: Any) -> int:
+    """Number of cells over all ranks."""
+    return int(mesh.topology.index_map(mesh.topology.dim).size_global)
+
+
+def node_numbering(V: Any) -> Numbering:
+    """Numbering of a space's owned nodes (blocks of d.o.f.), by the first cell of the input that has them (collective).
+
+    A cell keeps the order of its vertices in every partition, and with it that of its nodes as long as no edge and no facet has
+    more than one of its own: their order would follow global numbers of vertices.
+
+    Args:
+        V: Lagrange of degree 1 or 2, discontinuous Lagrange or quadrature space, with values of any shape.
+
+    Raises:
+        CheckpointError: if the space is another one.
+    """
+    comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, compat.cell_dofs(V)
+    found, error = compat.element_family(V), None
+    if found is None or (found[0] == "Lagrange" and found[1] > 2):
+        error = CheckpointError(
+            f"a checkpoint cannot hold a Function of {V.ufl_element()}: expected Lagrange of degree 1 or 2, discontinuous Lagrange "
+            "or quadrature spaces; interpolate into one of them"
+        )
+    agree(comm, error)
+    owned, k = index_map.size_local, V.dofmap.dof_layout.num_dofs
+    keys = np.full(owned + index_map.num_ghosts, np.iinfo(np.int64).max)
+    np.minimum.at(keys, cells, forms.original_cells(V.mesh)[:, None] * k + np.arange(cells.shape[1]))
+    # the first cell may be one that the node's owner does not know
+    starts = np.array(comm.allgather(index_map.local_range[0]))
+    ghosts = index_map.local_to_global(np.arange(owned, len(keys), dtype=np.int32)).astype(np.int64)
+    owner = np.searchsorted(starts, ghosts, side="right") - 1
+    theirs = [(ghosts[owner == r] - starts[r], keys[owned:][owner == r]) for r in range(comm.size)]
+    for nodes, key in comm.alltoall(theirs):
+        np.minimum.at(keys, nodes, key)
+    return Numbering(comm, keys[:owned], k * n_cells(V.mesh))
+
+
+def mesh_fingerprint(mesh: Any) -> str:
+    """Hash of every cell's nodes in the input and of their coordinates to the last bit, the same in every partition (collective)."""
+    n = mesh.topology.index_map(mesh.topology.dim).size_local
+    nodes = compat.geometry_dofs(mesh)[:n]
+    cells = Numbering(mesh.comm, forms.original_cells(mesh)[:n], n_cells(mesh))
+    given = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
+    return fingerprint(mesh.comm, [hashes(cells.to_table(values[nodes])) for values in (given, mesh.geometry.x)])
+
+
+def as_bytes(array: Array) -> npt.NDArray[np.uint8]:
+    """The bytes of a contiguous array, in place."""
+    return array.reshape(-1).view(np.uint8)
+
+
+def hashes(part: Array) -> list[bytes]:
+    """Hash of every chunk in this rank's part of a table."""
+    chunks = range(0, len(part), CHUNK)
+    return [blake2b(as_bytes(part[i : i + CHUNK]).data, digest_size=DIGEST).digest() for i in chunks]
+
+
+def fingerprint(comm: MPI.Comm, tables: list[list[bytes]]) -> str:
+    """One hash of several tables from the hashes of their chunks, the same for any number of ranks (collective)."""
+    parts, text = comm.gather(tables), None
+    if parts is not None:
+        text = blake2b(b"".join(h for table in zip(*parts) for rank in table for h in rank), digest_size=DIGEST).hexdigest()
+    return str(comm.bcast(text))

@@ -1,0 +1,183 @@
+"""What a run goes on from: Functions, the states of contacts and numbers, with the way of each to the order of the input.
+
+A part of the last step on the data's way; whoever leads a run collects its state here, and checkpoints write and read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx import compat
+from uem_dolfinx.geometry.rigid import Motion, RigidSurface
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mpi4py import MPI
+
+    from dolfinx import fem
+
+    from uem_dolfinx.contact.contact import Contact
+
+Array = npt.NDArray[Any]
+
+#: Sides of a cell are fewer.
+MOST_SIDES = 8
+
+
+class Entry(Protocol):
+    """Something with one row of numbers for each of its nodes."""
+
+    name: str
+    numbering: Numbering
+
+    def describe(self) -> str:
+        """What tells it from others (collective)."""
+
+    def rows(self) -> Array:
+        """Values at this rank's nodes ``(n, ...)`` (collective)."""
+
+    def take(self, rows: Array) -> None:
+        """Put values back (collective)."""
+
+
+class FunctionEntry:
+    """The values of a Function at its nodes.
+
+    Args:
+        name: of the Function in the file.
+        u: the Function.
+        numbering: of its space.
+    """
+
+    def __init__(self, name: str, u: fem.Function, numbering: Numbering):
+        self.name, self.u, self.numbering = f"function '{name}'", u, numbering
+
+    def describe(self) -> str:
+        """Element and size."""
+        family, degree = compat.element_family(self.u.function_space) or ("", 0)
+        return f"{family} {degree}, {self.rows().shape[1]} components at {self.numbering.total} nodes"
+
+    def rows(self) -> Array:
+        """A view of the owned part ``(n_owned, block size)``."""
+        dofmap = self.u.function_space.dofmap
+        rows = self.u.x.array.reshape(-1, dofmap.index_map_bs)
+        return np.asarray(rows[: dofmap.index_map.size_local])
+
+    def take(self, rows: Array) -> None:
+        """Overwrite the Function."""
+        self.rows()[:] = rows
+        self.u.x.scatter_forward()
+
+
+class ContactEntry:
+    """The committed states of a contact at its contactors.
+
+    Args:
+        number: of the contact, from 1.
+        contact: of a problem.
+        nodes: numbering of the displacement's space.
+    """
+
+    def __init__(self, number: int, contact: Contact, nodes: Numbering):
+        self.name, self.contact = f"contact {number} '{contact.name}'", contact
+        comm, pair = nodes.comm, contact.pair
+        places = nodes.place[pair.nodes]
+        self.numbering = Numbering(comm, places, nodes.total)
+        surfaces = [hashes(self.numbering.to_table(places))]
+        if isinstance(pair.target, MeshTarget):
+            keys = pair.target.facets.keys
+            surfaces.append(hashes(Numbering(comm, keys, MOST_SIDES * n_cells(contact.config.mesh)).to_table(keys)))
+        self._surfaces = fingerprint(comm, surfaces)
+        self._columns = " ".join(self.rows().dtype.names or ())
+
+    def describe(self) -> str:
+        """Size, the surfaces, and what is remembered of a contactor."""
+        return f"{self.numbering.total} contactors, surfaces {self._surfaces}, each with {self._columns}"
+
+    def rows(self) -> Array:
+        """One record for each contactor ``(n,)``."""
+        kept = self.contact.pair.keep()
+        rows = np.empty(len(self.contact.pair.nodes), dtype=[(name, a.dtype.str, a.shape[1:]) for name, a in kept.items()])
+        for name, a in kept.items():
+            rows[name] = a
+        return rows
+
+    def take(self, rows: Array) -> None:
+        """Hand the records to the pair."""
+        self.contact.pair.recall({name: rows[name] for name in rows.dtype.names or ()})
+
+
+@dataclass
+class State:
+    """What a run goes on from; the way to the order of the input is found when it is first written or read, and kept.
+
+    Attributes:
+        mesh: on which everything lives.
+        functions: by name: Lagrange of degree 1 or 2, discontinuous Lagrange or quadrature, with values of any shape.
+            None may be added after the first writing or reading.
+        contacts: of a problem; their committed states are kept, and where their rigid surfaces are.
+        numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
+        collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
+        restore: called on all ranks after reading, to go on from them.
+    """
+
+    mesh: Any
+    functions: dict[str, fem.Function] = field(default_factory=dict)
+    contacts: list[Contact] = field(default_factory=list)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    collect: list[Callable[[], None]] = field(default_factory=list)
+    restore: list[Callable[[], None]] = field(default_factory=list)
+
+    @property
+    def comm(self) -> MPI.Comm:
+        """Communicator of the mesh."""
+        return self.mesh.comm
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of the mesh (collective)."""
+        return mesh_fingerprint(self.mesh)
+
+    @cached_property
+    def entries(self) -> list[Entry]:
+        """Everything with a row for each node, in the order of the file (collective)."""
+        known: list[tuple[Any, Numbering]] = []
+
+        def numbering(V: Any) -> Numbering:
+            for space, found in known:
+                if space is V:
+                    return found
+            known.append((V, node_numbering(V)))
+            return known[-1][1]
+
+        nodal = [FunctionEntry(name, u, numbering(u.function_space)) for name, u in self.functions.items()]
+        return [*nodal, *(ContactEntry(i, contact, numbering(contact.config.V)) for i, contact in enumerate(self.contacts, 1))]
+
+    def describe(self) -> dict[str, str]:
+        """What tells this state from others, in the order in which it is compared (collective)."""
+        cells = f"{n_cells(self.mesh)} {compat.cell_name(self.mesh)} cells in {self.mesh.geometry.dim}D"
+        told = {"mesh": f"{cells}, fingerprint {self.fingerprint}"}
+        told |= {entry.name: entry.describe() for entry in self.entries}
+        return told | {f"number '{name}'": "a value" for name in self.numbers}
+
+    def motions(self) -> list[dict[str, Any] | None]:
+        """Where the contacts' rigid surfaces have been moved to."""
+        found: list[dict[str, Any] | None] = []
+        for contact in self.contacts:
+            motion = contact.target.motion if isinstance(contact.target, RigidSurface) else None
+            found.append(None if motion is None else {f.name: getattr(motion, f.name).tolist() for f in fields(Motion)})
+        return found
+
+    def move(self, motions: list[dict[str, Any] | None]) -> None:
+        """Put the contacts' rigid surfaces where they were."""
+        for contact, motion in zip(self.contacts, motions):
+            if isinstance(contact.target, RigidSurface):
+                contact.target.motion = None if motion is None else Motion(**{name: np.array(v) for name, v in motion.items()})

@@ -1,0 +1,1 @@
+"""The united Newton loop, and problems led through load steps and time steps."""

@@ -1,0 +1,242 @@
+"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, unite, solve, until equilibrium and contact hold.
+
+Seventh step on the data's way. The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
+from uem_dolfinx.log import logger, say
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+    from uem_dolfinx.algebra.restriction import Restriction
+
+#: A residual that keeps this part of its norm twice has met its rounding.
+STALLED = 0.5
+#: An active set that still changes after so many iterations changes by one contactor at a time from then on.
+CAUTIOUS_AFTER = 10
+#: Shortest step of the line search.
+SHORTEST_STEP = 1.0 / 64
+#: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
+ENOUGH_DECREASE = 0.9
+#: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
+PASSING = 1e-4
+#: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
+LAST = 0.1
+#: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
+LARGEST_ROUNDING = 1e-4
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of the history.
+
+    Attributes:
+        residual: norm of ``P'r`` over the forces at work.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks.
+        changed: whether contactors were activated or released.
+        linear_iterations: of the solve that followed; 0 if the step had converged.
+        step_length: of the line search in the step that led here.
+    """
+
+    residual: float
+    gap: float
+    active: int
+    changed: bool
+    linear_iterations: int
+    step_length: float
+
+
+@dataclass(frozen=True)
+class United:
+    """A state of the united system as the loop sees it.
+
+    Attributes:
+        restriction: P and c.
+        step: P and c that the step is taken with; the same unless a contact approximates curved facets by chords.
+        residual: ``P'F``, the out-of-balance forces.
+        norm: its norm.
+        scale: norm of the forces at work.
+        rounding: norm below which a force is rounding of the displacement.
+        strain_rounding: norm that rounding of the deformation gradient alone can make, in laws that start from it.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks.
+        changed: whether the active set changed.
+        closed: whether gaps and Dirichlet conditions are met.
+    """
+
+    restriction: Restriction
+    step: Restriction
+    residual: PETSc.Vec
+    norm: float
+    scale: float
+    rounding: float
+    strain_rounding: float
+    gap: float
+    active: int
+    changed: bool
+    closed: bool
+
+
+class UnitedSystem(Protocol):
+    """What the loop needs of the problem; every method is collective."""
+
+    @property
+    def linear(self) -> bool:
+        """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether there are contacts at all."""
+
+    def place(self, returning: bool) -> None:
+        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+
+    def assemble_residual(self) -> bool:
+        """Residual at the present displacement; whether it is finite."""
+
+    def unite(self, cautious: bool) -> United:
+        """Contact forces, activation and release, and the uniting equations that follow."""
+
+    def active_set(self) -> int:
+        """Fingerprint of the active set, the same on all ranks."""
+
+    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+        """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
+
+    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+        """``du = P dq + c``."""
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the present displacement."""
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set the displacement to ``start + length du``."""
+
+    def inverted(self) -> str | None:
+        """Where a cell is inside out, if one is."""
+
+    def reduced_residual(self, state: United) -> PETSc.Vec:
+        """``P'F`` at the present displacement, with the active set of ``state``."""
+
+
+def solve_united(
+    system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool, forces_before: float = 0.0
+) -> list[Iteration]:
+    """Iterate until ``P'r`` vanishes against the forces at work and every contact condition holds.
+
+    Args:
+        system: the problem.
+        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        max_iterations: bound on the number of linear solves.
+        line_search: shorten steps that invert cells or increase the work of the residual.
+        verbose: print a line per iteration.
+        forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
+
+    Returns:
+        The history; its last entry is the converged state.
+
+    Raises:
+        ConvergenceError: after ``max_iterations``, with the history.
+        NotFiniteError: if the residual is NaN or infinite at the start of the step.
+        InvertedElementError: if even the shortest step turns a cell inside out.
+    """
+    history: list[Iteration] = []
+    seen: set[int] = set()
+    cautious, start, thrust, length, norm, stalled = False, 0.0, 0.0, 1.0, 0.0, 0
+    system.place(returning=False)
+    if not system.assemble_residual():
+        raise NotFiniteError(
+            "the residual is not finite at the start of the step: "
+            "check loads, material parameters and the initial displacement for NaN and division by zero"
+        )
+    for k in range(max_iterations + 1):
+        state = system.unite(cautious)
+        start = start if k else state.norm
+        forces = max(state.scale, start)
+        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
+        norm = state.norm
+        rounding = state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding)
+        small = max(rtol * forces, min(rounding, LARGEST_ROUNDING * max(forces, thrust, forces_before)))
+        converged = not state.changed and state.closed and norm <= small
+        if converged or k == max_iterations:
+            history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
+            _report(history, verbose)
+            if converged:
+                return history
+            break
+        fingerprint = system.active_set()
+        cautious |= state.changed and (fingerprint in seen or k >= CAUTIOUS_AFTER)
+        seen.add(fingerprint)
+        rhs = system.linearise(state, first=k == 0)
+        driving = rhs.norm()
+        thrust = max(thrust, driving if k == 0 else 0.0)
+        passing = not cautious and (not system.linear or state.changed or (k == 0 and system.in_contact))
+        needed = LAST * rtol * forces / driving if driving > 0 else 0.0
+        dq, iterations = system.solve(rhs, min(max(needed, PASSING if passing else 0.0), LAST))
+        residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
+        history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
+        _report(history, verbose)
+        length = _advance(system, state, rhs, dq, line_search)
+    last = history[-1]
+    raise ConvergenceError(
+        f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
+        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps, or raise max_iterations",
+        history,
+    )
+
+
+def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
+    """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
+    du, start = system.move(state, dq), system.displacement()
+    work, norm = abs(dq.dot(rhs)), rhs.norm()
+    length = 1.0
+    while True:
+        last = not line_search or length <= SHORTEST_STEP
+        system.displace(start, du, length)
+        where = system.inverted()
+        if where is not None:
+            if last:
+                raise InvertedElementError(
+                    f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there"
+                )
+        elif not line_search or system.linear:
+            break
+        # the bodies are asked before the normal return, which has its own reasons to move a contactor
+        elif system.assemble_residual():
+            residual = system.reduced_residual(state)
+            less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
+            if last or less_work or residual.norm() <= ENOUGH_DECREASE * norm:
+                break
+        elif last:
+            break
+        length *= 0.5
+    system.place(returning=length == 1.0)
+    if not system.assemble_residual():
+        raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+    return length
+
+
+def _ratio(norm: float, scale: float) -> float:
+    return norm / scale if scale > 0 else 0.0
+
+
+def _report(history: list[Iteration], verbose: bool) -> None:
+    i = history[-1]
+    line = (
+        f"  {len(history) - 1:3d}  residual {i.residual:.3e}  gap {i.gap:.1e}  active {i.active:5d}{'*' if i.changed else ' '}  "
+        f"linear {i.linear_iterations:3d}  step {i.step_length:g}"
+    )
+    if verbose:
+        say(line)
+    else:
+        logger.debug(line)

@@ -1,0 +1,260 @@
+"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, wired up and solved for one state after the other.
+
+Eighth step on the data's way, and the only file that knows all the others.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.contact.checks import check_prescribed
+from uem_dolfinx.errors import UEMError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.restart.state import State
+from uem_dolfinx.solve.newton import Iteration, solve_united
+from uem_dolfinx.solve.system import BodySystem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import ufl
+
+    from uem_dolfinx.contact.contact import Contact
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.geometry.gmsh import Tag
+    from uem_dolfinx.materials.elastic import HistoryMaterial
+
+#: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
+#: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
+RIM = 1.0 / (2.0**1.5 - 1.0)
+
+
+class UnitedProblem:
+    """Bodies in contact by the United Elements Method, in statics, or in dynamics where there is inertia.
+
+    Solves ``F(u; v) = 0`` with the contactors of every contact united to their targets:
+
+        du = P dq + c,    P'KP dq = P'(r - K c),    r = -F,    K = dF/du      [UEM, 6.6]
+
+    Args:
+        F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
+            forces are added by ``dynamics``.
+        u: displacement, a Function of a vector Lagrange space; holds the solution.
+        bcs: Dirichlet conditions.
+        contacts: contacts between bodies or with rigid surfaces; none is fine.
+        petsc_options_prefix: prefix of the linear solver's options.
+        petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
+            iterative solve is as accurate as its Newton iteration can use.
+        load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped, or
+            a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only. Of time
+            steps it is a function of the time.
+        dynamics: mass, velocity and time integration; None is statics.
+        materials: laws with history in F, such as ``VonMises``.
+        newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
+        consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
+        line_search: shorten steps that invert cells or do not reduce the residual's work.
+        check_inversion: look for cells turned inside out in every iteration; None does so unless K is constant.
+        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        max_iterations: bound on the linear solves of one step.
+        verbose: print one line per iteration.
+
+    Raises:
+        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, or F does not depend on it.
+        TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
+        MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
+    """
+
+    #: Brings bodies and contact together for the Newton loop; a subclass may reach contact in another way.
+    system_type: Callable[..., BodySystem] = BodySystem
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        *,
+        bcs: Sequence[fem.DirichletBC] = (),
+        contacts: Sequence[Contact] = (),
+        petsc_options_prefix: str = "uem_",
+        petsc_options: dict[str, Any] | None = None,
+        load: fem.Constant | Callable[[float], None] | None = None,
+        dynamics: Dynamics | None = None,
+        materials: Sequence[HistoryMaterial] = (),
+        newton: str = "full",
+        consistent_tangent: bool = True,
+        line_search: bool = True,
+        check_inversion: bool | None = None,
+        rtol: float = 1e-8,
+        max_iterations: int = 50,
+        verbose: bool = False,
+    ):
+        if newton not in ("full", "modified"):
+            raise ValueError(f"newton = '{newton}': expected 'full' or 'modified'")
+        self.u, self.load = u, load
+        self.line_search, self.rtol, self.max_iterations, self.verbose = line_search, rtol, max_iterations, verbose
+        self.config = Configuration(u)
+        self.comm = self.config.comm
+        self.contacts, self.dynamics, self.materials = list(contacts), dynamics, list(materials)
+        damping = dynamics.attach(self.config) if dynamics is not None else None
+        self.system = self.system_type(
+            self.config,
+            F if damping is None else F + damping,
+            bcs,
+            UnitedSolver(self.config, petsc_options_prefix, petsc_options),
+            newton=newton,
+            consistent_tangent=consistent_tangent,
+            check_inversion=check_inversion,
+            materials=self.materials,
+            dynamics=dynamics,
+        )
+        self.system.add_pairs([contact.attach(self.system) for contact in self.contacts])
+        #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
+        self.committed = np.array(u.x.array)
+        self._last = np.array(u.x.array)
+        self._largest_forces = 0.0
+
+    # -- one step ----------------------------------------------------------------------------------------------------
+
+    def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+        """Bring the bodies into equilibrium and commit the state (collective).
+
+        Arguments, return value and errors are those of :meth:`attempt`.
+        """
+        history = self.attempt(start=start, fraction=fraction, ratio=ratio)
+        self.commit()
+        return history
+
+    def attempt(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+        """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
+
+        Args:
+            start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
+            fraction: how far the Dirichlet values go, from ``start`` (0) to the values of ``bcs`` (1).
+            ratio: this step's length over the last one's, for extrapolating the active set; 0 does not extrapolate.
+
+        Returns:
+            The history of iterations.
+
+        Raises:
+            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError: after
+                the committed state has been restored.
+        """
+        start = self.committed if start is None else start
+        wanted = np.array(start)
+        compat.set_bc_values(wanted, self.system.bcs)
+        self.system.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
+        try:
+            if ratio > 0.0:
+                self._predict(ratio)
+            self.system.land()
+            history = solve_united(
+                self.system,
+                rtol=self.rtol,
+                max_iterations=self.max_iterations,
+                line_search=self.line_search,
+                verbose=self.verbose,
+                forces_before=self._largest_forces,
+            )
+            for pair in self.system.pairs:
+                check_prescribed(pair)
+            if self.system.floating is not None:
+                self.system.floating.tell()
+        except UEMError:
+            self.restore()
+            raise
+        return history
+
+    def commit(self) -> None:
+        """Keep the present displacement and contact state."""
+        self._last, self.committed = self.committed, np.array(self.u.x.array)
+        self._largest_forces = max(self._largest_forces, self.system.residual.norm())
+        for material in self.materials:
+            material.commit()
+        if self.dynamics is not None:
+            self.dynamics.commit()
+        for pair in self.system.pairs:
+            pair.commit()
+            pair.project()
+
+    def restore(self) -> None:
+        """Return to the committed displacement and contact state."""
+        self.u.x.array[:] = self.committed
+        for material in self.materials:
+            material.update()
+        if self.dynamics is not None:
+            self.dynamics.restore()
+        for pair in self.system.pairs:
+            pair.restore()
+            pair.project()
+
+    def state(self) -> State:
+        """What a checkpoint keeps of the problem; read back, the next step is the one that would have come (collective).
+
+        Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
+        added must differ from those here.
+        """
+        before, stiffness = fem.Function(self.config.V), fem.Function(self.config.V)
+        functions = {"displacement": self.u, "displacement before": before, "stiffness": stiffness}
+        if self.dynamics is not None:
+            d = self.dynamics
+            functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
+        for i, material in enumerate(self.materials, 1):
+            functions |= {f"{name} {i}": f for name, f in material.history.items()}
+        state = State(self.config.mesh, functions, self.contacts)
+
+        def collect() -> None:
+            before.x.array[:] = self._last
+            known = self.system.keep_stiffness(stiffness)
+            # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
+            self.system.forget()
+            state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
+            if self.dynamics is not None:
+                state.numbers |= self.dynamics.numbers
+
+        def restore() -> None:
+            self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
+            self._largest_forces = state.numbers["largest forces"]
+            self.system.recall_stiffness(stiffness if state.numbers["stiffness known"] else None)
+            if self.dynamics is not None:
+                self.dynamics.resume(state.numbers)
+
+        state.collect.append(collect)
+        state.restore.append(restore)
+        return state
+
+    def reaction(self, tag: Tag) -> np.ndarray:
+        """Force with which the Dirichlet conditions act on the nodes of a tag: their sum ``(gdim,)`` (collective).
+
+        Args:
+            tag: entities of any dimension; components without Dirichlet condition count as zero.
+        """
+        self.system.assemble_residual()
+        nodes, shape = surface_nodes(self.config, tag), (-1, self.config.gdim)
+        force = self.system.residual.array_r.reshape(shape)[nodes]
+        for contact in self.contacts:
+            force = force - contact.force.x.array.reshape(shape)[nodes]
+        return np.sum(self.comm.allgather(np.where(self.system.free[nodes], 0.0, force).sum(axis=0)), axis=0)
+
+    def _deformation(self, du: np.ndarray) -> np.ndarray:
+        """What an increment of the displacement holds besides rigid motions of bodies that only contact holds (collective)."""
+        floating = self.system.floating
+        if floating is None:
+            return du
+        n, g = self.config.n_owned, self.config.gdim
+        rest = fem.Function(self.config.V)
+        rest.x.array[: n * g] = du[: n * g] - floating.part(floating.every_motion, du[: n * g].reshape(n, g)).ravel()
+        rest.x.scatter_forward()
+        return np.asarray(rest.x.array)
+
+    def _predict(self, ratio: float) -> None:
+        """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
+        self.u.x.array[:] = self.committed + RIM * ratio * self._deformation(self.committed - self._last)
+        for pair in self.system.pairs:
+            pair.project()
+            pair.predict(ratio)
+        self.u.x.array[:] = self.committed

@@ -1,0 +1,361 @@
+"""Load steps and time steps: how a problem is led from state to state, shortened on failure and at instants of contact.
+
+Ninth step on the data's way; a step is committed when it has converged, and a run that fails keeps its last good state.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx.errors import (
+    ConvergenceError,
+    InvertedElementError,
+    LinearSolveError,
+    NotFiniteError,
+    SpaceError,
+    TunnellingError,
+    UEMError,
+)
+from uem_dolfinx.geometry.rigid import RigidSurface
+from uem_dolfinx.log import logger, progress
+from uem_dolfinx.parallel import agree
+from uem_dolfinx.solve.tunnelling import check_tunnelling
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.restart.checkpoint import Checkpoint
+    from uem_dolfinx.solve.newton import Iteration
+    from uem_dolfinx.solve.problem import UnitedProblem
+
+Array = npt.NDArray[np.float64]
+
+#: A step may be cut to this part of its nominal length.
+SHORTEST_STEP = 1.0 / 1024
+#: A step that needs no more iterations than this is easy: the next one may be longer again.
+EASY = 6
+#: A remainder of a step below this part of it is rounding.
+NOTHING = 1e-9
+#: Rounding of a time, relative to the largest.
+TIME_ROUNDING = 4 * np.finfo(float).eps
+#: Contacts may give the bodies this part of the largest kinetic energy in a step.
+MOST_GIVEN = 2e-3
+#: Steps in which contacts give energy are cut down to this part of the nominal length.
+SHORTEST_GIVEN = 1.0 / 128
+
+
+class _EnergyGivenError(UEMError):
+    """Contacts have given the bodies energy within a step; never leaves this file."""
+
+
+#: What a shorter step may mend.
+MENDABLE = (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError, _EnergyGivenError)
+
+
+@dataclass(frozen=True)
+class LoadStep:
+    """A converged load step.
+
+    Attributes:
+        number: counted from 1.
+        factor: load factor reached, 1 at the end.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+    """
+
+    number: int
+    factor: float
+    iterations: list[Iteration]
+    cuts: int
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of linear solves."""
+        return len(self.iterations) - 1
+
+
+def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
+    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length.
+
+    Args:
+        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
+        steps: nominal number of equal steps.
+
+    Yields:
+        Every converged step.
+
+    Raises:
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+    """
+    nominal = 1.0 / steps
+    length, done, last, number, cuts = nominal, 0.0, 0.0, 0, 0
+    start = np.array(problem.u.x.array)
+    while done < 1.0:
+        factor = min(done + length, 1.0)
+        if 1.0 - factor < NOTHING:
+            factor = 1.0
+        fraction = _apply_load(problem, factor)
+        try:
+            iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
+        except MENDABLE as error:
+            # the last step may have been shorter than was meant
+            cuts, length = cuts + 1, 0.5 * (factor - done)
+            if length < SHORTEST_STEP * nominal:
+                _apply_load(problem, done)
+                # the targets that the load moves are back, too
+                problem.restore()
+                raise
+            logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
+            continue
+        last, done, number = factor - done, factor, number + 1
+        yield LoadStep(number, factor, iterations, cuts)
+        cuts = 0
+        if len(iterations) - 1 <= EASY:
+            length = min(2.0 * length, nominal)
+
+
+def _apply_load(problem: UnitedProblem, factor: float) -> float:
+    """Set the load; returns how far the Dirichlet values are to be ramped."""
+    set_load(problem, factor)
+    return 1.0 if callable(problem.load) and not isinstance(problem.load, fem.Constant) else factor
+
+
+@dataclass(frozen=True)
+class TimeStep:
+    """A converged time step.
+
+    Attributes:
+        number: counted from 1.
+        time: reached.
+        dt: length of the step.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+        touched: names of the contacts that had no active contactor before the step and have one now.
+        left: names of those that had one and have none now.
+    """
+
+    number: int
+    time: float
+    dt: float
+    iterations: list[Iteration]
+    cuts: int
+    touched: tuple[str, ...]
+    left: tuple[str, ...]
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of linear solves."""
+        return len(self.iterations) - 1
+
+    @property
+    def start(self) -> float:
+        """Time at which the step began; with ``event_tolerance`` the instant of the touches and departures in it."""
+        return self.time - self.dt
+
+
+def time_steps(
+    problem: UnitedProblem,
+    dt: float,
+    end: float,
+    *,
+    event_tolerance: float | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Iterator[TimeStep]:
+    """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
+
+    A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would
+    give the bodies energy within it, and grown again on ease.
+
+    Args:
+        problem: with ``dynamics``; its ``load`` is called with the time.
+        dt: nominal length of the steps.
+        end: time to reach.
+        event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``: the step is parted there,
+            so that a step begins at the instant. None leaves steps as they are.
+        checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
+            either here or, for writers that are to resume, already by ``checkpoint.begin(problem.state())``.
+
+    Returns:
+        An iterator of converged steps.
+
+    Raises:
+        ValueError: if ``dt`` is not positive, or too short to be told from rounding of the time, ``end`` before the start or not
+            finite, or ``event_tolerance`` not between 0 and 1.
+        SpaceError: if the problem has no dynamics.
+        CheckpointError: see ``Checkpoint``.
+        TunnellingError: if a contactor passes through a target even in the shortest step.
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+    """
+    dynamics = problem.dynamics
+    if dynamics is None:
+        raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
+    if not 0.0 < dt < np.inf or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
+        raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
+    if not dynamics.start <= end < np.inf:
+        raise ValueError(f"end = {end}: expected a time that is not before the start, {dynamics.start:.6g}")
+    if _rounding(dynamics, dt, end) > SHORTEST_STEP * dt:
+        raise ValueError(
+            f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
+            "take longer steps"
+        )
+    if checkpoint is not None and not checkpoint.begun:
+        checkpoint.begin(problem.state())
+    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt, checkpoint)
+    return iter(progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt))))
+
+
+def _time_steps(
+    problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
+) -> Iterator[TimeStep]:
+    """The steps of ``time_steps``."""
+    set_load(problem, dynamics.time)
+    problem.system.accelerate()
+    cuts, before, rounding = 0, _touching(problem), _rounding(dynamics, dt, end)
+    while (remainder := end - dynamics.time) > rounding:
+        # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
+        passed = (dynamics.time - dynamics.start) / dt
+        rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
+        length = min(dynamics.longest, dt if abs(rest - dt) <= rounding else rest)
+        try:
+            forces = _contact_forces(problem)
+            length, iterations = _step(problem, length, before, tolerance)
+            if length > SHORTEST_GIVEN * dt:
+                _refuse_given_energy(problem, dynamics, forces)
+        except UEMError as error:
+            dynamics.restore()
+            set_load(problem, dynamics.time)
+            problem.restore()
+            if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_STEP * dt:
+                raise
+            cuts, dynamics.longest = cuts + 1, 0.5 * length
+            logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, dynamics.longest)
+            continue
+        problem.commit()
+        nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
+        if abs(dynamics.time - nearest) <= rounding:
+            dynamics.time = float(nearest)
+        if len(iterations) - 1 <= EASY:
+            dynamics.longest *= 2.0
+        dynamics.number += 1
+        after = _touching(problem)
+        yield TimeStep(
+            dynamics.number,
+            dynamics.time,
+            length,
+            iterations,
+            cuts,
+            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if now and not was),
+            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if was and not now),
+        )
+        before, cuts = after, 0
+        if checkpoint is not None:
+            checkpoint.step()
+    if checkpoint is not None:
+        checkpoint.finish()
+
+
+def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
+    """Attempt a step, or the part of it before the first touch or departure: its length and history (collective)."""
+    iterations = _attempt(problem, length)
+    if tolerance is None or length <= tolerance or _touching(problem) == before:
+        return length, iterations
+    # the first trial asks whether the step begins at the instant
+    low, high, trial = 0.0, length, tolerance
+    while high - low > tolerance:
+        problem.restore()
+        try:
+            _attempt(problem, trial)
+            same = _touching(problem) == before
+        except MENDABLE:
+            same = False
+        low, high = (trial, high) if same else (low, trial)
+        trial = 0.5 * (low + high)
+    problem.restore()
+    length = low or length
+    return length, _attempt(problem, length)
+
+
+def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
+    """Find the state at the end of a step of this length (collective)."""
+    assert problem.dynamics is not None
+    set_load(problem, problem.dynamics.time + length)
+    problem.dynamics.begin(length)
+    iterations = problem.attempt()
+    check_tunnelling(problem.system, problem.committed)
+    return iterations
+
+
+def _contact_forces(problem: UnitedProblem) -> list[Array]:
+    """Contact forces on both bodies of each contact that does no work by itself, at this rank's nodes (collective)."""
+    assert problem.dynamics is not None
+    if problem.dynamics.contactors != "massless":
+        return []
+    still = [c for c in problem.contacts if not (isinstance(c.target, RigidSurface) and c.target.motion is not None)]
+    return [np.array(c.force.x.array[: problem.config.gdim * problem.config.n_owned]) for c in still if c.n_active]
+
+
+def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, before: list[Array]) -> None:
+    """Refuse a step within which contacts have given the bodies energy, by more than their share (collective).
+
+    The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along.
+
+    Args:
+        problem: at the end of the step.
+        dynamics: of the problem.
+        before: contact forces at its beginning.
+    """
+    forces = before + _contact_forces(problem)
+    if not forces:
+        return
+    n = problem.config.gdim * problem.config.n_owned
+    way = problem.u.x.array[:n] - problem.committed[:n]
+    given = problem.comm.allreduce(0.5 * float(sum(f @ way for f in forces)))
+    if given <= MOST_GIVEN * dynamics.largest:
+        return
+    dynamics.largest = max(dynamics.largest, dynamics.kinetic_energy())
+    if given > MOST_GIVEN * dynamics.largest:
+        raise _EnergyGivenError(f"contacts would give the bodies {given:.3g} of energy, which have {dynamics.largest:.3g}")
+
+
+def _touching(problem: UnitedProblem) -> list[bool]:
+    """Which contacts have active contactors (collective)."""
+    return [contact.n_active > 0 for contact in problem.contacts]
+
+
+def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
+    """Difference of times that means nothing."""
+    return max(NOTHING * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))
+
+
+def set_load(problem: UnitedProblem, at: float) -> None:
+    """Set loads, and what else the problem's ``load`` sets, of a load factor or a time (collective).
+
+    What a function raises on some ranks is raised on all of them, where it can be sent as it is; else as a RuntimeError.
+    """
+    if isinstance(problem.load, fem.Constant):
+        problem.load.value = at
+    elif problem.load is not None:
+        try:
+            problem.load(at)
+        except Exception as error:
+            agree(problem.comm, error if problem.comm.size == 1 else _to_be_sent(error))
+        else:
+            agree(problem.comm, None)
+
+
+def _to_be_sent(error: Exception) -> Exception:
+    """The error, or its words if it does not survive the way to other ranks."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error

@@ -1,0 +1,142 @@
+"""Derivatives at the present displacement: the tangent K of the bodies, the curvature of the contact, and cells turned inside out.
+
+A part of the seventh step on the data's way; K is assembled only when something it depends on has changed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.log import compiling, timed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.geometry.configuration import Configuration
+    from uem_dolfinx.materials.elastic import HistoryMaterial
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Tangent:
+    """K = dF/du, with the mass's part of it in dynamics, assembled when it has changed.
+
+    Args:
+        F: UFL residual.
+        u: displacement.
+        materials: whose stresses in F are no expressions of u; they add their stiffness.
+        dynamics: whose inertia forces depend on u, or None.
+
+    Raises:
+        SpaceError: if F does not depend on u.
+    """
+
+    def __init__(self, F: ufl.Form, u: fem.Function, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None):
+        J = ufl.derivative(F, u)
+        for material in materials:
+            J += material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0])
+        J = ufl.algorithms.expand_derivatives(J)
+        if J.empty():
+            raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
+        #: Whether K is the same for every u.
+        self.linear: bool = u not in J.coefficients()
+        self._dynamics, self._factor = dynamics, 0.0
+        self._inputs = [*J.coefficients(), *J.constants()]
+        self._values: list[Array] | None = None
+        with compiling("the tangent"):
+            self._form = compat.form(J)
+        self.K: PETSc.Mat = forms.create_matrix(self._form)
+        #: Grows with every assembly.
+        self.number = 0
+
+    def update(self) -> None:
+        """Assemble K unless nothing it depends on has changed (collective)."""
+        values = [np.array(c.x.array if isinstance(c, fem.Function) else c.value) for c in self._inputs]
+        factor = self._dynamics.factor if self._dynamics is not None else 0.0
+        same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
+        same &= factor == self._factor
+        comm = self.K.comm.tompi4py()
+        if comm.allreduce(int(same)) == comm.size:
+            return
+        with timed("assemble tangent"):
+            forms.assemble_matrix(self.K, self._form)
+            if self._dynamics is not None and factor:
+                self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        self._values, self._factor = values, factor
+        self.number += 1
+
+
+def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PETSc.Mat:
+    """Matrix of ``-sum lambda grad^2 g``, to be added to K (collective).
+
+    Args:
+        parts: of every pair, global nodes ``(k, m)``, negative where there is none, and the blocks ``(k, m gdim, m gdim)``.
+        du: a vector with the displacement's layout.
+    """
+    g = du.getBlockSize()
+    # how many blocks meet at each node bounds the length of its rows
+    counts = du.duplicate()
+    counts.set(0.0)
+    for nodes, _ in parts:
+        width = nodes.shape[1]
+        flat = nodes[nodes >= 0].astype(PETSc.IntType)
+        index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
+        counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
+    counts.assemble()
+    n = counts.getLocalSize()
+    rows = np.minimum(counts.array_r, counts.getSize())
+    G = PETSc.Mat().createAIJ(
+        (du.getSizes(), du.getSizes()),
+        bsize=g,
+        nnz=(np.minimum(rows, n).astype(PETSc.IntType), np.minimum(rows, counts.getSize() - n).astype(PETSc.IntType)),
+        comm=du.comm,
+    )
+    G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+    # a rank without nodes would not be told, and then assemble otherwise than the others
+    G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
+    for nodes, blocks in parts:
+        if len(nodes):
+            which = nodes.astype(PETSc.IntType)
+            G.setValuesBlockedRCV(which, which, blocks, addv=PETSc.InsertMode.ADD)
+    G.assemble()
+    return G
+
+
+class Inversions:
+    """Looks for cells that the displacement turns inside out.
+
+    Args:
+        config: configuration of the displacement.
+    """
+
+    def __init__(self, config: Configuration):
+        self.config = config
+        self._J = ufl.det(ufl.Identity(config.gdim) + ufl.grad(config.u))
+        one = fem.Constant(config.mesh, 1.0)
+        with compiling("the search for cells turned inside out"):
+            self._volume = compat.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
+
+    def find(self) -> str | None:
+        """Where the worst of them is, if there are any (collective)."""
+        config = self.config
+        if forms.assemble_scalar(self._volume, config.comm) == 0.0:
+            return None
+        determinant = fem.Function(compat.dg0_space(config.mesh))
+        compat.interpolate_expression(determinant, self._J)
+        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
+        dofs = compat.cell_dofs(config.V)
+        here = (np.inf, "")
+        if len(values):
+            cell = int(values.argmin())
+            here = (float(values[cell]), str(np.round(config.X[dofs[cell]].mean(axis=0), 6)))
+        return min(config.comm.allgather(here))[1]

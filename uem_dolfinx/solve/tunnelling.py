@@ -1,0 +1,79 @@
+"""Steps within which a contactor would go through a target are refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.errors import TunnellingError
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.pair import ContactPair
+    from uem_dolfinx.solve.system import BodySystem
+
+#: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
+PASSING = 0.1
+#: A step that would have to be looked at more often than this is too long.
+MOST_LOOKS = 256
+
+
+def check_tunnelling(system: BodySystem, start: npt.NDArray[np.float64]) -> None:
+    """Refuse a step within which a contactor went through a target (collective).
+
+    One that touches at the end must have come from in front of the facet it touches. Of one that does not, the straight way is looked
+    at in pieces no longer than the target's stride; most steps are shorter than that and are not looked at.
+
+    Args:
+        system: at the end of the step.
+        start: displacement at its beginning ``(n_local incl. ghosts,)``.
+
+    Raises:
+        TunnellingError: naming the deepest such contactor of the first rank that has one.
+    """
+    u, config = system.u.x.array, system.config
+    end = np.array(u)
+    way = np.linalg.norm((end - start).reshape(-1, config.gdim), axis=1)
+    for pair in system.pairs:
+        target, stride = pair.target, pair.target.stride
+        moves = [
+            way[pair.nodes].max(initial=0.0),
+            way[target.facets.dofs].max(initial=0.0) if isinstance(target, MeshTarget) else 0.0,
+        ]
+        new = pair.trial.active & ~pair.committed.active
+        *moves, touches = np.max(config.comm.allgather([*moves, float(new.any())]), axis=0)
+        looks = np.ceil(sum(moves) / stride)
+        error = None
+        if looks > MOST_LOOKS:
+            error = TunnellingError(
+                f"{pair.name}: the surfaces move by {sum(moves):.4g} within a step, {looks:.3g} times what a contactor may pass without "
+                "being looked for: take smaller steps"
+            )
+        agree(config.comm, error)
+        if touches:
+            u[:] = start
+            outside = target.project(pair.points).gap >= 0.0
+            before = target.follow(pair.points, pair.projection).gap
+            u[:] = end
+            _refuse_passage(pair, new & outside & (before < -PASSING * stride), before, "touches the target from behind after")
+        for k in range(1, int(looks)):
+            u[:] = start + k / looks * (end - start)
+            p = target.project(pair.points)
+            u[:] = end
+            inside = ~pair.trial.active & (p.gap < -PASSING * stride) & ~(p.beyond != 0).any(axis=1)
+            _refuse_passage(pair, inside, p.gap, "passes through the target within")
+
+
+def _refuse_passage(pair: ContactPair, passed: npt.NDArray[np.bool_], gap: npt.NDArray[np.float64], how: str) -> None:
+    """Raise if a contactor passed (collective)."""
+    error = None
+    if passed.any():
+        i = int(np.argmin(np.where(passed, gap, np.inf)))
+        error = TunnellingError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} {how} a step, {-gap[i]:.4g} inside on its way: "
+            "take smaller steps"
+        )
+    agree(pair.config.comm, error)
