@@ -162,7 +162,7 @@ def signorini(
     def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:
         pressure.x.array[:] = contact.pressure.x.array
         found: dict[str, float | None] = {}
-        for name, (difference, whole) in forms.items():
+        for name, (difference, whole) in compiled.items():
             found[name] = float(np.sqrt(forms.assemble_scalar(difference, comm) / forms.assemble_scalar(whole, comm)))
         direction = 1.0 if contactor == "upper" else -1.0
         found["error_force"] = abs(direction * contact.resultant().force[1] / exact.force - 1)
