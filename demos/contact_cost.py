@@ -22,6 +22,7 @@ from common import comm, dirichlet
 from dolfinx import fem
 
 import uem_dolfinx as uem
+from uem_dolfinx.algebra.linear_solver import has_hypre
 from uem_dolfinx import compat
 
 args = common.arguments(__doc__, dofs=100_000, degree=1)
@@ -32,7 +33,7 @@ PARTS = {
     "united matrix P'KP": ("restriction matrix P", "cross out prescribed components"),
     "linear solve": ("factorisation or preconditioner set-up",),
 }
-AMG = ("gamg", "hypre") if compat.has_hypre() else ("gamg",)
+AMG = ("gamg", "hypre") if has_hypre() else ("gamg",)
 
 
 def elastic(mesh, dim: int) -> tuple[fem.Function, ufl.Form]:

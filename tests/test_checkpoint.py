@@ -535,7 +535,7 @@ def test_folder_that_cannot_be_made(folder):
 
 def test_writing_that_fails_leaves_the_last_file(folder, monkeypatch):
     """On one rank the disk is full: all ranks raise, the file before is whole, and nothing else is left."""
-    from uem_dolfinx import checkpoint
+    from uem_dolfinx.restart import checkpoint
 
     uem.write_checkpoint(folder / "run", small(seed=1))
     before = (folder / "run").read_bytes()

@@ -299,7 +299,7 @@ def test_no_step_jumps_through_a_plate():
 
 def test_a_passage_that_no_step_resolves_is_named(monkeypatch):
     """Where steps may not be shortened far enough the error names contact and contactor, and the last good state is kept."""
-    from uem_dolfinx import steps
+    from uem_dolfinx.solve import steps
 
     monkeypatch.setattr(steps, "SHORTEST_STEP", 0.9)
     problem, contact, _ = bullet()

@@ -281,7 +281,7 @@ def test_without_backends_a_default_is_found(monkeypatch):
     for backend in ("hypre", "mumps"):
         monkeypatch.setattr(compat, f"has_{backend}", lambda: False)
     if COMM.size > 1:
-        monkeypatch.setattr("uem_dolfinx.solver.DIRECT_UP_TO", {2: 0, 3: 0})
+        monkeypatch.setattr("uem_dolfinx.algebra.linear_solver.DIRECT_UP_TO", {2: 0, 3: 0})
     b = blocks(COMM, "triangle", 2, 4)
     contact = uem.Contact(b.high, b.low)
     problem = problem_of(b, contact, bcs=b.oedometer(0.01))

@@ -17,6 +17,7 @@ from dolfinx import fem
 from evidence.scene import DIRECT, Scene, overlap
 
 import uem_dolfinx as uem
+from uem_dolfinx.algebra.linear_solver import has_mumps
 from uem_dolfinx import compat, forms
 from uem_dolfinx.geometry.surfaces import tributary_areas
 
@@ -152,7 +153,7 @@ def indenter(N: int) -> Scene:
         return uem.Contact(contactor=tags["top"], target=paraboloid, sliding="fixed", name="indenter")
 
     direct = {"ksp_type": "preonly", "pc_type": "lu"}
-    if compat.has_mumps():
+    if has_mumps():
         direct["pc_factor_mat_solver_type"] = "mumps"
     known = contact()
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[known], petsc_options=direct, rtol=1e-12)

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from uem_dolfinx import compat
 from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.log import timed
@@ -54,7 +53,7 @@ def default_options(size: int, gdim: int) -> dict[str, Any]:
     """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG."""
     if size <= DIRECT_UP_TO[gdim]:
         options = {"ksp_type": "preonly", "pc_type": "lu"}
-        if compat.has_mumps():
+        if has_mumps():
             options["pc_factor_mat_solver_type"] = "mumps"
         return options
     return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
@@ -65,7 +64,7 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
 
     Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
     """
-    amg = amg or ("hypre" if compat.has_hypre() else "gamg")
+    amg = amg or ("hypre" if has_hypre() else "gamg")
     if amg == "gamg":
         return {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
     boomeramg = {
@@ -85,7 +84,7 @@ def check_options(options: dict[str, Any]) -> None:
         MissingBackendError: naming the option.
     """
     for key, value in options.items():
-        for name, there in (("hypre", compat.has_hypre), ("mumps", compat.has_mumps)):
+        for name, there in (("hypre", has_hypre), ("mumps", has_mumps)):
             if str(value).lower() == name and not there():
                 raise MissingBackendError(
                     f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "

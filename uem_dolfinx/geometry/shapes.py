@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.compat import create_lagrange_element, reference_topology
+from uem_dolfinx.forms import create_lagrange_element, reference_topology
 
 Array = npt.NDArray[np.float64]
 
