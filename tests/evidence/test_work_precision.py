@@ -6,21 +6,16 @@ Two tests to read first: ``test_exact_solution_is_in_equilibrium`` and ``test_or
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-
-import uem_dolfinx as uem
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
-
 from evidence import measure
 from evidence.problems import bar_impact, hertz_answer, hertz_cylinder, indenter
 from evidence.signorini import Exact, signorini
+
+import uem_dolfinx as uem
 
 COMM = MPI.COMM_WORLD
 EXACT = Exact(c=1.3, nu=0.3)

@@ -19,7 +19,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
-CANTILEVERS = Path(__file__).parent.parent / "meshes" / "cantilevers.geo"
+CANTILEVERS = Path(__file__).parents[2] / "meshes" / "cantilevers.geo"
 
 
 def cantilevers(w=-28.0, contactor="A", **how):

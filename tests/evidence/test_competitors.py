@@ -5,21 +5,16 @@ Two tests to read first: ``test_penalty_converges_with_its_stiffness`` and ``tes
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 from dolfinx import fem
+from evidence import methods
 from helpers import at, blocks, box, clamp, gathered_matrix, highest, linear, modulus, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "demos"))
-from evidence import methods
 
 COMM = MPI.COMM_WORLD
 E = 10.0

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
 from evidence import cases_motion, cases_pressing, cases_scales, cases_touching, methods
 from evidence.cases import COLUMNS, FORCE, Case, Check, judge
 from evidence.cases_laws import lawful

@@ -12,22 +12,19 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+import common
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from evidence import peers
+from evidence.peers import by_calculix, by_getfem
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
-
-import common
-from evidence import peers
-from evidence.peers import by_calculix, by_getfem
-
 COMM = MPI.COMM_WORLD
-SCRIPT = Path(__file__).parents[1] / "demos" / "peers.py"
+SCRIPT = Path(__file__).parents[2] / "demos" / "peers.py"
 NUMBERS = {"h": 1 / 30, "E": 1e6, "nu": 0.3, "R": 3.0, "push": 0.006}
 KEYS = {"code", "nodes", "seconds", "newton_iterations", "P", "p_max_ratio", "error"}
 

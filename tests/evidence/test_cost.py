@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from helpers import at, blocks, box, clamp, linear, modulus, scene, st_venant
-from test_dynamics import Bar
 from test_stages import FACTORISATION, SEARCH, SOLVE, TANGENT, counted, environment, serial
+from test_time_steps import Bar
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat

@@ -236,8 +236,8 @@ def test_checkpoint_of_statics(folder):
 
 RUN = """
 import sys
-sys.path.insert(0, {tests!r})
-from test_long_runs import DT, END, TOLERANCE, Impact
+sys.path[:0] = {paths!r}
+from test_interrupted_runs import DT, END, TOLERANCE, Impact
 import uem_dolfinx as uem
 
 impact = Impact()
@@ -249,7 +249,7 @@ with uem.Checkpoint({path!r}, every={every}) as checkpoint:
 
 def start(path, every):
     """A process that runs until it is done or killed."""
-    return start_process(RUN.format(tests=str(Path(__file__).parent), path=str(path), every=every))
+    return start_process(RUN.format(paths=[str(folder) for folder in Path(__file__).parents[:2]], path=str(path), every=every))
 
 
 @serial

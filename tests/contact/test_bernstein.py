@@ -42,7 +42,7 @@ from uem_dolfinx.geometry.shapes import facet_shape
 from uem_dolfinx.geometry.surfaces import tributary_areas
 
 COMM = MPI.COMM_WORLD
-MESHES = Path(__file__).parent.parent / "meshes"
+MESHES = Path(__file__).parents[2] / "meshes"
 NU = 0.3
 #: Oedometric modulus over Young's modulus.
 M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,15 +14,12 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import highest, start_process
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
-
 from evidence.traffic import Counting, plates, search_traffic, watched
+from helpers import highest, start_process
 
 serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
 
-SCRIPT = Path(__file__).parents[1] / "demos" / "scaling.py"
+SCRIPT = Path(__file__).parents[2] / "demos" / "scaling.py"
 #: Bytes of the numbers in the answer for one contactor over quadrilaterals, and what is said about each message.
 ANSWER, MESSAGE = 8 * 68, 5000
 

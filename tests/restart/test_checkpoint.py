@@ -681,7 +681,7 @@ def test_no_handler_outside_the_main_thread(folder):
 
 RUN = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {paths!r}
 from test_checkpoint import lead, slider
 import uem_dolfinx as uem
 
@@ -701,7 +701,7 @@ with uem.Checkpoint({path!r}, every={every}) as checkpoint:
 
 def start(path, every):
     """A process that runs until it is done or killed."""
-    return start_process(RUN.format(tests=str(Path(__file__).parent), path=str(path), every=every))
+    return start_process(RUN.format(paths=[str(folder) for folder in Path(__file__).parents[:2]], path=str(path), every=every))
 
 
 @serial
