@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
 from typing import Any
 
 from mpi4py import MPI
@@ -18,28 +17,20 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from evidence import methods
-from petsc4py import PETSc
+from evidence.scenes import NU, Array, Ints, Scene, at, box, clamp, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 COMM = MPI.COMM_WORLD
 
 #: What counts as right, for all methods alike: forces and works to 1 %, overlaps to 1e-3 of the smallest element at the contact.
 FORCE, OVERLAP, BALANCE = 1e-2, 1e-3, 1e-3
-NU = 0.3
 #: A method that has spent more than so many Newton iterations for each load step it was asked for and is not at the end, or so many
 #: times the time steps, counts as one that does not converge.
 PATIENCE = 20
 #: Newton iterations that a cut step has spent.
 LOST = 50
-
-
-def oedometer(E: float = 1.0, nu: float = NU) -> float:
-    """Modulus of a block that is held at its sides."""
-    return E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
 
 
 class NotApplicable(Exception):
@@ -221,24 +212,7 @@ class Box:
     E: float = 1.0
 
 
-def _nodes_and_cells(box: Box, cell: str) -> tuple[Array, Ints]:
-    g = len(box.lo)
-    axes = [np.linspace(a, b, k + 1) for a, b, k in zip(box.lo, box.hi, box.n)]
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, g)
-    stride = np.cumprod([1, *(k + 1 for k in box.n[:0:-1])])[::-1]
-    first = np.stack(np.meshgrid(*map(np.arange, box.n), indexing="ij"), axis=-1).reshape(-1, g) @ stride
-    ring = [(0, 0), (1, 0), (1, 1), (0, 1)]
-    corners: dict[str, list[Any]] = {
-        "triangle": [[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]],
-        "quadrilateral": [ring],
-        "tetrahedron": [np.cumsum([[0] * 3, *np.eye(3, dtype=int)[list(p)]], axis=0) for p in permutations(range(3))],
-        "hexahedron": [[(*c, z) for z in (0, 1) for c in ring]],
-    }
-    cells = np.concatenate([first[:, None] + np.array(c) @ stride for c in corners[cell]])
-    return x, cells.astype(np.int64)
-
-
-class Scene:
+class BoxScene(Scene):
     """Boxes in one mesh, whose surfaces are found by their places in the drawing, before it is bent, turned and scaled.
 
     Args:
@@ -258,15 +232,14 @@ class Scene:
         law: type[Any] = uem.LinearElastic,
     ):
         self.boxes, self.g = list(boxes), len(boxes[0].lo)
-        parts = [_nodes_and_cells(box, cell) for box in boxes]
-        first = np.cumsum([0, *(len(x) for x, _ in parts)])
-        self._drawing = np.concatenate([x for x, _ in parts])
-        x = np.concatenate([pose(x, k) if pose else x for k, (x, _) in enumerate(parts)])
-        cells = np.concatenate([c + f for (_, c), f in zip(parts, first)])
-        given = slice(None) if COMM.rank == 0 else slice(0)
-        self.mesh = compat.create_mesh(COMM, cells[given], x[given], cell, 1)
-        body = np.repeat(np.arange(len(parts)), [len(c) for _, c in parts])
-        self.body = body[forms.original_cells(self.mesh)]
+        parts = [box(cell, b.lo, b.hi, b.n) for b in boxes]
+        bodies = np.split(np.arange(sum(len(part.x) for part in parts)), np.cumsum([len(part.x) for part in parts])[:-1])
+
+        def posed(x: Array) -> Array:
+            return x if pose is None else np.concatenate([pose(x[nodes], k) for k, nodes in enumerate(bodies)])
+
+        made = scene(COMM, cell, parts, pose=posed)
+        super().__init__(made.mesh, made.drawing, made.body)
         self.V = compat.function_space(self.mesh, 1, (self.g,))
         self.u = fem.Function(self.V, name="displacement")
         self.E = fem.Function(compat.dg0_space(self.mesh), name="E")
@@ -275,11 +248,6 @@ class Scene:
         self.F = self.material.residual(self.u, ufl.TestFunction(self.V)) * ufl.dx(degree=2)
         self.bcs: list[fem.DirichletBC] = []
         self.contacts: list[uem.Contact] = []
-        self._tags: dict[tuple[int, int, float], uem.Tag] = {}
-        mesh, t = self.mesh, self.mesh.topology.dim
-        for a, b in ((t - 1, 0), (t - 1, t), (t, t - 1)):
-            mesh.topology.create_connectivity(a, b)
-        self._at = self._drawing[np.asarray(mesh.geometry.input_global_indices)[forms.vertex_nodes(mesh)]]
 
     @property
     def moduli(self) -> list[float]:
@@ -296,29 +264,13 @@ class Scene:
             within: places of the drawing ``(n, gdim)`` that count; None takes all.
         """
         value = (self.boxes[body].lo, self.boxes[body].hi)[end][axis]
-        t, topology = self.g, self.mesh.topology
-        on = np.abs(self._at[:, axis] - value) < 1e-9 * max(1.0, abs(value))
-        if within is not None:
-            on &= within(self._at)
-        facet_vertices, facet_cells = topology.connectivity(t - 1, 0), topology.connectivity(t - 1, t)
-        index = topology.index_map(t - 1)
-        facets = [
-            f
-            for f in range(index.size_local + index.num_ghosts)
-            if on[facet_vertices.links(f)].all() and (self.body[facet_cells.links(f)] == body).any()
-        ]
-        name = f"body_{body + 1}_{'xyz'[axis]}{end}"
-        return uem.Tag(name, 10 * body + 2 * axis + end + 1, t - 1, self.mesh, np.array(facets, dtype=np.int32))
+        on = at(axis, value, 1e-9 * max(1.0, abs(value)))
+        where = on if within is None else lambda x: on(x) & within(x)
+        return self.tag(f"body_{body + 1}_{'xyz'[axis]}{end}", body, where, 10 * body + 2 * axis + end + 1)
 
     def hold(self, tag: uem.Tag, *components: int, value: float | npt.ArrayLike = 0.0) -> None:
         """Prescribe components of the displacement on a tag; a vector prescribes all."""
-        if np.ndim(value):
-            dofs = fem.locate_dofs_topological(self.V, tag.dim, tag.entities)
-            self.bcs.append(fem.dirichletbc(np.array(value, dtype=PETSc.ScalarType), dofs, self.V))
-            return
-        for c in components or range(self.g):
-            dofs = fem.locate_dofs_topological(self.V.sub(c), tag.dim, tag.entities)
-            self.bcs.append(fem.dirichletbc(PETSc.ScalarType(value), dofs, self.V.sub(c)))
+        self.bcs += clamp(self.V, tag, *components, value=value)
 
     def rollers(self, *bodies: int) -> None:
         """Hold the sides of bodies, all when none is named, as an oedometer does."""

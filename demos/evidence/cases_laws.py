@@ -13,7 +13,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 import uem_dolfinx as uem
-from evidence.cases import BALANCE, COMM, OVERLAP, Array, Scene, Trial
+from evidence.cases import BALANCE, COMM, OVERLAP, BoxScene, Trial
+from evidence.scenes import Array
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
@@ -37,7 +38,7 @@ class Place:
     above: bool
 
 
-def places(scene: Scene, contact: uem.Contact, h: float) -> list[Place]:
+def places(scene: BoxScene, contact: uem.Contact, h: float) -> list[Place]:
     """Places of this rank's contactors (collective)."""
     points, target = contact.pair.points, contact.pair.target
     if not isinstance(contact.target, uem.Tag):
@@ -71,13 +72,13 @@ def _off_cone(normals: Array, force: Array) -> float:
     return float(nnls(normals.T, force)[1])
 
 
-def overlap(scene: Scene, h: float) -> float:
+def overlap(scene: BoxScene, h: float) -> float:
     """How deep the deepest contactor is inside its target, over the size of an element (collective)."""
     depths = [-place.gap for contact in scene.contacts for place in places(scene, contact, h) if place.above]
     return max(0.0, *COMM.allgather(max(depths, default=0.0))) / h
 
 
-def lawful(trial: Trial, scene: Scene, h: float, supported: float = BALANCE) -> float:
+def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALANCE) -> float:
     """Check equilibrium and contact conditions; returns the sum of the contact forces' sizes (collective).
 
     Equilibrium where no contact is, forces along the normals that press and never pull, action equal to reaction in force and
@@ -125,7 +126,7 @@ def lawful(trial: Trial, scene: Scene, h: float, supported: float = BALANCE) -> 
     return size
 
 
-def _action_and_reaction(trial: Trial, scene: Scene, r: Array, touching: Array, free: Array, scale: float) -> None:
+def _action_and_reaction(trial: Trial, scene: BoxScene, r: Array, touching: Array, free: Array, scale: float) -> None:
     """Check the sums of forces and of moments on all surfaces, where no support shares in them (collective)."""
     g = scene.g
     whole = np.array([COMM.allreduce(int((~free[touching, c]).sum())) == 0 for c in range(g)])

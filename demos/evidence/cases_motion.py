@@ -12,7 +12,7 @@ import ufl
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from evidence.cases import COMM, FORCE, OVERLAP, Box, Case, Scene, Trial
+from evidence.cases import COMM, FORCE, OVERLAP, Box, BoxScene, Case, Trial
 from evidence.cases_laws import overlap
 from uem_dolfinx import compat, forms
 
@@ -33,7 +33,7 @@ class Motion:
         scene: its bodies.
     """
 
-    def __init__(self, problem: uem.UnitedProblem, scene: Scene):
+    def __init__(self, problem: uem.UnitedProblem, scene: BoxScene):
         assert problem.dynamics is not None
         self._dynamics = problem.dynamics
         self._stored = compat.form(scene.material.energy(scene.u) * ufl.dx)
@@ -61,7 +61,7 @@ def bar_on_wall(courant: float, event: float | None, trial: Trial) -> None:
     h = 1 / n
     dt = courant * h / c
     gap = 0.3 * V0 * dt
-    scene = Scene([Box((0.0, gap), (h, gap + 1.0), (1, n), RHO * c**2)], nu=0.0)
+    scene = BoxScene([Box((0.0, gap), (h, gap + 1.0), (1, n), RHO * c**2)], nu=0.0)
     scene.unite(scene.side(0, 1, 0), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
     dynamics = uem.Dynamics(uem.consistent_mass(scene.V, RHO), velocity=(0.0, -V0))
     problem = trial.create(scene.F, scene.u, scene.moduli, h, contacts=scene.contacts, dynamics=dynamics)
@@ -88,7 +88,7 @@ def through(passes: float, trial: Trial) -> None:
     speed = passes * thickness / dt
     E = RHO * (speed / 0.3) ** 2
     boxes = [Box((-1.0, -thickness), (1.0, 0.0), (20, 2), E), Box((-0.43, 0.05), (0.43, 0.85), (8, 8), E)]
-    scene = Scene(boxes, nu=0.0)
+    scene = BoxScene(boxes, nu=0.0)
     for end in (0, 1):
         scene.hold(scene.side(0, 0, end))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))

@@ -7,11 +7,12 @@ from functools import partial
 import numpy as np
 
 import uem_dolfinx as uem
-from evidence.cases import COMM, FORCE, Box, Case, Scene, Trial
-from evidence.cases_laws import lawful
+from evidence.cases import COMM, FORCE, Box, BoxScene, Case, Trial
+from evidence.cases_laws import check_laws
+from evidence.scenes import rotation
 
 
-def _under_a_punch(boxes: list[Box]) -> Scene:
+def _under_a_punch(boxes: list[Box]) -> BoxScene:
     """Half of a wide and deep block, even under the punch and growing beyond; with the half of a punch if there are two boxes."""
 
     def graded(x: np.ndarray, body: int) -> np.ndarray:
@@ -20,7 +21,7 @@ def _under_a_punch(boxes: list[Box]) -> Scene:
         far = np.where(x[:, 0] > 1.5, 0.5 + np.exp(x[:, 0] - 1.5), x[:, 0])
         return np.column_stack([far, 1.0 - np.exp(-x[:, 1])])
 
-    scene = Scene(boxes, pose=graded)
+    scene = BoxScene(boxes, pose=graded)
     scene.hold(scene.side(0, 1, 0))
     for body in range(len(boxes)):
         scene.hold(scene.side(body, 0, 0), 0)
@@ -50,7 +51,7 @@ def flat_punch(trial: Trial) -> None:
             carried.append(-COMM.allreduce(float(s.residual()[nodes[inside], 1].sum())))
         trial.check(f"force within {part:g} of the width", (carried[1] - carried[0]) / force, FORCE)
     trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / force - 1, FORCE)
-    lawful(trial, scene, h)
+    check_laws(trial, scene, h)
 
 
 def sharp_corner(trial: Trial) -> None:
@@ -63,24 +64,24 @@ def sharp_corner(trial: Trial) -> None:
         return np.column_stack([0.013 + c * (x[:, 0] - x[:, 1]), c * (x[:, 0] + x[:, 1])])
 
     boxes = [Box((-1.0, -1.0), (1.0, 0.0), (24, 12)), Box((0.0, 0.0), (0.7, 0.7), (7, 7), 10.0)]
-    scene = Scene(boxes, "triangle", pose, law=uem.NeoHooke)
+    scene = BoxScene(boxes, "triangle", pose, law=uem.NeoHooke)
     scene.hold(scene.side(0, 1, 0))
     for axis in (0, 1):
         scene.hold(scene.side(1, axis, 1), value=(0.0, -0.12))
         scene.unite(scene.side(1, axis, 0), scene.side(0, 1, 1))
     scene.solve(trial, 1 / 12, 6)
-    lawful(trial, scene, 1 / 12)
+    check_laws(trial, scene, 1 / 12)
 
 
 def corner_on_corner(trial: Trial) -> None:
     """A block that overhangs the edge of a lower one is pressed down: the target's corner lies between two contactors."""
     boxes = [Box((0.0, -1.0), (1.0, 0.0), (8, 8)), Box((0.53, 0.0), (1.53, 1.0), (10, 10), 2.0)]
-    scene = Scene(boxes, "triangle", law=uem.NeoHooke)
+    scene = BoxScene(boxes, "triangle", law=uem.NeoHooke)
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.0, -0.1))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 0.1, 4)
-    lawful(trial, scene, 0.1)
+    check_laws(trial, scene, 0.1)
 
 
 def wedge(trial: Trial) -> None:
@@ -92,15 +93,15 @@ def wedge(trial: Trial) -> None:
         return np.column_stack([x[:, 0] + 0.01, x[:, 1] + 0.8 * np.abs(x[:, 0]) * (1 - x[:, 1])])
 
     boxes = [Box((-1.0, -1.0), (1.0, 0.0), (16, 8)), Box((-0.5, 0.0), (0.5, 1.0), (10, 10), 3.0)]
-    scene = Scene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
+    scene = BoxScene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.0, -0.08))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), max_penetration=0.2)
     scene.solve(trial, 0.1, 4)
-    lawful(trial, scene, 0.1)
+    check_laws(trial, scene, 0.1)
 
 
-def random_scene(seed: int, g: int, law: type, angle: float) -> tuple[Scene, float, np.ndarray]:
+def random_scene(seed: int, g: int, law: type, angle: float) -> tuple[BoxScene, float, np.ndarray]:
     """A block on another one, whose sizes, shapes, stiffnesses, meshes and ways are drawn; turned by an angle.
 
     Returns:
@@ -116,9 +117,7 @@ def random_scene(seed: int, g: int, law: type, angle: float) -> tuple[Scene, flo
     way = np.array([rng.uniform(-0.05, 0.05), *[0.0] * (g - 2), -gap - rng.uniform(0.02, 0.08)])
     jitter = [rng.uniform(-0.15, 0.15, ((n + 1) ** g, g)) for n in (n_low, n_high)]
     cell = [("triangle", "quadrilateral"), ("tetrahedron", "hexahedron")][g - 2][rng.integers(2)]
-    R = np.eye(g)
-    R[0, 0] = R[-1, -1] = np.cos(angle)
-    R[-1, 0], R[0, -1] = np.sin(angle), -np.sin(angle)
+    R = rotation(g, angle)
 
     def pose(x: np.ndarray, body: int) -> np.ndarray:
         y = np.array(x)
@@ -140,7 +139,7 @@ def random_scene(seed: int, g: int, law: type, angle: float) -> tuple[Scene, flo
         Box([-wide / 2] * (g - 1) + [-1.0], [wide / 2] * (g - 1) + [0.0], [int(n_low)] * g),
         Box([-0.5 + shift] * (g - 1) + [gap], [0.5 + shift] * (g - 1) + [gap + high], [int(n_high)] * g, E),
     ]
-    scene = Scene(boxes, cell, pose, law=law)
+    scene = BoxScene(boxes, cell, pose, law=law)
     scene.hold(scene.side(0, g - 1, 0))
     scene.hold(scene.side(1, g - 1, 1), value=R @ way)
     scene.unite(scene.side(1, g - 1, 0), scene.side(0, g - 1, 1), max_penetration=0.5)
@@ -154,7 +153,7 @@ def random_scenes(seeds: range, g: int, law: type, trial: Trial) -> None:
         for angle in (0.0, 0.7 + seed):
             scene, h, R = random_scene(seed, g, law, angle)
             scene.solve(trial, h, 4)
-            size = lawful(trial, scene, h)
+            size = check_laws(trial, scene, h)
             forces.append(scene.reaction(scene.side(0, g - 1, 0)) @ R)
         trial.check("rotation", float(np.abs(forces[1] - forces[0]).max()) / size if size > 0 else np.inf, FORCE)
         trial.about(f"scene {seed}", start)

@@ -10,20 +10,21 @@ from functools import partial
 import numpy as np
 
 import uem_dolfinx as uem
-from evidence.cases import FORCE, NU, OVERLAP, Box, Case, Scene, Trial, oedometer
-from evidence.cases_laws import lawful, overlap
+from evidence.cases import FORCE, OVERLAP, Box, BoxScene, Case, Trial
+from evidence.cases_laws import check_laws, overlap
+from evidence.scenes import NU, oedometric
 
 
-def springs(n: tuple[list[int], list[int]], E: tuple[float, float] = (1.0, 1.0), d: float = 0.01, gap: float = 0.0) -> Scene:
+def springs(n: tuple[list[int], list[int]], E: tuple[float, float] = (1.0, 1.0), d: float = 0.01, gap: float = 0.0) -> BoxScene:
     """Unit block on unit block between rollers, the top pushed down by d; ``n`` and E of the lower and the upper one."""
-    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), n[0], E[0]), Box((0.0, gap), (1.0, 1.0 + gap), n[1], E[1])])
+    scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), n[0], E[0]), Box((0.0, gap), (1.0, 1.0 + gap), n[1], E[1])])
     scene.rollers()
     scene.hold(scene.side(0, 1, 0), 1)
     scene.hold(scene.side(1, 1, 1), 1, value=-d)
     return scene
 
 
-def settled(trial: Trial, scene: Scene, force: float, h: float) -> None:
+def settled(trial: Trial, scene: BoxScene, force: float, h: float) -> None:
     """Check the reaction of the ground against the force of the springs, and the overlap (collective)."""
     trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / force - 1, FORCE)
     trial.check("overlap", overlap(scene, h), OVERLAP)
@@ -36,7 +37,7 @@ def stiffness_ratio(ratio: float, trial: Trial) -> None:
         scene = springs(([4 * (2 - contactor)] * 2, [4 * (1 + contactor)] * 2), E)
         scene.unite(scene.side(contactor, 1, 1 - contactor), scene.side(1 - contactor, 1, contactor))
         scene.solve(trial, 1 / 8)
-        settled(trial, scene, 0.01 * oedometer() / (1 / E[0] + 1 / E[1]), 1 / 8)
+        settled(trial, scene, 0.01 * oedometric() / (1 / E[0] + 1 / E[1]), 1 / 8)
 
 
 def stiffness_ratio_curved(ratio: float, trial: Trial) -> None:
@@ -48,12 +49,12 @@ def stiffness_ratio_curved(ratio: float, trial: Trial) -> None:
         return np.column_stack([x[:, 0], x[:, 1] + lift])
 
     boxes = [Box((-1.0, -1.0), (1.0, 0.0), (15, 8), E[0]), Box((-0.6, 0.0), (0.6, 1.0), (12, 8), E[1])]
-    scene = Scene(boxes, "triangle", round_below, law=uem.StVenantKirchhoff)
+    scene = BoxScene(boxes, "triangle", round_below, law=uem.StVenantKirchhoff)
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.0, -0.04))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 0.1, 2)
-    lawful(trial, scene, 0.1)
+    check_laws(trial, scene, 0.1)
 
 
 def mesh_ratio(n: tuple[int, int], two_pass: bool, trial: Trial) -> None:
@@ -65,18 +66,18 @@ def mesh_ratio(n: tuple[int, int], two_pass: bool, trial: Trial) -> None:
         scene.unite(low, high)
     scene.solve(trial, 1 / max(n))
     if n[1] >= n[0] or two_pass:
-        settled(trial, scene, 0.01 * oedometer() / 2, 1 / max(n))
-    lawful(trial, scene, 1 / max(n))
+        settled(trial, scene, 0.01 * oedometric() / 2, 1 / max(n))
+    check_laws(trial, scene, 1 / max(n))
 
 
 def locking(trial: Trial) -> None:
     """Two equal clamped blocks that bulge, against the same mesh in one piece: no shear where they meet, so the same force."""
     for nu in (0.3, 0.49, 0.4999):
-        whole = Scene([Box((0.0, -1.0), (1.0, 1.0), (6, 12))], nu=nu)
+        whole = BoxScene([Box((0.0, -1.0), (1.0, 1.0), (6, 12))], nu=nu)
         whole.hold(whole.side(0, 1, 0))
         whole.hold(whole.side(0, 1, 1), value=(0.0, -0.02))
         uem.UnitedProblem(whole.F, whole.u, bcs=whole.bcs, petsc_options_prefix="whole_").solve()
-        scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (6, 6)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], nu=nu)
+        scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), (6, 6)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], nu=nu)
         scene.hold(scene.side(0, 1, 0))
         scene.hold(scene.side(1, 1, 1), value=(0.0, -0.02))
         scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
@@ -84,7 +85,7 @@ def locking(trial: Trial) -> None:
         start = len(trial.checks)
         force = whole.reaction(whole.side(0, 1, 0))[1]
         trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / force - 1, FORCE)
-        lawful(trial, scene, 1 / 6)
+        check_laws(trial, scene, 1 / 6)
         trial.about(f"nu = {nu}", start)
 
 
@@ -96,13 +97,13 @@ def _one_unit(trial: Trial, length: float, E: float) -> tuple[np.ndarray, int]:
         return length * bent
 
     boxes = [Box((-0.5, -1.0), (1.5, 0.0), (8, 4), E), Box((0.0, 0.05), (1.0, 1.05), (6, 6), 2 * E)]
-    scene = Scene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
+    scene = BoxScene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.03 * length, -0.12 * length))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     before = trial.iterations
     scene.solve(trial, length / 6, 2)
-    lawful(trial, scene, length / 6)
+    check_laws(trial, scene, length / 6)
     return scene.reaction(scene.side(0, 1, 0)) / (E * length), trial.iterations - before
 
 
@@ -123,13 +124,13 @@ def penetration(depth: float, trial: Trial) -> None:
     scene = springs(([4, 4], [8, 8]), d=0.0, gap=-depth)
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), max_penetration=2 * h)
     scene.solve(trial, h)
-    trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / (depth * oedometer() / 2) - 1, FORCE)
+    trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / (depth * oedometric() / 2) - 1, FORCE)
     trial.check("overlap", overlap(scene, h), OVERLAP)
 
 
 def compression(kept: float, held: bool, trial: Trial) -> None:
     """Two neo-Hookean blocks pressed to a part of their height, between rollers or free to spread; both stay bricks."""
-    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, 0.0), (1.0, 1.0), (4, 4))], law=uem.NeoHooke)
+    scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, 0.0), (1.0, 1.0), (4, 4))], law=uem.NeoHooke)
     if held:
         scene.rollers()
     else:
@@ -149,7 +150,7 @@ def compression(kept: float, held: bool, trial: Trial) -> None:
     while not held and low < (middle := (low + high) / 2) < high:
         low, high = (middle, high) if along(middle, kept) < 0 else (low, middle)
     settled(trial, scene, -along(kept, low), 1 / 4)
-    lawful(trial, scene, 1 / 4)
+    check_laws(trial, scene, 1 / 4)
 
 
 CASES = [

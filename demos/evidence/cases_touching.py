@@ -9,9 +9,10 @@ import numpy as np
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from evidence.cases import BALANCE, FORCE, OVERLAP, Box, Case, Scene, Trial, oedometer
-from evidence.cases_laws import lawful, overlap
+from evidence.cases import BALANCE, FORCE, OVERLAP, Box, BoxScene, Case, Trial
+from evidence.cases_laws import check_laws, overlap
 from evidence.cases_scales import settled, springs
+from evidence.scenes import oedometric
 
 
 def bend(height: float, nudge: float, lift: float) -> Callable[[np.ndarray, int], np.ndarray]:
@@ -38,13 +39,13 @@ def vertex(height: float, law: type, trial: Trial) -> None:
     forces = []
     for nudge in (1e-3, -1e-3, *NUDGES):
         boxes = [Box((-1.0, -1.0), (1.0, 0.0), (8, 4)), Box((-0.5, 0.0), (0.5, 1.0), (4, 4), 2.0)]
-        scene = Scene(boxes, "triangle", bend(height, nudge, 0.0), law=law)
+        scene = BoxScene(boxes, "triangle", bend(height, nudge, 0.0), law=law)
         scene.hold(scene.side(0, 1, 0))
         scene.hold(scene.side(1, 1, 1), value=(0.0, -0.03))
         scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), max_penetration=0.2)
         scene.solve(trial, 0.25, 2)
         start = len(trial.checks)
-        lawful(trial, scene, 0.25)
+        check_laws(trial, scene, 0.25)
         forces.append(scene.reaction(scene.side(0, 1, 0))[1])
         # on a ridge either side is an equilibrium
         low, high = min(forces[:2]), max(forces[:2])
@@ -58,13 +59,13 @@ def edge(trial: Trial) -> None:
         forces = []
         for nudge in NUDGES[:3]:
             boxes = [Box((-1.0, -0.5, -1.0), (1.0, 1.5, 0.0), (4, 4, 2)), Box((-0.5, 0.0, 0.0), (0.5, 1.0, 1.0), (2, 2, 2), 2.0)]
-            scene = Scene(boxes, "tetrahedron", bend(height, nudge, 0.0), law=uem.StVenantKirchhoff)
+            scene = BoxScene(boxes, "tetrahedron", bend(height, nudge, 0.0), law=uem.StVenantKirchhoff)
             scene.hold(scene.side(0, 2, 0))
             scene.hold(scene.side(1, 2, 1), value=(0.0, 0.0, -0.03))
             scene.unite(scene.side(1, 2, 0), scene.side(0, 2, 1), max_penetration=0.2)
             scene.solve(trial, 0.5, 2)
             start = len(trial.checks)
-            lawful(trial, scene, 0.5)
+            check_laws(trial, scene, 0.5)
             forces.append(scene.reaction(scene.side(0, 2, 0))[2])
             trial.check("force", forces[-1] / forces[0] - 1, FORCE)
             trial.about(f"{'roof' if height > 0 else 'valley'}, nudge {nudge:.2g}", start)
@@ -73,7 +74,7 @@ def edge(trial: Trial) -> None:
 def rest(trial: Trial) -> None:
     """Touching with nothing that pushes: nothing moves, no force."""
     for law in (uem.LinearElastic, uem.NeoHooke):
-        scene = Scene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle", law=law)
+        scene = BoxScene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle", law=law)
         scene.hold(scene.side(0, 1, 0))
         scene.hold(scene.side(1, 1, 1))
         scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
@@ -84,7 +85,7 @@ def rest(trial: Trial) -> None:
 
 def grazing(trial: Trial) -> None:
     """A block slides along a flat target at zero pressure, over its vertices and off its end, without force."""
-    scene = Scene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle")
+    scene = BoxScene([Box((-0.5, -1.0), (1.5, 0.0), (8, 4)), Box((0.0, 0.0), (1.0, 1.0), (6, 6))], "triangle")
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(1.7, 0.0))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
@@ -102,7 +103,7 @@ def tangent_sphere(trial: Trial) -> None:
             return np.column_stack([x[:, 0], x[:, 1] + (0.1 + 0.4 * x[:, 0] ** 2 * (1 - x[:, 1]) if body else 0.0)])
 
         boxes = [Box((-1.0, -1.0), (1.0, 0.0), (15, 6)), Box((-0.5, 0.0), (0.5, 1.0), (10, 6))]
-        scene = Scene(boxes, "triangle", pose)
+        scene = BoxScene(boxes, "triangle", pose)
         scene.hold(scene.side(0, 1, 0))
         scene.hold(scene.side(1, 1, 1), value=(0.0, -0.1 - more))
         scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
@@ -120,7 +121,7 @@ def off_the_end(trial: Trial) -> None:
         return np.column_stack([x[:, 0], x[:, 1] + (0.8 * (x[:, 0] - 0.85) ** 2 * (0.5 - x[:, 1]) if body else 0.0)])
 
     boxes = [Box((0.0, -1.0), (2.0, 0.0), (10, 5)), Box((0.6, 0.0), (1.1, 0.5), (6, 6), 10.0)]
-    scene = Scene(boxes, "triangle", pose, law=uem.NeoHooke)
+    scene = BoxScene(boxes, "triangle", pose, law=uem.NeoHooke)
     scene.hold(scene.side(0, 1, 0))
     lead = fem.Constant(scene.mesh, np.zeros(2))
     top = fem.locate_dofs_topological(scene.V, 1, scene.side(1, 1, 1).entities)
@@ -137,7 +138,7 @@ def off_the_end(trial: Trial) -> None:
         force = float(np.linalg.norm(scene.reaction(scene.side(0, 1, 0))))
         pressed = max(pressed, force)
         if force > 0.01 * pressed:
-            lawful(trial, scene, h)
+            check_laws(trial, scene, h)
         trial.about(f"at {step.factor:.3g}", start)
     trial.check("force at the end", force / pressed, BALANCE)
 
@@ -148,7 +149,7 @@ def led_contactor(trial: Trial) -> None:
     scene.hold(scene.side(1, 1, 0), 1, value=-0.01)
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 1 / 8)
-    settled(trial, scene, 0.01 * oedometer(), 1 / 8)
+    settled(trial, scene, 0.01 * oedometric(), 1 / 8)
 
 
 def fought_contactor(trial: Trial) -> None:
@@ -163,14 +164,14 @@ def fought_contactor(trial: Trial) -> None:
 
 def clamped_corner(trial: Trial) -> None:
     """Contactors held sideways where the target is held fast: values that fit, and a target's node that cannot move."""
-    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (5, 5)), Box((0.0, 0.0), (1.0, 1.0), (5, 5))])
+    scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), (5, 5)), Box((0.0, 0.0), (1.0, 1.0), (5, 5))])
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(0, 0, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.0, -0.01))
     scene.hold(scene.side(1, 0, 0), 0)
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 0.2)
-    lawful(trial, scene, 0.2)
+    check_laws(trial, scene, 0.2)
 
 
 def two_pass(n: tuple[int, int], trial: Trial) -> None:
@@ -180,8 +181,8 @@ def two_pass(n: tuple[int, int], trial: Trial) -> None:
     scene.unite(high, low)
     scene.unite(low, high)
     scene.solve(trial, 1 / max(n))
-    settled(trial, scene, 0.01 * oedometer() / 2, 1 / max(n))
-    lawful(trial, scene, 1 / max(n))
+    settled(trial, scene, 0.01 * oedometric() / 2, 1 / max(n))
+    check_laws(trial, scene, 1 / max(n))
 
 
 def two_pass_round(trial: Trial) -> None:
@@ -190,38 +191,38 @@ def two_pass_round(trial: Trial) -> None:
     def pose(x: np.ndarray, body: int) -> np.ndarray:
         return np.column_stack([x[:, 0], x[:, 1] + (0.3 * x[:, 0] ** 2 * (1 - x[:, 1]) if body else 0.0)])
 
-    scene = Scene([Box((-1.0, -1.0), (1.0, 0.0), (30, 12)), Box((-0.6, 0.0), (0.6, 1.0), (25, 12), 3.0)], "triangle", pose)
+    scene = BoxScene([Box((-1.0, -1.0), (1.0, 0.0), (30, 12)), Box((-0.6, 0.0), (0.6, 1.0), (25, 12), 3.0)], "triangle", pose)
     scene.hold(scene.side(0, 1, 0))
     scene.hold(scene.side(1, 1, 1), value=(0.0, -0.04))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.unite(scene.side(0, 1, 1), scene.side(1, 1, 0))
     scene.solve(trial, 0.05)
-    lawful(trial, scene, 0.05)
+    check_laws(trial, scene, 0.05)
 
 
 def chain(E: tuple[float, float, float], trial: Trial) -> None:
     """Three blocks on each other, the middle one contactor and target: springs in series."""
-    scene = Scene([Box((0.0, k), (1.0, k + 1.0), (2 * 2**k, 2 * 2**k), E[k]) for k in range(3)])
+    scene = BoxScene([Box((0.0, k), (1.0, k + 1.0), (2 * 2**k, 2 * 2**k), E[k]) for k in range(3)])
     scene.rollers()
     scene.hold(scene.side(0, 1, 0), 1)
     scene.hold(scene.side(2, 1, 1), 1, value=-0.01)
     for k in (1, 2):
         scene.unite(scene.side(k, 1, 0), scene.side(k - 1, 1, 1))
     scene.solve(trial, 1 / 8)
-    settled(trial, scene, 0.01 * oedometer() / sum(1 / e for e in E), 1 / 8)
-    lawful(trial, scene, 1 / 8)
+    settled(trial, scene, 0.01 * oedometric() / sum(1 / e for e in E), 1 / 8)
+    check_laws(trial, scene, 1 / 8)
 
 
 def loose(load: float, gap: float, sides: bool, trial: Trial) -> None:
     """A block that nothing but contact holds up is pushed down across a gap: the ground carries the load."""
-    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, gap), (1.0, 1.0 + gap), (8, 8))])
+    scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, gap), (1.0, 1.0 + gap), (8, 8))])
     scene.rollers(*((0, 1) if sides else (0,)))
     scene.hold(scene.side(0, 1, 0), 1)
     scene.push(scene.side(1, 1, 1), (0.0, -load))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 1 / 8)
     settled(trial, scene, load, 1 / 8)
-    lawful(trial, scene, 1 / 8)
+    check_laws(trial, scene, 1 / 8)
 
 
 def rocking(trial: Trial) -> None:
@@ -238,18 +239,18 @@ def rocking(trial: Trial) -> None:
         return np.column_stack([0.02 + c * x[:, 0] - s * x[:, 1], 0.2 + s * x[:, 0] + c * x[:, 1]])
 
     boxes = [Box((-1.0, -1.0), (1.0, 0.0), (16, 6)), Box((-0.3, 0.0), (0.3, 0.4), (12, 4))]
-    scene = Scene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
+    scene = BoxScene(boxes, "triangle", pose, law=uem.StVenantKirchhoff)
     scene.hold(scene.side(0, 1, 0))
     scene.weigh(1, (0.0, -1e-2))
     scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
     scene.solve(trial, 0.05)
     trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / (1e-2 * scene.volume(1)) - 1, FORCE)
-    lawful(trial, scene, 0.05, supported=FORCE)
+    check_laws(trial, scene, 0.05, supported=FORCE)
 
 
 def lifted(trial: Trial) -> None:
     """A loose block that is pulled off its ground: nothing can hold it."""
-    scene = Scene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, 0.0), (1.0, 1.0), (8, 8))])
+    scene = BoxScene([Box((0.0, -1.0), (1.0, 0.0), (4, 4)), Box((0.0, 0.0), (1.0, 1.0), (8, 8))])
     scene.rollers()
     scene.hold(scene.side(0, 1, 0), 1)
     scene.push(scene.side(1, 1, 1), (0.0, 0.01))

@@ -7,7 +7,6 @@ Two tests to read first: ``test_nonnegative_control_gaps_leave_no_overlap`` (the
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from mpi4py import MPI
 
@@ -15,56 +14,35 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx import mesh as dmesh
 from helpers import (
     CELLS,
+    M,
+    arch,
     at,
     blocks,
     box,
     clamp,
-    complementary,
+    factors,
     highest,
+    lawful,
     linear,
     lowest,
     modulus,
+    rotation,
     run,
     scene,
     st_venant,
     tangent_by_differences,
-)
+)  # fmt: skip
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.geometry.shapes import facet_shape
 from uem_dolfinx.geometry.surfaces import tributary_areas
 
 COMM = MPI.COMM_WORLD
-MESHES = Path(__file__).parents[2] / "meshes"
-NU = 0.3
-#: Oedometric modulus over Young's modulus.
-M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))
-
-
-def lawful(contact, size=1.0, force=1.0):
-    """Complementarity of control gaps and control forces, action = reaction, and no control force that pulls."""
-    complementary(contact, 1e-12 * size, 1e-10 * force)
-    assert lowest(COMM, contact.pressures) >= -1e-10 * force
-    control = np.sum(contact.config.comm.allgather(contact.pair.trial.lam.sum()))
-    nodal = np.sum(contact.config.comm.allgather(contact.pair.trial.nodal.sum()))
-    assert control == pytest.approx(nodal, rel=1e-9, abs=1e-12 * force)
-    balance = contact.balance()
-    if balance is not None:
-        assert balance.force <= 1e-12 and balance.moment <= 1e-12
-
-
-def factors(history):
-    """``r1 / r0^2`` of all neighbours among the residuals with one and the same active set: bounded when Newton is quadratic."""
-    r, steady = [i.residual for i in history], [not i.changed for i in history]
-    pairs = [(a, b) for a, b, s in zip(r[:-1], r[1:], steady[1:]) if s and a < 0.1 and b > 1e-9]
-    return [b / a**2 for a, b in pairs]
 
 
 # -- closed forms ----------------------------------------------------------------------------------------------------------
@@ -101,9 +79,7 @@ def test_patch(cell, finer):
 def test_floating_block_of_degree_two(cell, tilt):
     """It falls on a rigid plane, lies down on it if need be, and carries its load uniformly."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
-    n, R = (3 if g == 2 else 2), np.eye(g)
-    R[0, 0] = R[-1, -1] = np.cos(tilt)
-    R[-1, 0], R[0, -1] = np.sin(tilt), -np.sin(tilt)
+    n, R = (3 if g == 2 else 2), rotation(g, tilt)
     s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], pose=lambda x: x @ R.T + 0.1 * np.eye(g)[-1])
     V = compat.function_space(s.mesh, 2, (g,))
     u = fem.Function(V)
@@ -115,9 +91,6 @@ def test_floating_block_of_degree_two(cell, tilt):
     assert contact.n_active == (2 * n + 1) ** (g - 1)
     assert contact.resultant().force[-1] == pytest.approx(0.02, rel=1e-9)
     assert highest(COMM, np.abs(contact.pressures / 0.02 - 1)) < 1e-8
-
-
-# -- control gaps ------------------------------------------------------------------------------------------------------------
 
 
 class Top:
@@ -245,20 +218,10 @@ def test_areas(top):
         assert highest(COMM, plain[corner]) < highest(COMM, areas[corner])
 
 
-# -- Newton ------------------------------------------------------------------------------------------------------------------
-
-
-def arched(x):
-    """Bend the top of the lower block into an arch."""
-    y = x.copy()
-    y[:, -1] -= 0.3 * (x[:, -1] <= 1e-12) * (x[:, -1] + 1) * (x[:, 0] - 0.5) ** 2
-    return y
-
-
 def on_an_arch(cell, comm=COMM, **options):
     """A block pressed askew onto an arch of degree 2."""
     # no contactor stands above a vertex
-    b = blocks(comm, cell, 5 if cell in ("triangle", "quadrilateral") else 3, 2, degree=2, gap=0.1, overhang=0.5, pose=arched)
+    b = blocks(comm, cell, 5 if cell in ("triangle", "quadrilateral") else 3, 2, degree=2, gap=0.1, overhang=0.5, pose=arch(0.3))
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.1, *[0.0] * (b.gdim - 2), -0.2])]
     contact = uem.Contact(b.high, b.low, max_penetration=1.0)
     problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], **options)
@@ -345,122 +308,3 @@ def test_rim_is_the_same_on_any_number_of_ranks(cell, n):
         answers.append((rows[np.lexsort(np.round(rows[:, : len(n) - 1], 9).T)], len(history)))
     (rows, count), (alone, count_alone) = answers
     assert np.abs(rows - alone).max() < 1e-8 and count == count_alone
-
-
-def test_hertz_on_curved_cells():
-    """Degree-2 cells that follow the arc, coarse: peak pressure and half width of Hertz at the computed force."""
-    E, R = 1e6, 3.0
-    mesh, tags = uem.read_gmsh(MESHES / "hertz_cylinder.geo", COMM, gdim=2, parameters={"h": 1 / 30, "order": 2})
-    V = compat.function_space(mesh, 2, (2,))
-    u = fem.Function(V)
-    bcs = [*clamp(V, tags["symmetry"], 0), *clamp(V, tags["block_bottom"], 1), *clamp(V, tags["disc_top"], 1, value=-0.006)]
-    contact = uem.Contact(tags["disc_arc"], tags["block_top"])
-    problem = uem.UnitedProblem(linear(u, fem.Constant(mesh, PETSc.ScalarType(E))), u, bcs=bcs, contacts=[contact], rtol=1e-10)
-    for _ in uem.load_steps(problem, 2):
-        lawful(contact, force=E)
-    P = 2 * contact.resultant().force[1]
-    E_star = E / (2 * (1 - NU**2))
-    p0 = np.sqrt(P * E_star / (np.pi * R))
-    a = 2 * P / (np.pi * p0)
-    assert contact.max_pressure() == pytest.approx(p0, rel=0.05)
-    x = contact.pair.points[:, 0]
-    assert highest(COMM, x[contact.pair.trial.active]) == pytest.approx(a, abs=1 / 30)
-    # moment of the half profile about the axis: the integral of p x
-    assert contact.resultant().moment[0] == pytest.approx(p0 * a**2 / 3, rel=0.03)
-
-
-# -- curved geometry -----------------------------------------------------------------------------------------------------------
-
-
-def curved_blocks(cell, comm=COMM):
-    """A block over an arch, both in cells of degree 2 whose nodes lie on the arch; none of the contactors is above a vertex."""
-    # nodes of the cells of degree 2 in Gmsh's order, on a grid of half cells
-    ring = [(0, 0), (2, 0), (2, 2), (0, 2)]
-    if cell == "quadrilateral":
-        kinds = [[*ring, (1, 0), (2, 1), (1, 2), (0, 1), (1, 1)]]
-    else:
-        kinds = [[(0, 0), (2, 0), (2, 2), (1, 0), (2, 1), (1, 1)], [(0, 0), (2, 2), (0, 2), (1, 1), (1, 2), (0, 1)]]
-    points, cells, first = [], [], 0
-    for lo, hi, n in (((-0.5, -1.0), (1.5, 0.0), (5, 2)), ((0.0, 0.1), (1.0, 1.1), (3, 3))):
-        grid = box("quadrilateral", lo, hi, (2 * n[0], 2 * n[1]))
-        stride = np.array([2 * n[1] + 1, 1])
-        corner = np.stack(np.meshgrid(2 * np.arange(n[0]), 2 * np.arange(n[1]), indexing="ij"), axis=-1).reshape(-1, 2) @ stride
-        cells += [first + corner[:, None] + np.array(k) @ stride for k in kinds]
-        points.append(arched(grid.x))
-        first += len(grid.x)
-    x, cells = np.concatenate(points), np.concatenate(cells).astype(np.int64)
-    given_ = slice(None) if comm.rank == 0 else slice(0)
-    used = np.unique(cells)
-    place = np.zeros(len(x), np.int64)
-    place[used] = np.arange(len(used))
-    mesh = compat.create_mesh(comm, place[cells][given_], x[used][given_], cell, 2)
-    for a, b in ((1, 0), (1, 2)):
-        mesh.topology.create_connectivity(a, b)
-
-    def tag(name, where):
-        return uem.Tag(name, 1, 1, mesh, dmesh.locate_entities_boundary(mesh, 1, where).astype(np.int32))
-
-    tags = [
-        tag("bottom", lambda x: np.abs(x[1] + 1) < 1e-9), tag("low", lambda x: np.abs(x[1] + 0.3 * (x[0] - 0.5) ** 2) < 1e-9),
-        tag("high", lambda x: np.abs(x[1] - 0.1) < 1e-9), tag("top", lambda x: np.abs(x[1] - 1.1) < 1e-9),
-    ]  # fmt: skip
-    return mesh, tags
-
-
-@pytest.mark.parametrize("arch_presses", [False, True])
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_arch_of_curved_cells(cell, arch_presses):
-    """The arch as target and as contactor: lawful, quadratic, alike on any number of ranks, and first touched at its crown."""
-    answers = []
-    for comm in (COMM, MPI.COMM_SELF):
-        mesh, (bottom, low, high, top) = curved_blocks(cell, comm)
-        V = compat.function_space(mesh, 2, (2,))
-        u, lid = fem.Function(V), fem.Function(V)
-        contact = uem.Contact(*((low, high) if arch_presses else (high, low)), max_penetration=0.2)
-        dofs = fem.locate_dofs_topological(V, 1, top.entities)
-
-        def load(factor, lid=lid):
-            lid.x.array.reshape(-1, 2)[:, 1] = -0.1 - 0.05 * factor
-
-        problem = uem.UnitedProblem(
-            st_venant(u, fem.Constant(mesh, PETSc.ScalarType(1.0))), u, bcs=[*clamp(V, bottom), fem.dirichletbc(lid, dofs)],
-            contacts=[contact], load=load, rtol=1e-11,
-        )  # fmt: skip
-        seen = []
-        for step in uem.load_steps(problem, 3):
-            lawful(contact)
-            seen += factors(step.iterations)
-        assert len(seen) >= 2 and max(seen) < 20
-        answers.append(contact.resultant().force)
-        centre = contact.resultant().moment[0] / contact.resultant().force[1]
-        # the pressure's middle is the crown's
-        assert centre == pytest.approx(0.5, abs=0.02)
-    assert np.abs(answers[0] - answers[1]).max() < 1e-9 * np.abs(answers[1]).max()
-
-
-def test_chords_change_the_way_but_not_the_answer():
-    """Straight pieces in P alone [UEM, 4.5]: the same state to rounding, after more iterations."""
-    found = {}
-    for chords in (False, True):
-        pose = lambda x: x + np.array([0.0, -0.2]) * ((x[:, :1] - 0.5) ** 2) * (x[:, 1:] <= 1e-12) * (x[:, 1:] + 1)  # noqa: E731
-        b = blocks(COMM, "triangle", 5, 4, gap=0.02, degree=2, overhang=0.25, pose=pose)
-        contact = uem.Contact(b.high, b.low, chords=chords)
-        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.03, -0.06])]
-        problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
-        steps = run(problem, 2)
-        found[chords] = contact.resultant().force, sum(s.newton_iterations for s in steps), contact.n_active
-        complementary(contact, 1e-12, 1e-10)
-    assert np.allclose(found[True][0], found[False][0], rtol=1e-8)
-    assert found[True][2] == found[False][2] > 2
-    assert found[True][1] > found[False][1]
-
-
-@pytest.mark.parametrize("kind", ["interval", "triangle", "quadrilateral"])
-def test_chords_interpolate_between_neighbouring_nodes(kind):
-    shape, rng = facet_shape(kind, 2), np.random.default_rng(4)
-    xi = rng.random((200, shape.dim))
-    xi = np.concatenate([xi[shape.contains(xi)], shape.nodes])
-    w = shape.chords(xi)
-    assert w.min() >= 0.0 and np.abs(w.sum(axis=1) - 1).max() < 1e-15
-    assert np.abs(w @ shape.nodes - xi).max() < 1e-15
-    assert np.abs(w[-len(shape.nodes) :] - np.eye(len(shape.nodes))).max() < 1e-15

@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, complementary, highest, linear, modulus, run, scene
+from helpers import CELLS, M, at, blocks, box, clamp, complementary, highest, linear, modulus, run, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,9 +23,6 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
 
 COMM = MPI.COMM_WORLD
-NU = 0.3
-M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))
-CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 
 
 def squeezed(b, E_low=1.0, E_high=1.0, d=0.01, how=(), **options):

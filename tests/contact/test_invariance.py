@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import blocks, clamp, linear, modulus, run, st_venant
+from helpers import arch, blocks, clamp, linear, modulus, rotation, run, st_venant
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,14 +19,7 @@ import uem_dolfinx as uem
 COMM = MPI.COMM_WORLD
 
 
-def arch(x):
-    """Lower block with a curved top, so that normals differ and contactors slide."""
-    y = x.copy()
-    y[:, -1] -= 0.3 * np.where(x[:, -1] <= 1e-12, x[:, -1] + 1, 0.0) * (x[:, 0] - 0.45) ** 2
-    return y
-
-
-def rotation(g, angle, other=0.0):
+def turn_of(g, angle, other=0.0):
     R = np.eye(g)
     c, s = np.cos(angle), np.sin(angle)
     R[:2, :2] = [[c, -s], [s, c]]
@@ -43,7 +36,7 @@ def press(
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     R = np.eye(g) if turn is None else turn
     n = (6, 4) if g == 2 else (3, 2)
-    b = blocks(comm, cell, *n, gap=0.1, overhang=0.5, pose=lambda x: length * (arch(x) @ R.T + shift), shuffle=shuffle)
+    b = blocks(comm, cell, *n, gap=0.1, overhang=0.5, pose=lambda x: length * (arch(0.3, 0.45)(x) @ R.T + shift), shuffle=shuffle)
     slide = np.array([0.08, *[0.0] * (g - 2), -0.2]) @ R.T * length
     contact = uem.Contact(b.high, b.low, normals=normals, max_penetration=0.2 * length)
     problem = uem.UnitedProblem(
@@ -100,7 +93,7 @@ def test_translation(reference, case):
 @pytest.mark.parametrize("angle", [0.3, np.pi / 2, -2.0])
 def test_rotation(reference, case, angle):
     turned = press(
-        case[0], normals=case[1], turn=rotation(2 if case[0] in ("triangle", "quadrilateral") else 3, angle, 0.7 * angle)
+        case[0], normals=case[1], turn=turn_of(2 if case[0] in ("triangle", "quadrilateral") else 3, angle, 0.7 * angle)
     )
     same(turned, reference[case], 1e-9)
     # on the way to the contact the block has no strain, and its residual is rounding that the pose decides
@@ -110,7 +103,7 @@ def test_rotation(reference, case, angle):
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.floats(-3.1, 3.1), st.floats(-5, 5), st.integers(0, 1000))
 def test_any_pose_and_numbering(reference, angle, shift, seed):
-    same(press("triangle", turn=rotation(2, angle), shift=shift, shuffle=seed), reference["triangle", "facet"], 1e-9)
+    same(press("triangle", turn=turn_of(2, angle), shift=shift, shuffle=seed), reference["triangle", "facet"], 1e-9)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -146,7 +139,7 @@ def test_rigid_motion_after_contact_leaves_the_forces(cell):
     pressures, forces = [], []
 
     def load(factor):
-        R = rotation(g, max(0.0, factor - 0.5) * 1.2)
+        R = turn_of(g, max(0.0, factor - 0.5) * 1.2)
         shift = max(0.0, factor - 0.5) * np.arange(1, g + 1)
         press_down = np.eye(g)[-1] * -0.2 * min(1.0, 2 * factor)
         bottom.x.array[:] = (x @ R.T - x + shift).ravel()

@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, box, clamp, complementary, highest, modulus, scene, st_venant
+from helpers import at, box, clamp, highest, lawful, modulus, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -39,17 +39,6 @@ def slider(cell, way, *, pose=lambda x: x, target=None, normals="facet", start=0
 
     problem = uem.UnitedProblem(st_venant(u, modulus(s, 1.0, 2.0)), u, bcs=bcs, contacts=[contact], rtol=1e-10, load=load)
     return s, contact, problem
-
-
-def lawful(contact):
-    """Complementarity, and action = reaction."""
-    complementary(contact, 1e-12, 1e-9)
-    balance = contact.balance()
-    assert balance.force <= 1e-12 and balance.moment <= 1e-12
-    there, back = contact.resultant(), contact.resultant(on="target")
-    size = 1.0 + np.abs(there.force).max()
-    assert np.abs(there.force + back.force).max() <= 1e-14 * size
-    assert np.abs(there.moment + back.moment).max() <= 1e-11 * size
 
 
 def facets_met(contact):

@@ -5,21 +5,19 @@ The figures of this scene are asserted by ``demos/snap_through.py``. Worth readi
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import blocks, clamp, gathered_matrix, linear, run
+from helpers import MESHES, blocks, clamp, gathered_matrix, linear, run
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
-CANTILEVERS = Path(__file__).parents[2] / "meshes" / "cantilevers.geo"
+CANTILEVERS = MESHES / "cantilevers.geo"
 
 
 def cantilevers(w=-28.0, contactor="A", **how):

@@ -13,7 +13,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, complementary, highest, linear, modulus, scene, st_venant
+from helpers import M, arch, at, blocks, box, clamp, highest, lawful, linear, modulus, rotation, scene, st_venant
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -21,9 +21,6 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
-NU = 0.3
-#: Oedometric modulus over Young's modulus.
-M = (1 - NU) / ((1 + NU) * (1 - 2 * NU))
 LAWS = {"linear": linear, "finite": st_venant}
 #: Newton iterations of all steps together that no scene here may exceed.
 PATIENCE = 40
@@ -52,12 +49,10 @@ class Meeting:
     contact: uem.Contact
 
 
-def lawful(problem, contact, history, size, stress):
-    """Complementarity, action = reaction, and equilibrium read from the residual itself."""
+def in_equilibrium(problem, contact, history, size, stress):
+    """Conditions of contact, and equilibrium read from the residual itself."""
     g = problem.config.gdim
-    complementary(contact, 2e-13 * problem.config.size, 1e-10 * stress * size ** (g - 1))
-    balance = contact.balance()
-    assert balance.force <= 1e-12 and balance.moment <= 1e-12
+    lawful(contact, 0.2 * problem.config.size, stress * size ** (g - 1))
     force = np.linalg.norm(contact.resultant().force)
     # places are rounded, and so are the forces that follow from them
     rounding = 1e-14 * stress * size ** (g - 1)
@@ -94,7 +89,7 @@ def meet(
     problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
     iterations = 0
     for step in uem.load_steps(problem, steps):
-        lawful(problem, contact, step.iterations, length, stress)
+        in_equilibrium(problem, contact, step.iterations, length, stress)
         assert step.cuts == 0
         iterations += step.newton_iterations
     assert iterations <= PATIENCE
@@ -103,25 +98,6 @@ def meet(
     energy = 0.5 * float(COMM.allreduce(work)) / (stress * length**g)
     force = contact.resultant().force @ R / (stress * length ** (g - 1))
     return Meeting(b.scene.gather(b.u) @ R / length, force, contact.n_active, energy, iterations, contact)
-
-
-def curved(height):
-    """Bend the lower block's top, an arch for a positive height and a bowl for a negative one; the crown is at x = 0.45."""
-
-    def pose(x):
-        y = x.copy()
-        depth = np.where(x[:, -1] <= 1e-12, x[:, -1] + 1, 0.0)
-        y[:, -1] -= height * depth * (x[:, 0] - 0.45) ** 2
-        return y
-
-    return pose
-
-
-def rotation(g, angle):
-    R = np.eye(g)
-    R[0, 0] = R[-1, -1] = np.cos(angle)
-    R[-1, 0], R[0, -1] = np.sin(angle), -np.sin(angle)
-    return R
 
 
 # -- poses, units, numbering -------------------------------------------------------------------------------------------------
@@ -133,7 +109,7 @@ def rotation(g, angle):
 @given(angle=st.floats(-3.2, 3.2), size=st.floats(-9, 6), stiff=st.floats(-3, 11), seed=st.integers(0, 99))
 def test_force_turns_with_the_scene(law, height, angle, size, stiff, seed):
     """In any pose, unit and numbering the scene is the same scene."""
-    how = dict(law=law, gap=0.05, d=0.12, slide=0.03, pose=curved(height))
+    how = dict(law=law, gap=0.05, d=0.12, slide=0.03, pose=arch(height, 0.45))
     there = meet(**how, turn=rotation(2, angle), length=10.0**size, stress=10.0**stiff)
     here = meet(**how)
     assert there.active == here.active > 0
@@ -146,7 +122,7 @@ def test_force_turns_with_the_scene(law, height, angle, size, stiff, seed):
 @settings(max_examples=3, deadline=None, derandomize=True)
 @given(angle=st.floats(-3.2, 3.2), cell=st.sampled_from(["tetrahedron", "hexahedron"]))
 def test_force_turns_with_the_scene_in_3d(angle, cell):
-    how = dict(cell=cell, n=(3, 2), gap=0.05, d=0.12, slide=0.03, pose=curved(0.3))
+    how = dict(cell=cell, n=(3, 2), gap=0.05, d=0.12, slide=0.03, pose=arch(0.3, 0.45))
     here, there = meet(**how), meet(**how, turn=rotation(3, angle))
     assert there.active == here.active > 0
     assert np.abs(there.force - here.force).max() < 1e-9 and np.abs(there.u - here.u).max() < 1e-9
@@ -242,7 +218,7 @@ def nudged(nudge, *, height=0.0, cell="triangle", normals="facet", law="finite",
     high = box(cell, [0.0] * (g - 1) + [gap], [1.0] * (g - 1) + [1.0 + gap], [m] * g)
 
     def pose(x):
-        y = curved(height)(x)
+        y = arch(height, 0.45)(x)
         if not fitted:
             y[len(low.x) :] = x[len(low.x) :]
         y[len(low.x) :, 0] += nudge / m
@@ -257,7 +233,7 @@ def nudged(nudge, *, height=0.0, cell="triangle", normals="facet", law="finite",
     problem = uem.UnitedProblem(LAWS[law](u, modulus(s, 1.0, 2.0)), u, bcs=bcs, contacts=[contact], rtol=1e-10)
     count = 0
     for step in uem.load_steps(problem, 2):
-        lawful(problem, contact, step.iterations, 1.0, 1.0)
+        in_equilibrium(problem, contact, step.iterations, 1.0, 1.0)
         assert step.cuts == 0
         count += step.newton_iterations
     assert count <= PATIENCE

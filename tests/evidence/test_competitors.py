@@ -20,7 +20,7 @@ COMM = MPI.COMM_WORLD
 E = 10.0
 
 
-def arch(x):
+def dented(x):
     """Bend the upper block's lower side, so that it touches in the middle first."""
     y = np.array(x)
     y[:, -1] += 0.08 * (x[:, :-1] - 0.5) ** 2 @ np.ones(x.shape[1] - 1) * (x[:, -1] > 0.0)
@@ -29,7 +29,7 @@ def arch(x):
 
 def pressed(method, parameter=None, *, cell="quadrilateral", degree=1, push=0.05, law=linear, lift=0.02, ratio=1.0, **options):
     """An arched block pressed onto a flat one, with another mesh: the problem, its contact, and the blocks."""
-    b = blocks(COMM, cell, n_low=4, n_high=6, gap=lift, degree=degree, pose=arch, overhang=0.25)
+    b = blocks(COMM, cell, n_low=4, n_high=6, gap=lift, degree=degree, pose=dented, overhang=0.25)
     g = b.gdim
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, *range(g - 1)), *clamp(b.V, b.top, g - 1, value=-push)]
     contact = uem.Contact(

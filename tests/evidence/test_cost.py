@@ -12,10 +12,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from bar_scenes import Bar
+from counting import FACTORISATION, SEARCH, SOLVE, TANGENT, counted
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, linear, modulus, scene, st_venant
-from test_stages import FACTORISATION, SEARCH, SOLVE, TANGENT, counted, environment, serial
-from test_time_steps import Bar
+from helpers import at, blocks, box, clamp, environment, linear, modulus, scene, serial, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat

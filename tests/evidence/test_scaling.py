@@ -10,14 +10,10 @@ import pickle
 from dataclasses import fields
 from pathlib import Path
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 from evidence.traffic import Counting, plates, search_traffic, watched
-from helpers import highest, start_process
-
-serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
+from helpers import highest, serial, start_process
 
 SCRIPT = Path(__file__).parents[2] / "demos" / "scaling.py"
 #: Bytes of the numbers in the answer for one contactor over quadrilaterals, and what is said about each message.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from evidence import cases_motion, cases_pressing, cases_scales, cases_touching, methods
 from evidence.cases import COLUMNS, FORCE, Case, Check, judge
-from evidence.cases_laws import lawful
+from evidence.cases_laws import check_laws
 from evidence.cases_scales import springs
 
 COMM = MPI.COMM_WORLD
@@ -81,7 +81,7 @@ def test_unlawful_states_are_found(spoil, found):
         scene = springs(([4, 4], [8, 8]))
         scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
         scene.solve(trial, 1 / 8)
-        lawful(trial, scene, 1 / 8)
+        check_laws(trial, scene, 1 / 8)
         assert max(check.severity for check in trial.checks) < 1
         trial.checks.clear()
         u = scene.u.x.array.reshape(-1, 2)
@@ -90,7 +90,7 @@ def test_unlawful_states_are_found(spoil, found):
         upper[scene.nodes_of(1)] = 1.0
         u[:, 1] += spoil(y, upper)
         scene.u.x.scatter_forward()
-        lawful(trial, scene, 1 / 8)
+        check_laws(trial, scene, 1 / 8)
 
     assert verdict(run)["verdict"] == "wrong"
     assert found in {check.what for check in trials[0].checks if check.severity > 1}

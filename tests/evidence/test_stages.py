@@ -6,51 +6,19 @@ The two tests worth reading are ``test_nothing_near`` and ``test_linear_bodies_i
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
-from mpi4py import MPI
 
 import numpy as np
 import pytest
 import ufl
+from counting import CROSSED, FACTORISATION, HISTORY, MASS, OUTPUT, PRODUCT, PROJECTION, SEARCH, TANGENT, P, counted
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, linear, outside_mpi, run, scene, st_venant
+from helpers import at, blocks, box, clamp, environment, linear, run, scene, serial, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-
-serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
-
-SEARCH, PROJECTION = "search", "projection"
-P, PRODUCT, CROSSED = "restriction matrix P", "united matrix P'KP", "cross out prescribed components"
-TANGENT, FACTORISATION, SOLVE = "assemble tangent", "factorisation or preconditioner set-up", "linear solve"
-MASS = ("assemble mass", "redistribute mass", "first acceleration", "inertia forces")
-HISTORY = ("return mapping", "commit history")
-OUTPUT = ("write fields", "write table", "write checkpoint", "read checkpoint")
-STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, TANGENT, FACTORISATION, SOLVE, *MASS, *HISTORY, *OUTPUT)
-
-
-class Calls(dict):
-    """Number of calls by timer."""
-
-    def of(self, timers: tuple[str, ...]) -> int:
-        return sum(self[timer] for timer in timers)
-
-
-@contextmanager
-def counted() -> Iterator[Calls]:
-    """How often each stage runs inside, known at the end (alike on all ranks, or it fails)."""
-    before = {stage: compat.timing_calls(f"~UEM: {stage}") for stage in STAGES}
-    calls = Calls()
-    yield calls
-    calls.update({stage: compat.timing_calls(f"~UEM: {stage}") - n for stage, n in before.items()})
-    assert len({tuple(c.items()) for c in MPI.COMM_WORLD.allgather(calls)}) == 1
 
 
 def block_over(comm, target_of, *, height=1.0, law=linear, **how):
@@ -248,14 +216,6 @@ def test_output_only_where_asked_for(comm, folder):
 
 #: What only some scenes need.
 HEAVY = ("gmsh", "matplotlib", "pyvista", "scipy", "tqdm", "vtk")
-
-
-def environment(**more: str) -> dict[str, str]:
-    """For a process told from this one's MPI, with this checkout of the package."""
-    kept = outside_mpi()
-    package = str(Path(uem.__file__).resolve().parent.parent)
-    paths = [package, str(Path(__file__).parents[1]), *filter(None, [kept.get("PYTHONPATH")])]
-    return kept | {"PYTHONPATH": os.pathsep.join(paths)} | more
 
 
 def python(script: str, *options: str, **more: str) -> str:

@@ -1,6 +1,6 @@
-"""Von Mises plasticity: kernels against slow references, closed forms of simple paths, balance of energy, limit loads.
+"""Von Mises plasticity in bodies: closed forms of simple paths, balance of energy, what a problem keeps of it, and what is refused.
 
-Worth reading first: ``test_return_solves_the_equations_of_plasticity`` and ``test_limit_load_of_a_tube``.
+The test to read first is ``test_uniaxial_loading_unloading_and_reverse_flow``.
 """
 
 from __future__ import annotations
@@ -14,157 +14,13 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import Scene, at, box, clamp, highest, run, scene
+from helpers import at, clamp, highest, run
 from petsc4py import PETSc
-from scipy.optimize import root
+from plastic_scenes import FY, MU, NU, E, H, block, reaction
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.materials import von_mises as plasticity
-
-KINDS = {3: "plane_stress", 4: "plane_strain", 6: "3d"}
-E, NU, FY, H = 200.0, 0.3, 0.4, 15.0
-MU = E / (2 * (1 + NU))
-ONE = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-
-
-# -- kernels -----------------------------------------------------------------------------------------------------------
-
-
-def kernel(k: int):
-    """The return of vectors with k components, of strain and committed history."""
-    law = plasticity.plane_stress_return if k == 3 else plasticity.radial_return
-    elastic = (E, NU) if k == 3 else (MU,)
-
-    def returned(strain, plastic_strain, peeq, hardening=H):
-        n = len(strain)
-        return law(strain, plastic_strain, peeq, *(np.full(n, x) for x in (*elastic, FY, hardening)))
-
-    return returned
-
-
-def states(k: int, n: int = 40):
-    """Strains from elastic to 20 times the yield strain, and histories that plastic flow can leave behind."""
-    rng = np.random.default_rng(k)
-    plastic = 0.01 * rng.standard_normal((n, k))
-    if k > 3:
-        plastic[:, :3] -= plastic[:, :3].mean(axis=1, keepdims=True)
-    strain = plastic + FY / E * rng.standard_normal((n, k)) * rng.choice([0.1, 1.0, 20.0], (n, 1))
-    return strain, plastic, 0.02 * rng.random(n)
-
-
-def slow_return(strain, plastic, peeq, hardening):
-    """Stress, plastic strain and peeq of one point from the equations of plasticity in 3D, by a general root finder.
-
-    Unknown are the stress over FY, the strain across the plane where there is one, and the increment of peeq over the yield strain.
-    """
-    k, unit = len(strain), FY / E
-    inside = {3: [0, 1, 5], 4: [0, 1, 2, 5], 6: list(range(6))}[k]
-    eps, before = np.zeros(6), np.zeros(6)
-    eps[inside], before[inside] = strain, plastic
-    if k == 3:
-        before[2] = -before[0] - before[1]
-    compliance = ((1 + NU) * np.eye(6) - NU * np.outer(ONE, ONE)) / E
-
-    def mises(s):
-        return np.sqrt(1.5) * np.linalg.norm(s - ONE * s[:3].mean())
-
-    def state(x, flowing):
-        s, across, dp = FY * x[:6], unit * x[6], unit * x[7] * flowing
-        total = eps.copy()
-        total[2] += across
-        normal = 1.5 * (s - ONE * s[:3].mean()) / max(mises(s), 1e-300)
-        return s, total, before + dp * normal, peeq + dp
-
-    def equations(x, flowing):
-        s, total, ep, p = state(x, flowing)
-        hooke = (compliance @ s - total + ep) / unit
-        plane = x[2] if k == 3 else x[6]
-        surface = (mises(s) - FY - hardening * p) / FY if flowing else x[7]
-        return [*hooke, plane, surface]
-
-    guess = np.zeros(8)
-    for flowing in (False, True):
-        solution = root(equations, guess, args=(flowing,), method="hybr", options={"xtol": 1e-13})
-        s, _, ep, p = state(solution.x, flowing)
-        assert np.abs(equations(solution.x, flowing)).max() < 1e-9
-        if mises(s) <= FY + hardening * p + 1e-9 * FY:
-            break
-        # start the flow from the elastic stress scaled back
-        guess = solution.x.copy()
-        guess[:6] *= (FY + hardening * p) / mises(s)
-        guess[7] = 0.5 * (mises(s) / FY - 1)
-    if k != 3:
-        s = s - ONE * s[:3].mean()
-    return s[inside], ep[inside], p
-
-
-@pytest.mark.parametrize("hardening", [0.0, H])
-@pytest.mark.parametrize("k", KINDS)
-def test_return_solves_the_equations_of_plasticity(k, hardening):
-    given = states(k)
-    fast = kernel(k)(*given, hardening)
-    slow = [slow_return(*point, hardening) for point in zip(*given)]
-    plastic = fast.peeq > given[2]
-    assert 5 < plastic.sum() < len(plastic) - 5
-    for values, reference, scale in zip((fast.stress, fast.plastic_strain, fast.peeq), zip(*slow), (FY, FY / E, FY / E)):
-        assert np.abs(values - np.array(reference)).max() < 1e-7 * scale
-
-
-@pytest.mark.parametrize("hardening", [0.0, H])
-@pytest.mark.parametrize("k", KINDS)
-def test_tangent_is_derivative_of_the_stress(k, hardening):
-    strain, *before = states(k)
-    returned, h = kernel(k), 1e-6 * FY / E
-    tangent = returned(strain, *before, hardening).tangent
-    assert np.abs(tangent - tangent.transpose(0, 2, 1)).max() < 1e-14 * E
-    for j in range(k):
-        step = h * np.eye(k)[j]
-        slope = (returned(strain + step, *before, hardening).stress - returned(strain - step, *before, hardening).stress) / (
-            2 * h
-        )
-        assert np.abs(slope - tangent[:, :, j]).max() < 1e-6 * E
-    # the plastic parts only soften
-    elastic = returned(0 * strain, *(0 * x for x in before)).tangent
-    assert np.linalg.eigvalsh(elastic - tangent).min() > -1e-12 * E
-    assert np.linalg.eigvalsh(tangent).min() > -1e-12 * E
-
-
-def test_plane_stress_return_converges_from_every_state():
-    """The steps are bounded by far more than the worst of these states needs, whatever its scale and its path."""
-    rng, n = np.random.default_rng(1), 20000
-    scale, size = 10 ** rng.uniform(-3, 12, n), 10 ** rng.uniform(-6, 0, n)
-    nu, hardening = rng.uniform(-0.9, 0.999, n), scale * rng.choice([0.0, 1e-3, 1.0, 10.0], n)
-    strain = rng.standard_normal((n, 3)) * (size * 10 ** rng.uniform(0, 6, n))[:, None]
-    strain[: n // 3] *= [1.0, 1.0, 0.0]
-    strain[: n // 6, 1] = strain[: n // 6, 0]
-    new = plasticity.plane_stress_return(strain, 0 * strain, np.zeros(n), scale, nu, scale * size, hardening)
-    s = new.stress
-    mises = np.sqrt(s[:, 0] ** 2 - s[:, 0] * s[:, 1] + s[:, 1] ** 2 + 1.5 * s[:, 2] ** 2)
-    flows = new.peeq > 0
-    assert flows.mean() > 0.9
-    assert np.abs(mises / (scale * size + hardening * new.peeq) - 1)[flows].max() < 1e-10
-
-
-def test_plane_strain_is_3d_held_across():
-    """The plastic strain across the plane is part of the history, and the elastic one makes up for it."""
-    strain, plastic, peeq = states(4)
-    wide = [np.insert(x, [3, 3], 0.0, axis=1) for x in (strain, plastic)]
-    plane, full = kernel(4)(strain, plastic, peeq), kernel(6)(*wide, peeq)
-    for name in ("stress", "plastic_strain"):
-        assert np.abs(np.insert(getattr(plane, name), [3, 3], 0.0, axis=1) - getattr(full, name)).max() < 1e-15
-    assert np.abs(plane.plastic_strain[:, 2]).max() > FY / E
-    assert np.abs(plane.plastic_strain[:, :3].sum(axis=1)).max() < 1e-15
-
-
-# -- scenes ------------------------------------------------------------------------------------------------------------
-
-
-def block(comm: MPI.Comm, cell: str, n: int = 2, degree: int = 1, **how: Any) -> tuple[Scene, fem.Function]:
-    """Unit square or cube with a displacement."""
-    g = 2 if cell in ("triangle", "quadrilateral") else 3
-    s = scene(comm, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], **how)
-    return s, fem.Function(compat.function_space(s.mesh, degree, (g,)), name="u")
 
 
 def skewed(X: np.ndarray) -> np.ndarray:
@@ -220,13 +76,6 @@ def uniaxial(comm: MPI.Comm, cell: str, kind: str, strain: str) -> tuple[uem.Uni
     bcs.append(fem.dirichletbc(pulled, dofs, V.sub(0)))
     F = material.residual(ufl.TestFunction(V))
     return uem.UnitedProblem(F, u, bcs=bcs, materials=[material], petsc_options_prefix="bar_", rtol=1e-11), material, pulled
-
-
-def reaction(problem: uem.UnitedProblem) -> float:
-    """Work of the internal forces on the present displacement."""
-    problem.system.assemble_residual()
-    r = problem.system.residual.array_r
-    return problem.comm.allreduce(float(r @ problem.u.x.array[: len(r)]))
 
 
 # -- closed forms ------------------------------------------------------------------------------------------------------
@@ -456,125 +305,6 @@ def test_work_on_a_shear_path_is_stored_or_dissipated(comm, cell, kind):
         work += (tau + last[1]) / 2 * (gamma - last[0])
         last = gamma, tau
     assert material.energy() + material.dissipation() == pytest.approx(work, rel=1e-10)
-
-
-# -- limit loads -------------------------------------------------------------------------------------------------------
-
-
-def tube(comm: MPI.Comm, cell: str, n: int, degree: int) -> tuple[float, list[uem.LoadStep]]:
-    """Inner pressure of a perfectly plastic tube in plane strain, wide open, over the exact limit load; b = 2 a."""
-    g = 2 if cell in ("triangle", "quadrilateral") else 3
-
-    def bent(X):
-        angle = np.pi / 2 * X[:, 1]
-        return np.column_stack([(1 + X[:, 0]) * np.cos(angle), (1 + X[:, 0]) * np.sin(angle), X[:, 2:]])
-
-    s = scene(comm, cell, [box(cell, [0.0] * g, [1.0, 1.0, 0.25][:g], [n, 2 * n, 1][:g])], pose=bent)
-    V = compat.function_space(s.mesh, degree, (g,))
-    u, opened, opening = fem.Function(V), fem.Function(V), 0.01
-    X = V.tabulate_dof_coordinates()[:, :2]
-    opened.x.array.reshape(-1, g)[:, :2] = opening * X / np.linalg.norm(X, axis=1, keepdims=True)
-    bcs = clamp(V, s.tag("x", 0, at(1, 0.0)), 1) + clamp(V, s.tag("y", 0, at(1, 1.0)), 0)
-    for z in (0.0, 0.25) if g == 3 else ():
-        bcs += clamp(V, s.tag("end", 0, at(2, z)), 2)
-    bcs.append(fem.dirichletbc(opened, fem.locate_dofs_topological(V, g - 1, s.tag("inner", 0, at(0, 0.0)).entities)))
-    material = uem.VonMises(u, 1000.0, NU, 1.0, kind="3d" if g == 3 else "plane_strain")
-    problem = uem.UnitedProblem(
-        material.residual(ufl.TestFunction(V)), u, bcs=bcs, materials=[material], petsc_options_prefix="t_"
-    )
-    steps = run(problem, 8)
-    pressure = reaction(problem) / (opening * np.pi / 2 * (0.25 if g == 3 else 1.0))
-    return pressure / (2 / 3**0.5 * np.log(2)), steps
-
-
-@pytest.mark.parametrize(
-    "cell, n, degree, error",
-    [
-        ("quadrilateral", 4, 1, 0.0015), ("hexahedron", 4, 1, 0.0015), ("quadrilateral", 2, 2, 0.015),
-        ("quadrilateral", 4, 2, 0.004), ("triangle", 4, 2, 0.004), ("tetrahedron", 2, 2, 0.012), ("hexahedron", 2, 2, 0.015),
-    ],
-)  # fmt: skip
-def test_limit_load_of_a_tube(comm, cell, n, degree, error):
-    """Cells that lock come out far above the limit; Newton's method is quadratic."""
-    ratio, steps = tube(comm, cell, n, degree)
-    assert abs(ratio - 1) < error
-    assert max(step.newton_iterations for step in steps) <= 6
-
-
-@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_linear_simplices_lock_as_documented(comm, cell):
-    assert tube(comm, cell, 4, 1)[0] > 1.1
-
-
-@pytest.mark.parametrize(
-    "cell, n, degree, error",
-    [("quadrilateral", 8, 1, 0.056), ("quadrilateral", 4, 2, 0.042), ("triangle", 4, 2, 0.070), ("triangle", 8, 1, 0.24)],
-)
-def test_limit_load_of_a_punch(comm, cell, n, degree, error):
-    """Errors against Prandtl's 2 + pi, that the docstring of ``VonMises`` tells."""
-    s = scene(comm, cell, [box(cell, [0.0, -2.0], [4.0, 0.0], [4 * n, 2 * n])])
-    V = compat.function_space(s.mesh, degree, (2,))
-    u, punch = fem.Function(V), s.tag("punch", 0, lambda x: (np.abs(x[:, 1]) < 1e-9) & (x[:, 0] < 1 + 1e-9))
-    bcs = [*clamp(V, s.tag("bottom", 0, at(1, -2.0))), *clamp(V, punch, 0), *clamp(V, punch, 1, value=-0.06)]
-    for x in (0.0, 4.0):
-        bcs += clamp(V, s.tag("side", 0, at(0, x)), 0)
-    material = uem.VonMises(u, 1000.0, NU, 1.0, kind="plane_strain")
-    problem = uem.UnitedProblem(
-        material.residual(ufl.TestFunction(V)), u, bcs=bcs, materials=[material], petsc_options_prefix="p_"
-    )
-    run(problem, 10)
-    assert reaction(problem) / 0.06 / ((2 + np.pi) / 3**0.5) - 1 == pytest.approx(error, rel=0.03)
-
-
-# -- in a problem ------------------------------------------------------------------------------------------------------
-
-
-def beams(comm: MPI.Comm) -> tuple[np.ndarray, list[float]]:
-    """A finitely bent cantilever, plastic near its root and elastic elsewhere: displacement and what is measured."""
-    s = scene(comm, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [4.0, 1.0], [16, 4])])
-    V = compat.function_space(s.mesh, 1, (2,))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    middle = s.mesh.geometry.x[compat.geometry_dofs(s.mesh)].mean(axis=1)
-    root, rest = (np.flatnonzero(where).astype(np.int32) for where in (middle[:, 0] < 1, middle[:, 0] > 1))
-    how = {"kind": "plane_stress", "strain": "green_lagrange"}
-    material = uem.VonMises(u, E, NU, FY, H, cells=uem.Tag("root", 1, 2, s.mesh, root), **how)
-    F = material.residual(v)
-    F += uem.StVenantKirchhoff(E, NU, "plane_stress").residual(u, v) * forms.cell_measure(s.mesh, rest)
-    bcs = clamp(V, s.tag("root", 0, at(0, 0.0))) + clamp(V, s.tag("tip", 0, at(0, 4.0)), 1, value=-0.4)
-    problem = uem.UnitedProblem(F, u, bcs=bcs, materials=[material], petsc_options_prefix="b_")
-    run(problem, 4)
-    peeq = material.cell_averages()["peeq"]
-    owned = peeq.x.array[: peeq.function_space.dofmap.index_map.size_local]
-    figures = [material.energy(), material.dissipation(), reaction(problem), highest(comm, owned), comm.allreduce(owned.sum())]
-    return s.gather(u), figures
-
-
-def test_any_number_of_ranks_gives_the_same(comm):
-    """Some ranks have no plastic cell."""
-    u, figures = beams(comm)
-    u_alone, figures_alone = beams(MPI.COMM_SELF)
-    assert figures[1] > 0.1 * figures[2]
-    assert figures == pytest.approx(figures_alone, rel=1e-7)
-    assert np.abs(u - u_alone).max() < 1e-8
-
-
-def test_contact_presses_a_column_into_flow(comm):
-    """A rigid plane pushes with FY times the width of a perfectly plastic column, and no more."""
-    s, u = block(comm, "quadrilateral")
-    V = u.function_space
-    material = uem.VonMises(u, E, NU, FY, kind="plane_stress")
-    plane = uem.RigidPlane([0.0, 1.0], [0.0, -1.0])
-    contact = uem.Contact(contactor=s.tag("top", 0, at(1, 1.0)), target=plane)
-    bcs = clamp(V, s.tag("bottom", 0, at(1, 0.0)), 1) + clamp(V, s.tag("left", 0, at(0, 0.0)), 0)
-    problem = uem.UnitedProblem(
-        material.residual(ufl.TestFunction(V)), u, bcs=bcs, contacts=[contact], materials=[material], petsc_options_prefix="c_",
-        load=lambda factor: plane.move([0.0, -3 * FY / E * factor]),
-    )  # fmt: skip
-    forces = []
-    for _ in uem.load_steps(problem, 6):
-        forces.append(abs(contact.resultant().force[1]) / FY)
-    assert forces == pytest.approx([0.5, 1.0, 1.0, 1.0, 1.0, 1.0], rel=1e-7)
-    assert material.dissipation() == pytest.approx(2 * FY * FY / E, rel=1e-7)
 
 
 def test_a_failed_step_leaves_the_committed_state(comm):

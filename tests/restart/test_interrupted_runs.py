@@ -20,75 +20,14 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, box, clamp, scene, start_process
+from helpers import serial, start_process
+from restart_scenes import DT, END, SIZE, Impact
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat
 from uem_dolfinx.output.tables import CsvTable
 
 COMM = MPI.COMM_WORLD
-serial = pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
-DT, END, TOLERANCE, SIZE = 0.02, 0.2, 1e-2, 2.0
-
-
-class Impact:
-    """A plastic block that flies aslant onto a plastic one, which a moving foot and a growing load drive against it."""
-
-    def __init__(
-        self,
-        comm=COMM,
-        *,
-        scheme=None,
-        kind="plane_strain",
-        plastic=True,
-        moving=True,
-        dynamic=True,
-        max_iterations=4,
-        time=0.0,
-    ):
-        cell = "quadrilateral"
-        low = box(cell, [0.0, 0.0], [2.0, 1.0], [6, 3])
-        high = box(cell, [0.43, 1.05], [1.27, 1.9], [4, 5])
-        self.s = s = scene(comm, cell, [low, high], shuffle=6)
-        self.V = V = compat.function_space(s.mesh, 1, (2,))
-        self.u, w, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
-        X = V.tabulate_dof_coordinates()[: len(self.u.x.array) // 2]
-        velocity.x.array.reshape(-1, 2)[X[:, 1] > 1.02] = [0.3, -0.5]
-        self.foot, self.push = fem.Function(V), fem.Constant(s.mesh, 0.0)
-        base = fem.locate_dofs_topological(V, 1, s.tag("base", 0, at(1, 0.0)).entities)
-        self.bcs = [fem.dirichletbc(self.foot, base)] if moving else clamp(V, s.tag("base", 0, at(1, 0.0)))
-        self.law = uem.VonMises(self.u, 100.0, 0.3, 3.0 if plastic else np.inf, 5.0, kind=kind, strain="green_lagrange")
-        top = forms.surface_measure(s.mesh, s.tag("top", 1, at(1, 1.9)).entities)
-        self.external = -self.push * w[1] * top
-        self.contact = uem.Contact(s.tag("tip", 1, at(1, 1.05)), s.tag("face", 0, at(1, 1.0)), name="impact")
-        moves = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=scheme, velocity=velocity, gravity=(0.0, -1.0), time=time)
-        self.problem = uem.UnitedProblem(
-            self.law.residual(w) - self.external, self.u, bcs=self.bcs, contacts=[self.contact], materials=[self.law],
-            dynamics=moves if dynamic else None,
-            load=self.load, rtol=1e-10, max_iterations=max_iterations,
-        )  # fmt: skip
-
-    def load(self, t):
-        """The foot moves smoothly from rest, the push grows with time."""
-        self.foot.x.array.reshape(-1, 2)[:] = [0.0, 0.5 * t**2]
-        self.push.value = 0.2 + t
-
-    def run(self, folder, *, every=10**6, stop=None, end=END, tolerance=TOLERANCE, dt=DT):
-        """Step with tables ``energy.csv`` and ``history.csv`` and the checkpoint ``run`` in a folder; returns the steps."""
-        checkpoint, steps = uem.Checkpoint(folder / "run", every=every), []
-        checkpoint.begin(self.problem.state())
-        with (
-            uem.EnergyBook(self.problem, external=self.external, path=folder / "energy.csv", resume=True) as book,
-            uem.HistoryWriter(folder / "history.csv", self.problem, resume=True) as history,
-        ):
-            for step in uem.time_steps(self.problem, dt, end, event_tolerance=tolerance, checkpoint=checkpoint):
-                steps.append(step)
-                book.write(step)
-                history.write(step)
-                if step.number == stop:
-                    break
-        self.book = book
-        return steps
 
 
 def table(path):
@@ -235,9 +174,7 @@ def test_checkpoint_of_statics(folder):
 
 
 RUN = """
-import sys
-sys.path[:0] = {paths!r}
-from test_interrupted_runs import DT, END, TOLERANCE, Impact
+from restart_scenes import DT, END, TOLERANCE, Impact
 import uem_dolfinx as uem
 
 impact = Impact()
@@ -249,7 +186,7 @@ with uem.Checkpoint({path!r}, every={every}) as checkpoint:
 
 def start(path, every):
     """A process that runs until it is done or killed."""
-    return start_process(RUN.format(paths=[str(folder) for folder in Path(__file__).parents[:2]], path=str(path), every=every))
+    return start_process(RUN.format(path=str(path), every=every))
 
 
 @serial

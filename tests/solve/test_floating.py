@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import CELLS, at, box, clamp, complementary, highest, linear, modulus, scene, st_venant
+from helpers import CELLS, at, box, clamp, highest, lawful, linear, modulus, rotation, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -31,16 +31,7 @@ def shortening(stress, law):
     return float(min(r.real for r in np.roots([0.5, -1.5, 1.0, -stress]) if abs(r.imag) < 1e-12))
 
 
-def turned(g, angle):
-    """Rotation in the plane of the first and the last axis, as a matrix."""
-    R = np.eye(g)
-    R[0, 0] = R[-1, -1] = np.cos(angle)
-    R[-1, 0] = np.sin(angle)
-    R[0, -1] = -R[-1, 0]
-    return R
-
-
-class Scene:
+class Falling:
     """Bodies that fall under weight, or under tractions on named facets.
 
     Args:
@@ -85,20 +76,12 @@ def falling(cell, law="linear", *, gap=0.25, stress=0.02, E=(1.0, 2.0), n=(2, 4)
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     lower = box(cell, [0.0] * (g - 1) + [-1.0], [1.0] * (g - 1) + [0.0], [n[0]] * g)
     upper = box(cell, [0.0] * (g - 1) + [gap], [1.0] * (g - 1) + [1.0 + gap], [n[1]] * g)
-    f = Scene(cell, [lower, upper], law, E, nu, comm, **how)
+    f = Falling(cell, [lower, upper], law, E, nu, comm, **how)
     down = [0.0] * (g - 1) + [-stress] if traction is None else traction
     f.pull(f.s.tag("top", 1, at(g - 1, 1.0 + gap)), down)
     f.base = f.s.tag("base", 0, at(g - 1, -1.0))
     f.high, f.low = f.s.tag("high", 1, at(g - 1, gap)), f.s.tag("low", 0, at(g - 1, 0.0))
     return f
-
-
-def lawful(contact, size=1.0, force=1.0):
-    """Complementarity, and action = reaction."""
-    complementary(contact, 1e-12 * size, 1e-10 * force)
-    balance = contact.balance()
-    if balance is not None:
-        assert balance.force <= 1e-12 and balance.moment <= 1e-11
 
 
 def everywhere(match, call):
@@ -142,7 +125,7 @@ def test_free_block_falls_on_the_ground(cell, law):
     """Nothing at its sides: uniaxial stress, free to grow wider, and not moved along the motions that nothing loads."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     nu, stress = (0.0 if law == "finite" else 0.3), 0.02
-    f = Scene(cell, [box(cell, [0.0] * (g - 1) + [0.3], [1.0] * (g - 1) + [1.3], [3] * g)], law, E=(1.0,), nu=nu)
+    f = Falling(cell, [box(cell, [0.0] * (g - 1) + [0.3], [1.0] * (g - 1) + [1.3], [3] * g)], law, E=(1.0,), nu=nu)
     f.pull(f.s.tag("top", 0, at(g - 1, 1.3)), [0.0] * (g - 1) + [-stress])
     ground = uem.RigidPlane([0.0] * g, np.eye(g)[-1])
     contact = uem.Contact(f.s.tag("bottom", 0, at(g - 1, 0.3)), ground)
@@ -168,8 +151,8 @@ def test_free_block_falls_on_the_ground(cell, law):
 def test_tilted_block_comes_to_rest_flat(cell, law):
     """It touches the plane with one corner (edge), turns until it lies flat, and then carries its load uniformly."""
     g, angle, stress = (2 if cell == "quadrilateral" else 3), (0.1 if law == "finite" else 1e-3), 0.02
-    R = turned(g, angle)
-    f = Scene(cell, [box(cell, [0.0] * g, [1.0] * g, [3] * g)], law, E=(1.0,), pose=lambda x: x @ R.T + 0.05 * np.eye(g)[-1])
+    R = rotation(g, angle)
+    f = Falling(cell, [box(cell, [0.0] * g, [1.0] * g, [3] * g)], law, E=(1.0,), pose=lambda x: x @ R.T + 0.05 * np.eye(g)[-1])
     f.pull(f.s.tag("top", 0, at(g - 1, 1.0)), [0.0] * (g - 1) + [-stress])
     contact = uem.Contact(f.s.tag("bottom", 0, at(g - 1, 0.0)), uem.RigidPlane([0.0] * g, np.eye(g)[-1]))
     f.problem((), [contact], rtol=1e-12).solve()
@@ -205,8 +188,8 @@ def arc(middle=(0.0, 1.0), radius=1.0):
 @pytest.mark.parametrize("tilt", [0.0, 0.2])
 def test_half_disc_rights_itself(tilt):
     """Its weight acts below the middle of its arc: it rolls until its flat side is level, to an element of the polygon."""
-    R, n, weight = turned(2, tilt), 6, 1e-3
-    f = Scene("quadrilateral", [half_disc(n)], "finite", E=(1.0,), nu=0.3, pose=lambda x: (x - [0, 1]) @ R.T + [0.0, 1.02])
+    R, n, weight = rotation(2, tilt), 6, 1e-3
+    f = Falling("quadrilateral", [half_disc(n)], "finite", E=(1.0,), nu=0.3, pose=lambda x: (x - [0, 1]) @ R.T + [0.0, 1.02])
     f.weigh(weight)
     contact = uem.Contact(f.s.tag("arc", 0, arc()), uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
     f.problem((), [contact], rtol=1e-10).solve()
@@ -243,7 +226,7 @@ def test_two_fall_on_a_third():
     middle = half_disc(4).mapped(grooved)
     on_arc = np.abs(np.linalg.norm(half_disc(4).x - [0.0, 1.0], axis=1) - 1) < 1e-9
     lower = {tuple(np.round(x, 9)) for x in middle.x[on_arc]}
-    f = Scene("quadrilateral", [groove(1.5, 1.5), middle, half_disc(3, (0.0, 2.2), 0.5)], "finite", E=(1.0, 2.0, 4.0), nu=0.3)
+    f = Falling("quadrilateral", [groove(1.5, 1.5), middle, half_disc(3, (0.0, 2.2), 0.5)], "finite", E=(1.0, 2.0, 4.0), nu=0.3)
     f.weigh(0.0, 1e-3, 2e-3)
     contacts = [
         uem.Contact(
@@ -266,7 +249,7 @@ def test_middle_block_between_two(cell):
     """Held by nothing but its neighbours, it carries their force: three springs in series."""
     g, d = (2 if cell == "quadrilateral" else 3), 0.03
     bodies = [box(cell, [0.0] * (g - 1) + [float(k)], [1.0] * (g - 1) + [k + 1.0], [n] * g) for k, n in enumerate((1, 2, 4))]
-    f = Scene(cell, bodies, "finite", E=(1.0, 2.0, 4.0))
+    f = Falling(cell, bodies, "finite", E=(1.0, 2.0, 4.0))
     contacts = [uem.Contact(f.s.tag(f"low {k}", k, at(g - 1, k)), f.s.tag(f"high {k}", k - 1, at(g - 1, k))) for k in (1, 2)]
     bcs = clamp(f.V, f.s.tag("base", 0, at(g - 1, 0.0)))
     bcs += clamp(f.V, f.s.tag("lid", 2, at(g - 1, 3.0)), value=[0.0] * (g - 1) + [-d])
@@ -283,15 +266,15 @@ def test_middle_block_between_two(cell):
 
 def dropped(comm=COMM, angle=0.0, length=1.0, E=1.0, law="finite", shuffle=None):
     """A half disc, drawn askew, that drops into a groove beside its bottom; the answer in the drawing's frame and units."""
-    R, middle = turned(2, angle), np.array([0.05, 1.4])
-    tilt = turned(2, 0.1)
+    R, middle = rotation(2, angle), np.array([0.05, 1.4])
+    tilt = rotation(2, 0.1)
 
     def pose(x):
         # what is above the groove is the disc
         disc = x[:, 1] > 0.5 * np.abs(x[:, 0]) + 1e-3
         return length * np.where(disc[:, None], (x - middle) @ tilt.T + middle, x) @ R.T
 
-    f = Scene("quadrilateral", [groove(1.5, 1.5), half_disc(4, middle)], law, (E, 2 * E), 0.3, comm, pose=pose, shuffle=shuffle)
+    f = Falling("quadrilateral", [groove(1.5, 1.5), half_disc(4, middle)], law, (E, 2 * E), 0.3, comm, pose=pose, shuffle=shuffle)
     f.weigh(0.0, 0.01 * E / length, way=R[:, -1])
     contact = uem.Contact(f.s.tag("arc", 1, arc(middle)), f.s.tag("groove", 0, in_groove()), max_penetration=0.2 * length)
     history = f.problem(clamp(f.V, f.s.tag("base", 0, at(1, -1.5))), [contact], rtol=1e-10).solve()
@@ -381,7 +364,7 @@ def test_pulled_off_what_it_rests_on():
 def test_target_missed_sideways(law):
     """The target ends before the body comes down on it."""
     bodies = [box("quadrilateral", [0.0, -1.0], [1.0, 0.0], [2, 2]), box("quadrilateral", [3.0, 0.5], [4.0, 1.5], [2, 2])]
-    f = Scene("quadrilateral", bodies, law)
+    f = Falling("quadrilateral", bodies, law)
     f.weigh(0.0, 0.01)
     contact = uem.Contact(f.s.tag("high", 1, at(1, 0.5)), f.s.tag("low", 0, at(1, 0.0)))
     everywhere(r"the body with.* moves along \(.*, -1\)", f.problem(clamp(f.V, f.s.tag("base", 0, at(1, -1.0))), [contact]).solve)
@@ -392,19 +375,19 @@ def test_target_missed_sideways(law):
 def test_sliding_down_a_slope(cell):
     """A rigid slope without friction lets a body go on for ever: the message tells which way."""
     g, slope = (2 if cell == "quadrilateral" else 3), 0.5
-    n = turned(g, -slope)[:, -1]
-    f = Scene(cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)], "finite", E=(1.0,), pose=lambda x: x @ turned(g, -slope).T)
+    n = rotation(g, -slope)[:, -1]
+    f = Falling(cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)], "finite", E=(1.0,), pose=lambda x: x @ rotation(g, -slope).T)
     f.weigh(0.01)
     contact = uem.Contact(f.s.tag("bottom", 0, at(g - 1, 0.0)), uem.RigidPlane([0.0] * g, n))
     message = everywhere("the body with.* moves along", f.problem((), [contact]).solve)
     way = np.array([float(c) for c in message.split("moves along (")[1].split(")")[0].split(",")])
     # down the slope, of slope 0.5 to the right
-    assert way @ (turned(g, -slope)[:, 0]) == pytest.approx(1.0, abs=0.01)
+    assert way @ (rotation(g, -slope)[:, 0]) == pytest.approx(1.0, abs=0.01)
 
 
 def test_ball_on_a_slope():
     """A polygon of a ball comes to rest on no side of it."""
-    f = Scene("quadrilateral", [half_disc(4)], "finite", E=(1.0,), nu=0.3, pose=lambda x: x + [0.0, 0.1])
+    f = Falling("quadrilateral", [half_disc(4)], "finite", E=(1.0,), nu=0.3, pose=lambda x: x + [0.0, 0.1])
     f.weigh(1e-3)
     slope = 0.3
     contact = uem.Contact(f.s.tag("arc", 0, arc()), uem.RigidPlane([0.0, 0.0], [np.sin(slope), np.cos(slope)]))
@@ -414,7 +397,7 @@ def test_ball_on_a_slope():
 
 def test_error_restores_the_committed_state():
     """Pressed in the first step and pulled away in the second: the state is that of the first, and the third can follow it."""
-    f = Scene("quadrilateral", [groove(1.5, 1.5), half_disc(4, (0.0, 1.4))], "finite", nu=0.3)
+    f = Falling("quadrilateral", [groove(1.5, 1.5), half_disc(4, (0.0, 1.4))], "finite", nu=0.3)
     f.weigh(0.0, 1e-3)
     contact = uem.Contact(f.s.tag("arc", 1, arc((0.0, 1.4))), f.s.tag("groove", 0, in_groove()))
     problem = f.problem(clamp(f.V, f.s.tag("base", 0, at(1, -1.5))), [contact], rtol=1e-10)
