@@ -144,17 +144,16 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     def residual(u: Array) -> PETSc.Vec:
         problem.u.x.array[:] = u.ravel()
         system.place(returning=False)
-        system.assemble_residual()
+        problem.forces.assemble()
         pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
-        r = system.residual
+        r = problem.forces.residual
         r.axpy(-1.0, compat.petsc_vector(contact.force))
         return r
 
     residual(smooth)
     facets = pair.projection.facet.copy()
-    system.tangent.update()
-    A = system.tangent.K.copy()
-    curvature = system._curvature()
+    A = problem.forces.update_tangent().copy()
+    curvature = system.curvature()
     assert curvature is not None
     du = A.createVecRight()
     du.array[:] = direction[: problem.config.n_owned].ravel()

@@ -7,7 +7,6 @@ continuous collision detection. Bodies that touch at the start are lifted by hal
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import ipctk
@@ -21,7 +20,7 @@ from evidence.pushed import PushedSystem
 from uem_dolfinx import forms
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import United
+from uem_dolfinx.solve.newton import IterationState
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -29,6 +28,8 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
+    from uem_dolfinx.solve.body_forces import BodyForces
     from collections.abc import Sequence
 
     from uem_dolfinx.contact.contact import Contact
@@ -47,7 +48,7 @@ TOO_NEAR = 1e-3
 
 
 class BarrierSystem(PushedSystem):
-    """Contact by a barrier; arguments beyond those of ``BodySystem``:
+    """Contact by a barrier; arguments beyond those of ``PushedSystem``:
 
     Args:
         contacts: the contacts of the problem.
@@ -55,19 +56,31 @@ class BarrierSystem(PushedSystem):
         stiffness: of the barrier, a pressure; None takes the mean diagonal of K over the nodes' mean spacing.
     """
 
-    def __init__(self, *args: Any, contacts: Sequence[Contact], distance: float, stiffness: float | None = None, **options: Any):
+    def __init__(
+        self,
+        forces: BodyForces,
+        pairs: list[ContactPair],
+        solver: UnitedSolver,
+        *,
+        contacts: Sequence[Contact],
+        distance: float,
+        stiffness: float | None = None,
+        **options: Any,
+    ):
         self._contacts, self.distance, self.stiffness = list(contacts), distance, stiffness
-        super().__init__(*args, **options)
+        super().__init__(forces, pairs, solver, **options)
         if self.comm.size > 1 or self.config.degree > 1:
             raise SpaceError("the barrier is for one rank and degree 1: ipctk takes straight surfaces, whole")
+        self._make_collision_mesh()
 
-    def add_pairs(self, pairs: list[ContactPair]) -> None:
-        """Take in the contact pairs and build the collision mesh of their surfaces."""
-        super().add_pairs(pairs)
+    def _make_collision_mesh(self) -> None:
+        """Collision mesh of the pairs' surfaces."""
         config = self.config
         surfaces = [TargetFacets(config, contact.contactor) for contact in self._contacts]
-        meshed = [pair.target.facets for pair in pairs if isinstance(pair.target, MeshTarget)]
-        self._areas = [tributary_areas(config, contact.contactor)[pair.nodes] for contact, pair in zip(self._contacts, pairs)]
+        meshed = [pair.target.facets for pair in self.pairs if isinstance(pair.target, MeshTarget)]
+        self._areas = [
+            tributary_areas(config, contact.contactor)[pair.nodes] for contact, pair in zip(self._contacts, self.pairs)
+        ]
         self._mesh: Any = None
         if meshed:
             facets = np.concatenate([s.dofs for s in [*surfaces, *meshed]])
@@ -94,9 +107,9 @@ class BarrierSystem(PushedSystem):
     def _pressure(self) -> float:
         """Stiffness of the barrier."""
         if self.stiffness is None:
-            self.tangent.update()
+            self.forces.update_tangent()
             spacing = np.concatenate(self._areas).mean() ** (1.0 / (self.config.gdim - 1))
-            diagonal = self.tangent.K.getDiagonal().array_r
+            diagonal = self.forces.stiffness.ravel()
             self.stiffness = float(diagonal[diagonal > 0].min()) / spacing ** (self.config.gdim - 2)
         return self.stiffness
 
@@ -118,7 +131,7 @@ class BarrierSystem(PushedSystem):
                 forces[pair.nodes] -= (areas * self._rigid(p.gap)[0])[:, None] * p.normal
             force = forces[pair.nodes]
             lam = np.einsum("ng,ng->n", force, p.normal)
-            pair.trial = replace(pair.trial, active=lam > 0, lam=lam, nodal=lam, force=force)
+            pair.set_forces(lam, lam, force, active=lam > 0)
         return forces
 
     def _rigid(self, gap: Array) -> tuple[Array, Array]:
@@ -134,7 +147,7 @@ class BarrierSystem(PushedSystem):
 
     def _hessian(self) -> PETSc.Mat:
         """``K`` with the barrier's second derivative, made positive."""
-        A = self.tangent.K.copy()
+        A = self.forces.tangent.K.copy()
         rows, columns, values = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)], [np.zeros(0)]
         g = self.config.gdim
         if self._mesh is not None:
@@ -162,7 +175,7 @@ class BarrierSystem(PushedSystem):
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def land(self) -> None:
+    def begin_step(self) -> None:
         """Begin a step; bodies that are too near for the barrier are lifted."""
         self._alpha, self._squeezes = 1.0, 0
         for pair in self.pairs:
@@ -176,53 +189,60 @@ class BarrierSystem(PushedSystem):
         self.place(returning=False)
 
     def _out_of_balance(self, restriction: Restriction) -> PETSc.Vec:
-        R = self.residual
+        R = self.forces.residual
         R.array[:] -= self._push()[: self.config.n_owned].ravel()
         return restriction.reduce(R)
 
-    def unite(self, cautious: bool) -> United:
+    def unite(self, cautious: bool) -> IterationState:
         """Forces of the barrier."""
-        restriction, _ = self._restrict()
+        P = self.restriction()
         with timed("barrier"):
-            R = self._out_of_balance(restriction)
-        F = self.residual.norm()
-        closed = self._prescribed_is_met()
-        active = sum(pair.n_active for pair in self.pairs)
-        rounding = self.rounding()
-        return United(restriction, restriction, R, R.norm(), F, rounding, self._strain_rounding(), 0.0, active, False, closed)
+            R = self._out_of_balance(P)
+        return IterationState(
+            trial=P,
+            test=P,
+            residual=R,
+            norm=R.norm(),
+            scale=self.forces.residual.norm(),
+            rounding=self.rounding(),
+            strain_rounding=self.forces.strain_rounding(),
+            gap=0.0,
+            active=sum(pair.n_active for pair in self.pairs),
+            changed=False,
+            closed=self.forces.dirichlet_met(),
+        )
 
-    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
         """Tangent of bodies and barrier; returns the right-hand side."""
         forms.free_petsc_garbage(self.comm)
-        self.tangent.update()
-        self._stiffness = self.tangent.K.getDiagonal()
+        self.forces.update_tangent()
         with timed("barrier"):
             A = self._hessian()
-        self.solver.set_operator(state.restriction, A, None)
+        self.solver.set_operator(state.trial, A, None)
         # the solver tells matrices by their handles, so that one must live until the next is made
         self._A = A
-        return self._right_hand_side(state, A)
+        return self.right_hand_side(state, A)
 
-    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment, as much of it as meets nothing on its way and does not pass the potential's minimum."""
         du = super().move(state, dq)
-        start = np.array(self.u.x.array)
+        start = np.array(self.forces.u.x.array)
         step = du.array_r.copy()
         with timed("barrier"):
             length = self._free_way(start, step)
             slope = dq.dot(state.residual)
-            if state.restriction.c.norm() == 0.0 and slope < 0.0:
+            if state.trial.c.norm() == 0.0 and slope < 0.0:
 
                 def look(length: float) -> tuple[float, float]:
-                    self.u.x.array[:] = start + length * step
+                    self.forces.u.x.array[:] = start + length * step
                     self.place(returning=False)
                     if self.inverted() is not None or not self.assemble_residual():
                         return np.inf, np.inf
-                    residual = self._out_of_balance(state.restriction)
+                    residual = self._out_of_balance(state.trial)
                     return float(dq.dot(residual)), residual.norm()
 
                 length = flat_length(look, (slope, state.norm), length)
-        self.u.x.array[:] = start
+        self.forces.u.x.array[:] = start
         self.place(returning=False)
         self._alpha = length
         du.scale(length)

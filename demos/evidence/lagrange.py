@@ -19,10 +19,13 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
+from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.system import BodySystem
 
 if TYPE_CHECKING:
-    from uem_dolfinx.solve.newton import United
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
+    from uem_dolfinx.solve.body_forces import BodyForces
+    from uem_dolfinx.solve.newton import IterationState
     from uem_dolfinx.contact.pair import ContactPair
 
 DIRECT = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
@@ -43,10 +46,13 @@ ITERATIVE = {
 class LagrangeSystem(BodySystem):
     """Contact by multipliers; arguments as those of ``BodySystem``."""
 
-    def __init__(self, *args: Any, **options: Any):
-        super().__init__(*args, **options)
+    def __init__(self, forces: BodyForces, pairs: list[ContactPair], solver: UnitedSolver, **options: Any):
+        super().__init__(forces, pairs, solver, **options)
+        # nothing holds what floats
+        self.floating = FloatingBodies(forces, [], lambda: None)
         #: The saddle-point matrix of the last solve.
         self.saddle: PETSc.Mat | None = None
+        self._made_of: object = None
         direct = self.solver.options.get("pc_type") in ("lu", "cholesky")
         self._options = dict(DIRECT)
         if not direct:
@@ -55,25 +61,18 @@ class LagrangeSystem(BodySystem):
             self._options |= {f"fieldsplit_u_{key}": value for key, value in amg.items()}
         self._prefix = f"saddle_{id(self)}_"
 
-    def add_pairs(self, pairs: list[ContactPair]) -> None:
-        """Take in the contact pairs (collective); nothing holds what floats."""
-        super().add_pairs(pairs)
-        self.floating = None
-
-    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
         """Saddle-point matrix; returns what drives the step, as the united system would feel it."""
         forms.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
-            self.tangent.update()
-            self._stiffness = self.tangent.K.getDiagonal()
-        curvature = self._curvature() if self.consistent_tangent else None
-        equations = self._equations()
+            self.forces.update_tangent()
+        curvature = self.curvature() if self.consistent_tangent else None
+        equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
-        prescribed = np.where(self.free, 0.0, self.wanted - self.config.displacement)[: self.config.n_owned]
-        self._c = _vector(self._du_like(), prescribed)
+        self._c = self.forces.vector(self.forces.prescribed)
         if curvature is None and not any(pair.sliding == "finite" for pair in self.pairs):
             made_of = (
-                self.tangent.number,
+                self.forces.tangent.number,
                 equations.node.tobytes(),
                 equations.direction.tobytes(),
                 equations.coefficients.tobytes(),
@@ -82,32 +81,32 @@ class LagrangeSystem(BodySystem):
         else:
             made_of = None
         with timed("saddle point"):
-            if made_of is None or made_of != self._factored:
+            if made_of is None or made_of != self._made_of:
                 self._build(equations, curvature)
-        self._factored = made_of
-        free = self.free[: self.config.n_owned]
+        self._made_of = made_of
+        free = self.forces.free[: self.config.n_owned]
         load = self._A * self._c
-        load.axpy(1.0, self.residual)
+        load.axpy(1.0, self.forces.residual)
         self._short = self._G_all * self._c
         self._short.array[:] += equations.gap
         self._short.array[:] *= -self._scale
-        self._load = _vector(self._du_like(), -np.where(free, load.array_r.reshape(free.shape), 0.0))
-        self._restriction = state.restriction
-        load = self._A * state.step.c
-        load.axpy(1.0, self.residual)
-        driving = state.restriction.reduce(state.restriction.pass_on(load))
+        self._load = self.forces.vector(-np.where(free, load.array_r.reshape(free.shape), 0.0))
+        self._restriction = state.test
+        load = self._A * state.trial.c
+        load.axpy(1.0, self.forces.residual)
+        driving = state.test.reduce(state.test.pass_on(load))
         driving.scale(-1.0)
         return driving
 
     def _build(self, equations: UnitingEquations, curvature: PETSc.Mat | None) -> None:
         """Matrix, and the solver for it (collective)."""
         n = self.config.n_owned
-        free = self.free[:n]
-        self._A = self.tangent.K if curvature is None else self.tangent.K.copy()
+        free = self.forces.free[:n]
+        self._A = self.forces.tangent.K if curvature is None else self.forces.tangent.K.copy()
         if curvature is not None:
             self._A.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        used = _vector(self._du_like(), free.astype(float))
-        mean = self._stiffness.sum() / self._stiffness.getSize()
+        used, own = self.forces.vector(free.astype(float)), self.forces.vector(self.forces.stiffness)
+        mean = own.sum() / own.getSize()
         self._scale = float(mean)
         self._G_all = self._constraints(equations)
         G = self._G_all.copy()
@@ -115,7 +114,7 @@ class LagrangeSystem(BodySystem):
         G.scale(self._scale)
         K = self._A.copy()
         K.diagonalScale(used, used)
-        diagonal, own = K.getDiagonal(), self._stiffness
+        diagonal = K.getDiagonal()
         diagonal.array[~free.ravel()] = own.array_r[~free.ravel()]
         K.setDiagonal(diagonal)
         nest = PETSc.Mat().createNest([[K, G.transpose(PETSc.Mat())], [G, None]], comm=self.comm)
@@ -136,7 +135,7 @@ class LagrangeSystem(BodySystem):
     def _constraints(self, equations: UnitingEquations) -> PETSc.Mat:
         """G: a row per equation, a column per displacement (collective)."""
         g, m = self.config.gdim, len(equations)
-        sizes = self._du_like().getSizes()
+        sizes = self.forces.vector().getSizes()
         own = self.config.to_global(equations.node.astype(np.int32))
         rows = np.concatenate([np.repeat(np.arange(m), g), np.repeat(equations.row, g)])
         nodes = np.concatenate([own, equations.followed])
@@ -174,15 +173,10 @@ class LagrangeSystem(BodySystem):
         b.axpy(-1.0, self.saddle * x)
         if reason < 0 or not np.isfinite(x.norm()) or b.norm() > 1e-3 * max(self._load.norm(), self._short.norm()):
             raise LinearSolveError(f"the saddle point is singular, or its solve failed with KSP reason {reason}")
-        self._x = _vector(self._du_like(), x.array_r[:n])
+        self._x = self.forces.vector(x.array_r[:n])
         return self._restriction.reduce(self._x), int(self._ksp.getIterationNumber())
 
-    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment with the prescribed displacements."""
-        free = self.free[: self.config.n_owned].ravel()
-        return _vector(self._du_like(), np.where(free, self._x.array_r, self._c.array_r))
-
-
-def _vector(like: PETSc.Vec, values: np.ndarray) -> PETSc.Vec:
-    like.array[:] = values.ravel()
-    return like
+        free = self.forces.free[: self.config.n_owned].ravel()
+        return self.forces.vector(np.where(free, self._x.array_r, self._c.array_r))

@@ -15,7 +15,7 @@ from evidence.lagrange import LagrangeSystem
 from evidence.penalty import NodePoints, PenaltySystem, SurfacePoints
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     import ufl
     from dolfinx import fem
@@ -29,14 +29,6 @@ UZAWA_OVERLAP = 1e-9
 #: Linear solves of a step: every update of the multipliers takes one or more.
 MOST_UZAWA_ITERATIONS = 100
 MOST_BARRIER_ITERATIONS = 100
-
-
-class OtherProblem(uem.UnitedProblem):
-    """A problem whose contact is reached by another method."""
-
-    def __init__(self, F: ufl.Form, u: fem.Function, system_type: Callable[..., Any], **options: Any):
-        self.system_type = system_type
-        super().__init__(F, u, **options)
 
 
 def available(method: str) -> bool:
@@ -62,20 +54,21 @@ def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None
     if method == "united":
         return uem.UnitedProblem(F, u, **options)
     if method == "lagrange":
-        return OtherProblem(F, u, LagrangeSystem, **options)
+        return uem.UnitedProblem(F, u, method=LagrangeSystem, **options)
     tags = [contact.contactor for contact in options.get("contacts", ())]
     if method == "barrier":
         from evidence.barrier import BarrierSystem
 
         options.setdefault("max_iterations", MOST_BARRIER_ITERATIONS)
-        return OtherProblem(F, u, partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter), **options)
+        method_of = partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter)
+        return uem.UnitedProblem(F, u, method=method_of, **options)
     system = partial(
         PenaltySystem, tags=tags, stiffness=parameter, points=SurfacePoints if method == "penalty_surface" else NodePoints
     )
     if method == "augmented":
         options.setdefault("max_iterations", MOST_UZAWA_ITERATIONS)
         system = partial(system, overlap=UZAWA_OVERLAP)
-    return OtherProblem(F, u, system, **options)
+    return uem.UnitedProblem(F, u, method=system, **options)
 
 
 def counts(steps: Iterable[uem.LoadStep]) -> tuple[int, int]:

@@ -7,7 +7,7 @@ quadrature points of the contactor's facets (integrated over the surface). Newto
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,15 +18,17 @@ from evidence.line_search import flat_length
 from evidence.pushed import PushedSystem
 from uem_dolfinx import forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import United
+from uem_dolfinx.solve.newton import IterationState
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
-from uem_dolfinx.solve.system import ROUNDING
+from uem_dolfinx.solve.body_forces import FORCE_ROUNDING
 from uem_dolfinx.solve.tangent import contact_curvature
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
+    from uem_dolfinx.solve.body_forces import BodyForces
     from uem_dolfinx.geometry.gmsh import Tag
     from uem_dolfinx.contact.pair import ContactPair
 
@@ -132,7 +134,7 @@ class SurfacePoints:
 
 
 class PenaltySystem(PushedSystem):
-    """Contact by springs; arguments beyond those of ``BodySystem``:
+    """Contact by springs; arguments beyond those of ``PushedSystem``:
 
     Args:
         tags: contactor of every contact.
@@ -141,26 +143,32 @@ class PenaltySystem(PushedSystem):
         overlap: at which the multipliers are good enough, as part of the model's size; None is plain penalty.
     """
 
-    def __init__(self, *args: Any, tags: list[Tag], stiffness: float, points: type, overlap: float | None = None, **options: Any):
-        self._tags, self._stiffness_of_springs, self._points_type, self._overlap = tags, stiffness, points, overlap
+    def __init__(
+        self,
+        forces: BodyForces,
+        pairs: list[ContactPair],
+        solver: UnitedSolver,
+        *,
+        tags: list[Tag],
+        stiffness: float,
+        points: type,
+        overlap: float | None = None,
+        **options: Any,
+    ):
+        self._stiffness_of_springs, self._overlap = stiffness, overlap
         self._springs: list[Springs] = []
         self._A: PETSc.Mat | None = None
-        super().__init__(*args, **options)
-
-    def add_pairs(self, pairs: list[ContactPair]) -> None:
-        """Take in the contact pairs (collective)."""
-        super().add_pairs(pairs)
-        self._points = []
-        for pair, tag in zip(self.pairs, self._tags):
+        for pair in pairs:
             # springs know nothing of control gaps
-            pair.control = None
-            self._points.append(self._points_type(pair, tag))
+            pair.coupling = pair.coupling.with_nodal_gaps()
+        super().__init__(forces, pairs, solver, **options)
+        self._points = [points(pair, tag) for pair, tag in zip(pairs, tags)]
         self._none = [np.zeros(len(p.area)) for p in self._points]
         self._multipliers = self._committed = self._none
-        self._known = [pair.committed for pair in self.pairs]
-        self._averaged = [isinstance(pair.target, MeshTarget) and pair.target.averaged for pair in self.pairs]
+        self._known = [pair.committed for pair in pairs]
+        self._averaged = [pair.target.averaged for pair in pairs]
 
-    def land(self) -> None:
+    def begin_step(self) -> None:
         """Begin a step with the multipliers of the last converged one."""
         committed = [pair.committed for pair in self.pairs]
         if any(now is not then for now, then in zip(committed, self._known)):
@@ -177,8 +185,7 @@ class PenaltySystem(PushedSystem):
     def _stretch(self) -> tuple[PETSc.Vec, float]:
         """Forces of the springs on the bodies, and the deepest overlap (collective); keeps the springs."""
         self._springs, overlap = [], 0.0
-        total = self._du_like()
-        total.set(0.0)
+        total = self.forces.vector()
         for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
             p = points.project()
             force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * ~_past_the_end(p)
@@ -211,27 +218,35 @@ class PenaltySystem(PushedSystem):
         lam = self.config.to_owners(s.nodes.ravel(), on_node.ravel())[pair.nodes]
         parts = (on_node[..., None] * s.projection.normal[:, None, :]).reshape(-1, self.config.gdim)
         force = np.column_stack([self.config.to_owners(s.nodes.ravel(), f)[pair.nodes] for f in parts.T])
-        pair.trial = replace(pair.trial, active=lam > 0, lam=lam, nodal=lam, force=force)
+        pair.set_forces(lam, lam, force, active=lam > 0)
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def unite(self, cautious: bool) -> United:
+    def unite(self, cautious: bool) -> IterationState:
         """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
-        F = self.residual
-        restriction, _ = self._restrict()
+        F = self.forces.residual
+        P = self.restriction()
         with timed("springs"):
             forces, overlap = self._stretch()
-            R = restriction.reduce(F - forces)
+            R = P.reduce(F - forces)
             changed, rounding = False, self._rounding_of_springs()
             deep = self._overlap is not None and overlap > self._overlap * self.config.size
             if deep and R.norm() <= max(SETTLED * F.norm(), rounding):
                 self._multipliers = [s.force for s in self._springs]
                 forces, _ = self._stretch()
-                R, changed = restriction.reduce(F - forces), True
-        closed = self._prescribed_is_met() and not deep
-        active = sum(pair.n_active for pair in self.pairs)
-        return United(
-            restriction, restriction, R, R.norm(), F.norm(), rounding, self._strain_rounding(), overlap, active, changed, closed
+                R, changed = P.reduce(F - forces), True
+        return IterationState(
+            trial=P,
+            test=P,
+            residual=R,
+            norm=R.norm(),
+            scale=F.norm(),
+            rounding=rounding,
+            strain_rounding=self.forces.strain_rounding(),
+            gap=overlap,
+            active=sum(pair.n_active for pair in self.pairs),
+            changed=changed,
+            closed=self.forces.dirichlet_met() and not deep,
         )
 
     def _rounding_of_springs(self) -> float:
@@ -241,15 +256,14 @@ class PenaltySystem(PushedSystem):
             on = s.force > 0
             x = np.abs(self.config.x[s.nodes[on, 0]]).max(initial=0.0)
             stiffest = (self._stiffness_of_springs * s.area[on]).max(initial=0.0) * np.sqrt(max(on.sum(), 1))
-            rounding += ROUNDING * max(self.comm.allgather(float(x * stiffest)))
+            rounding += FORCE_ROUNDING * max(self.comm.allgather(float(x * stiffest)))
         return rounding
 
-    def linearise(self, state: United, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
         """Tangent of bodies and springs; returns the right-hand side."""
         forms.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
-            self.tangent.update()
-            self._stiffness = self.tangent.K.getDiagonal()
+            self.forces.update_tangent()
         self._solves = 1 if first else self._solves + 1
         if self._solves == AVERAGED_AFTER:
             for pair in self.pairs:
@@ -257,21 +271,21 @@ class PenaltySystem(PushedSystem):
                     pair.target.averaged = True
         sliding = any(pair.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
-        made_of = self.comm.allgather((self.tangent.number, on))
-        if self._A is None or sliding or made_of != self._factored:
+        made_of = self.comm.allgather((self.forces.tangent.number, on))
+        if self._A is None or sliding or made_of != self.made_of:
             with timed("springs"):
                 A = self._with_springs()
-            self.solver.set_operator(state.restriction, A, None)
+            self.solver.set_operator(state.trial, A, None)
             self._A = A
-        self._factored = made_of
-        return self._right_hand_side(state, self._A)
+        self.made_of = made_of
+        return self.right_hand_side(state, self._A)
 
     def _with_springs(self) -> PETSc.Mat:
         """``K + sum stiffness area grad g grad g' - t grad^2 g`` over the springs that push (collective)."""
         blocks = [self._blocks(s) for s in self._springs]
-        A = self.tangent.K.copy()
+        A = self.forces.tangent.K.copy()
         if self.comm.allreduce(sum(len(nodes) for nodes, _ in blocks)):
-            A.axpy(1.0, contact_curvature(blocks, self._du_like()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            A.axpy(1.0, contact_curvature(blocks, self.forces.vector()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return A
 
     def _blocks(self, s: Springs) -> tuple[Ints, Array]:
@@ -296,11 +310,11 @@ class PenaltySystem(PushedSystem):
         H = H.reshape(len(i), 1 + nn, g, 1 + nn, g)
         return np.einsum("kpa,kpgqh,kqb->kagbh", spread, H, spread, optimize=True).reshape(len(i), (nb + nn) * g, (nb + nn) * g)
 
-    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment; after some full steps, only as much of it as the potential falls."""
         du = super().move(state, dq)
         slope = dq.dot(state.residual)
-        if self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.restriction.c.norm() > 0.0 or slope >= 0.0:
+        if self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.trial.c.norm() > 0.0 or slope >= 0.0:
             return du
         start = self.displacement()
 
@@ -315,8 +329,8 @@ class PenaltySystem(PushedSystem):
         self.displace(start, du, 0.0)
         return du
 
-    def reduced_residual(self, state: United) -> PETSc.Vec:
+    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """Out-of-balance forces at the present displacement (collective)."""
         self.place(returning=False)
         forces, _ = self._stretch()
-        return state.restriction.reduce(self.residual - forces)
+        return state.test.reduce(self.forces.residual - forces)

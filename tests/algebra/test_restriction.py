@@ -322,14 +322,13 @@ def test_rigid_motion_is_a_united_motion(cell):
     b = blocks(COMM, cell, 2, 3)
     contact = uem.Contact(b.high, b.low)
     problem = uem.UnitedProblem(linear(b.u, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))), b.u, contacts=[contact])
-    system = problem.system
     assert contact.n_active == 4 ** (b.gdim - 1)
     free = np.ones((problem.config.n_owned, b.gdim), bool)
-    r = Restriction(problem.config, contact.pair.equations(), free, np.zeros(free.shape))
-    system.tangent.update()
+    r = Restriction(problem.config, contact.pair.equations().test, free, np.zeros(free.shape))
+    K = problem.forces.update_tangent()
     solver = UnitedSolver(problem.config, "modes_", {"ksp_type": "cg", "pc_type": "gamg"})
-    solver.set_operator(r, system.tangent.K, None)
-    size = gathered_matrix(system.tangent.K).max()
+    solver.set_operator(r, K, None)
+    size = gathered_matrix(K).max()
     for mode in rigid_body_modes(problem.config):
         full = solver.A.createVecLeft()
         full.array[:] = mode.ravel()
@@ -406,7 +405,7 @@ def test_forces_keep_their_sum_and_moment():
     problem = uem.UnitedProblem(
         linear(b.u, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))), b.u, bcs=clamped, contacts=[uem.Contact(b.high, b.low)]
     )
-    r, _ = problem.system._restrict()
+    r = problem.system.restriction()
     y = r.P.createVecLeft()
     nodal = np.zeros((problem.config.n_owned, 2))
     nodes = problem.contacts[0].pair.nodes

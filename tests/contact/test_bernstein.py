@@ -167,22 +167,22 @@ def place_hash(X, seed):
 @given(seed=st.integers(0, 1000), zeros=st.floats(0.0, 0.9))
 def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
     """Where no control gap is negative no point of the surface is inside the target; nodal gaps cannot promise that."""
-    config, control = top.config, top.pair.control
+    config, family = top.config, top.pair.coupling.family
     wanted = place_hash(np.round(config.X, 6), seed)
     wanted = 0.01 * np.where(wanted < zeros, 0.0, wanted)
     # nodal gaps from control gaps, ancestors first: vertices, edges, facets
     nodal = np.array(wanted)
-    middle_of_facet = np.isin(control.child, control.child[control._of_facet])
+    middle_of_facet = np.isin(family.child, family.child[family.of_facet])
     for k in (~middle_of_facet, middle_of_facet):
         more = np.zeros(config.n_local)
-        np.add.at(more, top.pair.nodes[control.child[k]], control.weight[k] * nodal[control.parent[k]])
+        np.add.at(more, top.pair.nodes[family.child[k]], family.weight[k] * nodal[family.parent[k]])
         nodal += more
         # ghosts take their owners' values
         top.u.x.array.reshape(-1, top.g)[:, -1] = nodal
         top.u.x.scatter_forward()
         nodal = np.array(top.u.x.array.reshape(-1, top.g)[:, -1])
     top.open(nodal)
-    assert COMM.allreduce(int((~control.shared).sum())) == 0
+    assert COMM.allreduce(int((~top.pair.placement.details.control.shared).sum())) == 0
     assert highest(COMM, np.abs(top.pair.gap - wanted[top.pair.nodes])) < 1e-15
     assert lowest(COMM, [top.sampled(nodal, seed)]) >= -1e-15
 
@@ -191,14 +191,14 @@ def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
 @given(seed=st.integers(0, 1000), share=st.floats(0.05, 1.0))
 def test_control_forces_of_a_pressure_press(top, seed, share):
     """Any pressure >= 0, even one that acts on a part of a facet, has control forces >= 0 that add up to it."""
-    config, control = top.config, top.pair.control
+    config = top.config
     top.open(np.zeros(config.n_local), active=True)
     rng = np.random.default_rng(seed)
     top.wave.value[:] = np.concatenate([rng.normal(size=2), rng.uniform(1, 7, 2), rng.uniform(0, 6, 2), [share]])
     b = compat.create_vector(top.S)
     forms.assemble_vector(b, top.push)
     f = np.array(b.array_r)[top.pair.nodes]
-    lam, nodal = control.forces(f, np.ones(len(f), bool))
+    lam, nodal = top.pair.placement.details.control.forces(f, np.ones(len(f), bool))
     total = float(COMM.allreduce(f.sum()))
     assert lowest(COMM, lam) >= -1e-15 * max(total, 1e-300)
     assert COMM.allreduce(lam.sum()) == pytest.approx(total, rel=1e-12, abs=1e-300)
@@ -210,7 +210,7 @@ def test_areas(top):
     """Positive, and together the surface's, where those of the shape functions are zero or negative at vertices."""
     top.open(np.zeros(top.config.n_local), active=True)
     plain = tributary_areas(top.config, top.tag)[top.pair.nodes]
-    areas = top.pair.control.areas(plain)
+    areas = top.pair.coupling.areas(top.pair.placement, plain)
     assert lowest(COMM, areas) > 0.01
     assert COMM.allreduce(areas.sum()) == pytest.approx(1.0, rel=1e-12)
     if top.g == 3 and len(np.unique(COMM.allreduce([len(f) for f in top.facets]))) == 1:

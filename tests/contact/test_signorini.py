@@ -63,10 +63,9 @@ def test_against_quadratic_programming(cell, n):
     # fixed horizontal positions, as in the linear problem: projected once for all
     _, contact, problem = quarter(cell, n, vertical_gap(g, d, R), sliding="fixed")
     run(problem)
-    system, config = problem.system, problem.config
-    system.tangent.update()
-    K = gathered_matrix(system.tangent.K)
-    free = np.concatenate(COMM.allgather(system.free[: config.n_owned].ravel()))
+    config = problem.config
+    K = gathered_matrix(problem.forces.update_tangent())
+    free = np.concatenate(COMM.allgather(problem.forces.free[: config.n_owned].ravel()))
     first = config.index_map.local_range[0]
     own = (first + contact.pair.nodes) * g + g - 1
     normal = np.concatenate(COMM.allgather(own))
@@ -134,10 +133,10 @@ def test_complementarity_on_rigid_surfaces(target, cell):
         complementary(contact, 1e-14, 1e-13)
     assert contact.n_active > 1
     # equilibrium: the contact balances what base and symmetry planes hold, where a contactor may lie in a symmetry plane, too
-    problem.system.assemble_residual()
+    problem.forces.assemble()
     n = problem.config.n_owned
-    held = problem.system.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
-    fixed = ~problem.system.free[:n]
+    held = problem.forces.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
+    fixed = ~problem.forces.free[:n]
     assert highest(COMM, np.abs(held[~fixed])) < 1e-10 * np.abs(contact.resultant().force).max()
     reaction = np.array(COMM.allreduce((held * fixed).sum(axis=0)))
     assert np.abs(reaction + contact.resultant().force).max() < 1e-10 * np.abs(reaction).max()

@@ -36,7 +36,7 @@ def test_linear_body_assembles_its_tangent_once():
     b, contact, problem = pressed(law=linear, sliding="fixed", consistent_tangent=False)
     steps = run(problem, 3)
     assert sum(step.newton_iterations for step in steps) >= 3
-    assert problem.system.tangent.number == 1
+    assert problem.forces.tangent.number == 1
     assert contact.n_active > 0
 
 
@@ -48,7 +48,7 @@ def test_modified_newton_gives_the_same_state():
         answers[newton] = (
             b.scene.gather(b.u),
             contact.n_active,
-            problem.system.tangent.number,
+            problem.forces.tangent.number,
             sum(s.newton_iterations for s in steps),
         )
     full, modified = answers["full"], answers["modified"]

@@ -118,6 +118,9 @@ class UnitedSolver:
         #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
         self._made_with: UnitingEquations | None = None
         self._first_pace = self._pace = 0.0
+        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC that the options ask for.
+        self._symmetric = True
+        self._types = self.ksp.getType(), self.ksp.getPC().getType()
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.config.comm)
@@ -155,14 +158,26 @@ class UnitedSolver:
         """Whether the preconditioner can use the rigid-body modes."""
         return self.ksp.getPC().getType() in ("gamg", "ml", "bddc")
 
-    def set_operator(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
-        """Build ``P'(K + curvature)P`` and give it to the KSP (collective).
+    def set_operator(
+        self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, test: Restriction | None = None
+    ) -> None:
+        """Build ``Q'(K + curvature)P`` and give it to the KSP (collective).
 
         Args:
-            restriction: of the current uniting equations.
+            restriction: of the current uniting equations: P.
             K: tangent matrix without boundary conditions.
             curvature: second derivatives of the gaps times contact forces, or None.
+            test: Q; None, or the same object, is P, and the matrix is symmetric.
         """
+        unsymmetric = test is not None and test is not restriction
+        self._adapt(not unsymmetric)
+        if test is not None and unsymmetric:
+            # direct solvers need no P'KP; for others it makes the preconditioner
+            if self.iterative:
+                self.set_operator(restriction, K, curvature)
+                self._adapt(False)
+            self._set_unsymmetric(restriction, test, K, curvature)
+            return
         key: object = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
         reuse = key == self._key and self.A is not None
         P = None if restriction.M is None else restriction.P
@@ -197,6 +212,43 @@ class UnitedSolver:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.ksp.setOperators(self.A)
+
+    def _adapt(self, symmetric: bool) -> None:
+        """Take the KSP and PC of the options, or ones for unsymmetric matrices in place of those for symmetric ones."""
+        if symmetric == self._symmetric:
+            return
+        self._symmetric = symmetric
+        pc = self.ksp.getPC()
+        if symmetric:
+            self.ksp.setType(self._types[0])
+            pc.setType(self._types[1])
+        else:
+            self._types = self.ksp.getType(), pc.getType()
+            self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
+            if self._types[1] == "cholesky":
+                pc.setType("lu")
+        with self._in_database():
+            pc.setFromOptions()
+        if not symmetric and pc.getType() == "cholesky":
+            pc.setType("lu")
+
+    def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
+        """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
+        with timed("united matrix Q'KP"):
+            G = K if curvature is None else K.copy()
+            if curvature is not None:
+                G.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            A = Q.P.transposeMatMult(G.matMult(P.P))
+            diagonal, stiffness = A.getDiagonal(), K.getDiagonal()
+            idle = ~P.used.ravel()
+            diagonal.array[idle] = stiffness.array_r[idle]
+            A.setDiagonal(diagonal)
+        if self.iterative:
+            self.ksp.setOperators(A, self.A)
+            return
+        self._key, self._new, self.A = None, True, A
+        self.ksp.getPC().setReusePreconditioner(False)
+        self.ksp.setOperators(A)
 
     def _keep_preconditioner(self, equations: UnitingEquations) -> None:
         """Decide whether the preconditioner serves the present matrix as well (collective)."""

@@ -1,6 +1,6 @@
-"""Control gaps: what takes the place of nodal gaps on contactors of degree 2.
+"""Node to surface on contactors of degree 2: control gaps take the place of nodal gaps.
 
-A part of the fourth step on the data's way. A quadratic facet's shape functions are partly negative, so that under a pressure its
+A quadratic facet's shape functions are partly negative, so that under a pressure its
 nodal forces are zero or negative at vertices, and tell nothing about contact. In Bernstein's basis, which is positive, the same
 gap has the coefficients
 
@@ -15,119 +15,138 @@ add up to the resultant.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.contact.coupling import Placement
+from uem_dolfinx.contact.node_to_surface import Feet, NodeToSurface
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.equations import UnitingEquations
+    from uem_dolfinx.contact.state import PairState
     from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection
+    from uem_dolfinx.geometry.projection import Projection, Target
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-#: Nodes share a quadratic gap if their normals agree up to this cosine ...
+#: Nodes share a quadratic gap if their normals agree up to this cosine,
+#: [heuristic; cosine; -]
 SAME_SIDE = 0.9
-#: ... and if the gap rises no steeper than this from one to the other.
+#: and if the gap rises no steeper than this from one to the other.
+#: [heuristic; slope; -]
 STEEPEST = 0.2
 
 
-class ControlGaps:
-    """Control gaps of the contactors of a degree-2 surface.
+@dataclass(frozen=True)
+class Family:
+    """Which contactors in the middle of an edge or a facet depend on which vertices and middles around them.
 
-    Every term subtracts ``weight`` times the gap of a parent, a vertex or an edge's middle, from the gap of a contactor in the
-    middle of an edge or a facet. Parents may live on other ranks; children are always this rank's own.
-
-    Args:
-        config: configuration of the displacement, of degree 2.
-        nodes: owned contactor nodes ``(n,)``.
+    Every term subtracts ``weight`` times the gap of a parent, a vertex or an edge's middle, from the gap of a child, a contactor in
+    the middle of an edge or a facet. Parents may live on other ranks; children are always this rank's own.
 
     Attributes:
+        config: configuration of the displacement, of degree 2.
+        nodes: owned contactor nodes ``(n,)``.
         child: place of the term's contactor ``(k,)``.
         parent: local node of the term's parent ``(k,)``.
         weight: ``(k,)``.
+        of_facet: whether the term leads from the middle of a facet to the middle of an edge ``(k,)``.
+    """
+
+    config: Configuration
+    nodes: npt.NDArray[np.int32]
+    child: Ints
+    parent: Ints
+    weight: Array
+    of_facet: Bools
+
+    def control_gaps(self, projection: Projection, usable: Bools, active: Bools) -> ControlGaps:
+        """Terms that count where the contactors are (collective).
+
+        Args:
+            projection: of the contactors.
+            usable: whose gap counts: those over the target that no corner holds ``(n,)``.
+            active: who is active ``(n,)``.
+        """
+        p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
+        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
+        seen = self.config.from_owners(self.nodes, rows, self.parent)
+        gap, normal, i = seen[:, 0], seen[:, 2 : 2 + g], self.child
+        length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
+        smooth = np.abs(gap - p.gap[i]) <= STEEPEST * length
+        smooth &= np.einsum("kg,kg->k", normal, p.normal[i]) > SAME_SIDE
+        smooth &= usable[i] & (seen[:, 1] > 0)
+        alone = np.zeros(len(self.nodes), dtype=bool)
+        alone[i[~smooth]] = True
+        targets, weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
+        none = np.zeros(len(i), dtype=bool)
+        return ControlGaps(self, ~alone[i], none, gap, normal, targets, weights).with_active(active)
+
+
+@dataclass(frozen=True)
+class ControlGaps:
+    """The terms of a family at one displacement and active set.
+
+    Attributes:
+        family: whose terms they are.
         shared: whether the gap is quadratic from the child to all its parents ``(k,)``.
         closed: terms whose parent's own equation makes its gap vanish ``(k,)``.
+        gap: of the parents ``(k,)``.
         normal: of the parents ``(k, gdim)``.
         targets: global nodes that the parents follow ``(k, nn)``.
         weights: their weights ``(k, nn)``.
     """
 
-    def __init__(self, config: Configuration, nodes: npt.NDArray[np.int32]):
-        self.config, self.nodes = config, nodes
-        children, parents, weights, of_facet = _family(config, nodes)
-        self.child, self.parent, self.weight = children, parents, weights
-        self._of_facet = of_facet
-        #: Whether a contactor in the middle of a facet follows one in the middle of an edge, on any rank.
-        self.chained = bool(config.comm.allreduce(int(of_facet.sum())))
-        self.shared: Bools = np.zeros(len(children), dtype=bool)
-        self.closed: Bools = np.zeros(len(children), dtype=bool)
-        self._gap: Array = np.zeros(len(children))
-        self.normal: Array = np.zeros((len(children), config.gdim))
-        self.targets: Ints = np.zeros((len(children), 0), np.int64)
-        self.weights: Array = np.zeros((len(children), 0))
+    family: Family
+    shared: Bools
+    closed: Bools
+    gap: Array
+    normal: Array
+    targets: Ints
+    weights: Array
 
-    def look(self, projection: Projection, usable: Bools) -> None:
-        """Take in where contactors and their parents are (collective).
-
-        Args:
-            projection: of the contactors.
-            usable: whose gap counts: those over the target that no corner holds ``(n,)``.
-        """
-        p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
-        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
-        seen = self.config.from_owners(self.nodes, rows, self.parent)
-        self._gap, self.normal = seen[:, 0], seen[:, 2 : 2 + g]
-        self.targets, self.weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
-        i = self.child
-        length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
-        smooth = np.abs(self._gap - p.gap[i]) <= STEEPEST * length
-        smooth &= np.einsum("kg,kg->k", self.normal, p.normal[i]) > SAME_SIDE
-        smooth &= usable[i] & (seen[:, 1] > 0)
-        alone = np.zeros(len(self.nodes), dtype=bool)
-        alone[i[~smooth]] = True
-        self.shared = ~alone[i]
-
-    def follow(self, active: Bools) -> None:
-        """Take in who is active ``(n,)`` (collective)."""
-        at_parent = self.config.from_owners(self.nodes, active[:, None].astype(float), self.parent)[:, 0] > 0
-        open_child = np.zeros(len(self.nodes), dtype=bool)
-        open_child[self.child[self.shared & ~at_parent]] = True
+    def with_active(self, active: Bools) -> ControlGaps:
+        """The same terms with another active set ``(n,)`` (collective)."""
+        f = self.family
+        at_parent = f.config.from_owners(f.nodes, active[:, None].astype(float), f.parent)[:, 0] > 0
+        open_child = np.zeros(len(f.nodes), dtype=bool)
+        open_child[f.child[self.shared & ~at_parent]] = True
         closes = active & ~open_child
-        self.closed = self.config.from_owners(self.nodes, closes[:, None].astype(float), self.parent)[:, 0] > 0
+        return replace(self, closed=f.config.from_owners(f.nodes, closes[:, None].astype(float), f.parent)[:, 0] > 0)
 
     @property
     def kept(self) -> Bools:
         """Terms that matter, because the parent stays open ``(k,)``."""
         return self.shared & ~self.closed
 
-    def gaps(self, gap: Array) -> Array:
+    def of(self, gap: Array) -> Array:
         """Control gaps from nodal gaps ``(n,)``."""
-        k = self.kept
-        return gap - np.bincount(self.child[k], self.weight[k] * self._gap[k], minlength=len(gap))
+        k, f = self.kept, self.family
+        return gap - np.bincount(f.child[k], f.weight[k] * self.gap[k], minlength=len(gap))
 
     def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
-        dropped = self.shared & self.closed
+        dropped, of_facet = self.shared & self.closed, self.family.of_facet
         # the middle of a facet hands on to edges, then both to vertices
-        control = control + active * self._handed_on(control, dropped & self._of_facet)
-        control = control + active * self._handed_on(control, dropped & ~self._of_facet)
+        control = control + active * self._handed_on(control, dropped & of_facet)
+        control = control + active * self._handed_on(control, dropped & ~of_facet)
         nodal = control - self._handed_on(control, self.shared)
         return self._scale * control, nodal
 
     @property
     def _scale(self) -> Array:
         """Bernstein's basis functions over those that belong to the scaled gaps ``(n,)``."""
-        scale = np.ones(len(self.nodes))
-        scale[self.child[self.shared]] = 0.5
-        scale[self.child[self.shared & self._of_facet]] = 0.25
+        f = self.family
+        scale = np.ones(len(f.nodes))
+        scale[f.child[self.shared]] = 0.5
+        scale[f.child[self.shared & f.of_facet]] = 0.25
         return scale
 
     def extend(self, equations: UnitingEquations, united: Ints, active: Bools) -> UnitingEquations:
@@ -138,28 +157,72 @@ class ControlGaps:
             united: their places ``(m,)``.
             active: who is united ``(n,)``.
         """
-        place = np.full(len(self.nodes), -1, dtype=np.int64)
+        f = self.family
+        place = np.full(len(f.nodes), -1, dtype=np.int64)
         place[united] = np.arange(len(united))
-        k = np.flatnonzero(self.kept & active[self.child])
-        own = self.weight[k, None] * self.normal[k]
+        k = np.flatnonzero(self.kept & active[f.child])
+        own = f.weight[k, None] * self.normal[k]
         a, b = np.nonzero(self.targets[k] >= 0)
-        row = place[self.child[k]]
+        row = place[f.child[k]]
         return replace(
             equations,
             row=np.concatenate([equations.row, row, row[a]]),
-            followed=np.concatenate([equations.followed, self.config.to_global(self.parent[k]), self.targets[k][a, b]]),
+            followed=np.concatenate([equations.followed, f.config.to_global(f.parent[k]), self.targets[k][a, b]]),
             coefficients=np.concatenate([equations.coefficients, own, -self.weights[k][a, b][:, None] * own[a]]),
         )
 
     def areas(self, areas: Array) -> Array:
         """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
-        areas = areas + self._handed_on(areas, self.shared & self._of_facet)
-        return self._scale * (areas + self._handed_on(areas, self.shared & ~self._of_facet))
+        areas = areas + self._handed_on(areas, self.shared & self.family.of_facet)
+        return self._scale * (areas + self._handed_on(areas, self.shared & ~self.family.of_facet))
 
     def _handed_on(self, values: Array, terms: Bools) -> Array:
         """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
-        amounts = np.where(terms, self.weight * values[self.child], 0.0)
-        return self.config.to_owners(self.parent, amounts)[self.nodes]
+        f = self.family
+        amounts = np.where(terms, f.weight * values[f.child], 0.0)
+        return f.config.to_owners(f.parent, amounts)[f.nodes]
+
+
+@dataclass(frozen=True)
+class ControlFeet(Feet):
+    """``Feet`` with the control gaps there."""
+
+    control: ControlGaps
+
+
+class Bernstein(NodeToSurface):
+    """Implements ``Coupling`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
+
+    def __init__(self, config: Configuration, nodes: npt.NDArray[np.int32], target: Target, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self.family = Family(config, nodes, *_family(config, nodes))
+        # one in the middle of a facet follows those in the middles of edges
+        self.chained = bool(config.comm.allreduce(int(self.family.of_facet.sum())))
+
+    def _measured(self, projection: Projection, moves: Bools | None, feet: Feet, state: PairState) -> Placement:
+        plain = Placement(projection, projection.gap, moves, feet)
+        control = self.family.control_gaps(projection, ~self.off(plain, state) & ~state.in_corner, state.active)
+        details = ControlFeet(feet.nearest, feet.corners, feet.left, control)
+        return replace(plain, gap=control.of(projection.gap), details=details)
+
+    def with_active(self, placement: Placement, state: PairState) -> Placement:
+        """The gap of a parent that has closed no longer counts (collective)."""
+        control = placement.details.control.with_active(state.active)
+        details = replace(placement.details, control=control)
+        return replace(placement, gap=control.of(placement.projection.gap), details=details)
+
+    def _normal_rows(self, placement: Placement, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
+        plain = super()._normal_rows(placement, state, which, weights)
+        return placement.details.control.extend(plain, which, state.active)
+
+    def _nodal(self, placement: Placement, state: PairState, multipliers: Array) -> tuple[Array, Array]:
+        control: ControlGaps = placement.details.control
+        return control.forces(multipliers, state.active)
+
+    def areas(self, placement: Placement, areas: Array) -> Array:
+        """Integrals of Bernstein's basis (collective)."""
+        control: ControlGaps = placement.details.control
+        return control.areas(areas)
 
 
 def _family(config: Configuration, nodes: npt.NDArray[np.int32]) -> tuple[Ints, Ints, Array, Bools]:

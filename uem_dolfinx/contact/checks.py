@@ -1,42 +1,27 @@
-"""What is refused about a contact pair: values that are not finite, deep overlaps, contactors that are stuck inside the target.
+"""What is refused about a contact pair: deep overlaps at the start, contactors that are stuck inside the target.
 
-A part of the fourth step on the data's way. Every check speaks on all ranks or on none.
+Every check speaks on all ranks or on none.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from mpi4py import MPI
+
 import numpy as np
 
-from uem_dolfinx.errors import ConflictError, NotFiniteError, PenetrationError
+from uem_dolfinx.contact.active_set import TOUCHING
+from uem_dolfinx.errors import ConflictError, PenetrationError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.pair import ContactPair
 
-#: A body touches at the start when its gap is below this part of the model's size.
-TOUCHING = 1e-9
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
+#: [heuristic; the model's size; -]
 LEFT_OUT = 1e-6
-
-
-def check_finite(pair: ContactPair) -> None:
-    """Refuse a projection that is not finite, which a rigid surface's functions may return (collective).
-
-    Raises:
-        NotFiniteError: naming the first such contactor.
-    """
-    p = pair.projection
-    bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
-    error = None
-    if len(bad):
-        error = NotFiniteError(
-            f"{pair.name}: gap {p.gap[bad[0]]}, normal {p.normal[bad[0]]} at {pair.config.describe(int(pair.nodes[bad[0]]))}: "
-            "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
-        )
-    agree(pair.config.comm, error)
 
 
 def check_initial(pair: ContactPair) -> None:
@@ -56,13 +41,13 @@ def check_initial(pair: ContactPair) -> None:
         )
     agree(pair.config.comm, error)
     inside = gap < -TOUCHING * pair.config.size
-    depth, count = -gap.min(initial=0.0), int(inside.sum())
-    depths, counts = zip(*pair.config.comm.allgather((float(depth), count)))
-    if sum(counts):
-        pair.initial_overlap = max(depths)
+    depth = pair.config.comm.allreduce(float(-gap.min(initial=0.0)), op=MPI.MAX)
+    count = pair.config.comm.allreduce(int(inside.sum()))
+    if count:
+        pair.initial_overlap = depth
         logger.warning(
             "%s: %d contactors start up to %.4g inside the target; the first step presses the bodies apart by this interference",
-            pair.name, sum(counts), pair.initial_overlap,
+            pair.name, count, pair.initial_overlap,
         )  # fmt: skip
 
 

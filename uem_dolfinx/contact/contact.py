@@ -1,14 +1,12 @@
-"""Contact: what the user declares about two surfaces, and what can be read from it after a step.
-
-It turns tags into a contact pair before the first step and a pair's state into fields and resultants after every one.
-"""
+"""Contact: what the user declares about two surfaces, and what can be read from it after a step."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -16,45 +14,27 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
+from uem_dolfinx.contact.bernstein import Bernstein
+from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.gmsh import Tag
-from uem_dolfinx.geometry.projection import FacetProjection, Target
-from uem_dolfinx.geometry.rigid import RigidSurface, finite_point
+from uem_dolfinx.geometry.rigid import finite_point
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, check_tag, surface_nodes, tributary_areas
 
 if TYPE_CHECKING:
-    from uem_dolfinx.solve.system import BodySystem
+    from uem_dolfinx.geometry.configuration import Configuration
+    from uem_dolfinx.geometry.projection import Target
 
 Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 #: Default bound on the initial penetration, as part of the model's size.
+#: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
 MAX_PENETRATION = 0.05
-
-
-@dataclass(frozen=True)
-class Resultant:
-    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D."""
-
-    force: Array
-    moment: Array
-
-
-@dataclass(frozen=True)
-class Balance:
-    """Relative imbalance of the forces and of the moments of a pair."""
-
-    force: float
-    moment: float
-
-
-def _moments(x: Array, f: Array) -> Array:
-    """Moments about the origin of forces ``f (n, gdim)`` at ``x``, ``(n, 1)`` in 2D and ``(n, 3)`` in 3D."""
-    if x.shape[1] == 2:
-        return (x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0])[:, None]
-    return np.cross(x, f)
 
 
 class Contact:
@@ -100,8 +80,12 @@ class Contact:
         self._pair: ContactPair | None = None
         self._fields: dict[str, fem.Function] = {}
 
-    def attach(self, system: BodySystem) -> ContactPair:
+    def attach(self, config: Configuration, free: Bools) -> ContactPair:
         """Build the pair of this contact in a problem (collective).
+
+        Args:
+            config: configuration of the displacement.
+            free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
 
         Raises:
             TagError: if a tag is empty or of the wrong dimension.
@@ -109,7 +93,7 @@ class Contact:
             SurfaceError: if contactor and target share nodes.
             OrientationError: if a target facet lies inside a body.
         """
-        config = self.config = system.config
+        self.config = config
         check_tag(config, self.contactor, "contactor")
         nodes = surface_nodes(config, self.contactor)
         target: Target
@@ -120,18 +104,19 @@ class Contact:
             target = MeshTarget(facets, averaged=self.normals == "averaged")
         else:
             target = self.target
+        thickness = np.inf if self.thickness is None else self.thickness
+        coupling = (Bernstein if config.degree == 2 else NodeToSurface)(
+            config, nodes, target, free=free, sliding=self.sliding, thickness=thickness, chords=self.chords and config.degree == 2
+        )
         self._pair = ContactPair(
             config,
             nodes,
-            target,
-            free=system.free[: config.n_owned],
+            coupling,
             name=self.name,
             sliding=self.sliding,
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
-            thickness=np.inf if self.thickness is None else self.thickness,
-            chords=self.chords and config.degree == 2,
+            thickness=thickness,
         )
-        self._system = system
         return self._pair
 
     @property
@@ -165,12 +150,12 @@ class Contact:
     @property
     def pressures(self) -> Array:
         """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)`` (collective)."""
-        areas = self._areas if self.pair.control is None else self.pair.control.areas(self._areas)
+        areas = self.pair.coupling.areas(self.pair.placement, self._areas)
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
-        return float(max(self.config.comm.allgather(self.pressures.max(initial=0.0))))
+        return float(self.config.comm.allreduce(float(self.pressures.max(initial=0.0)), op=MPI.MAX))
 
     @property
     def pressure(self) -> fem.Function:
@@ -195,11 +180,9 @@ class Contact:
         f, g, pair = self._fields["force"], self.config.gdim, self.pair
         f.x.array[:] = 0.0
         total = compat.petsc_vector(f)
-        p, i = pair.projection, np.flatnonzero((pair.trial.force != 0).any(axis=1))
-        nodes = np.concatenate([self.config.to_global(pair.nodes[i])[:, None], p.nodes[i]], axis=1)
-        share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
-        rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
-        total.setValues(rows, (share[..., None] * pair.trial.force[i, None, :]).ravel(), addv=PETSc.InsertMode.ADD)
+        nodes, forces = pair.coupling.nodal_forces(pair.placement, pair.trial)
+        rows = (nodes[:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        total.setValues(rows, forces.ravel(), addv=PETSc.InsertMode.ADD)
         total.assemble()
         f.x.scatter_forward()
         return f
@@ -222,13 +205,9 @@ class Contact:
         centre = np.zeros(g) if about is None else finite_point(about, "about", g)
         x, f = self.pair.points, self.pair.trial.force
         if on == "target":
-            f = -f
-            if isinstance(p, FacetProjection):
-                x = p.foot
-            if about is None and isinstance(target, RigidSurface):
-                centre = target.reference(g)
-        parts = self.config.comm.allgather((f.sum(axis=0), _moments(x - centre, f).sum(axis=0)))
-        return Resultant(np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0))
+            x, f = p.foot, -f
+            centre = target.reference(g) if about is None else centre
+        return sum_up(self.config.comm, x - centre, f)
 
     def balance(self) -> Balance | None:
         """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
@@ -241,20 +220,7 @@ class Contact:
         if self.pair.target.n_nodes == 0:
             return None
         n, g = self.config.n_owned, self.config.gdim
-        f = self.force.x.array.reshape(-1, g)[:n]
-        x = self.config.x[:n]
-        m = _moments(x, f)
-        sums = [
-            f.sum(axis=0),
-            m.sum(axis=0),
-            np.linalg.norm(f, axis=1).sum(),
-            (np.linalg.norm(f, axis=1) * np.linalg.norm(x, axis=1)).sum(),
-        ]
-        force, moment, all_f, all_m = (sum(part) for part in zip(*self.config.comm.allgather(sums)))
-        return Balance(
-            float(np.linalg.norm(force) / all_f) if all_f > 0 else 0.0,
-            float(np.linalg.norm(moment) / all_m) if all_m > 0 else 0.0,
-        )
+        return imbalance(self.config.comm, self.config.x[:n], self.force.x.array.reshape(-1, g)[:n])
 
     def _field(self, what: str, values: npt.ArrayLike) -> fem.Function:
         if what not in self._fields:

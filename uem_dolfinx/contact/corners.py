@@ -1,6 +1,6 @@
 """Contactors in the concave corners of a faceted target: held by two facets on an edge, by three in a vertex.
 
-A part of the fourth step on the data's way. Facet normals jump from facet to facet; where two facets form a valley, a contactor
+Facet normals jump from facet to facet; where two facets form a valley, a contactor
 drawn to it belongs to both, and would flip between them for ever if it had to choose.
 """
 
@@ -25,10 +25,13 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 #: Facets whose slopes differ by less are one plane.
+#: [convention; slope; test_corners.py::test_facets_in_one_plane]
 ON_PLANE = 1e-9
 #: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
+#: [heuristic; slope; -]
 STEEP = 0.05
 #: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+#: [bound; iterations; -]
 IN_PLANE = 4
 
 

@@ -1,26 +1,18 @@
-"""What a contact pair remembers of its contactors from iteration to iteration and from step to step.
-
-A part of the fourth step on the data's way; whoever decides about contactors makes a new state of the old one.
-"""
+"""What a contact pair remembers of its contactors from iteration to iteration and from step to step."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.geometry.search import MeshTarget
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from uem_dolfinx.geometry.projection import Target
-
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Renumber = Callable[[Ints], Ints]
 
 #: Attributes that number facets.
 FACETS = ("facet", "held")
@@ -28,7 +20,7 @@ FACETS = ("facet", "held")
 
 @dataclass(frozen=True)
 class PairState:
-    """What a pair remembers of its contactors; frozen so that trial and committed never share an array by accident.
+    """What is known of ``n`` contactors; frozen so that trial and committed never share an array by accident.
 
     Attributes:
         active: united to the target ``(n,)``.
@@ -53,9 +45,14 @@ class PairState:
     passed: Bools
 
     @property
+    def in_corner(self) -> Bools:
+        """Contactors that a corner holds ``(n,)``."""
+        return np.asarray((self.held >= 0).any(axis=1))
+
+    @property
     def united_to(self) -> bytes:
         """What tells this active set from others: who is active, and the corners that hold contactors."""
-        corner = np.where((self.held >= 0).any(axis=1), self.facet, -1)
+        corner = np.where(self.in_corner, self.facet, -1)
         return self.active.tobytes() + corner.tobytes() + self.held.tobytes()
 
     @classmethod
@@ -73,19 +70,24 @@ class PairState:
             passed=np.zeros(n, bool),
         )
 
-    def keep(self, target: Target) -> dict[str, npt.NDArray[Any]]:
-        """The attributes by name, facets of a mesh by what tells them in any partition (collective)."""
-        kept = {f.name: getattr(self, f.name) for f in fields(self)}
-        if isinstance(target, MeshTarget):
-            for name in FACETS:
-                kept[name] = target.keys_of(kept[name].ravel()).reshape(kept[name].shape)
-        return kept
+    def to_checkpoint(self, keys_of: Renumber) -> dict[str, npt.NDArray[Any]]:
+        """The attributes by name (collective).
+
+        Args:
+            keys_of: what tells facets in any partition, from their present numbers ``(k,)``.
+        """
+        return {f.name: _renumbered(f.name, getattr(self, f.name), keys_of) for f in fields(self)}
 
     @classmethod
-    def recall(cls, kept: Mapping[str, npt.NDArray[Any]], target: Target) -> PairState:
-        """The state of which ``keep`` returned these arrays (collective)."""
-        arrays = {name: np.array(array) for name, array in kept.items()}
-        if isinstance(target, MeshTarget):
-            for name in FACETS:
-                arrays[name] = target.facets_of(arrays[name].ravel()).reshape(arrays[name].shape)
-        return cls(**arrays)
+    def from_checkpoint(cls, kept: Mapping[str, npt.NDArray[Any]], facets_of: Renumber) -> PairState:
+        """The state of which ``to_checkpoint`` returned these arrays (collective).
+
+        Args:
+            kept: by name.
+            facets_of: present numbers of facets, from what tells them in any partition ``(k,)``.
+        """
+        return cls(**{f.name: _renumbered(f.name, np.array(kept[f.name]), facets_of) for f in fields(cls)})
+
+
+def _renumbered(name: str, array: npt.NDArray[Any], renumber: Renumber) -> npt.NDArray[Any]:
+    return renumber(array.ravel()).reshape(array.shape) if name in FACETS else array

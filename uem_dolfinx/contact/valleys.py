@@ -1,12 +1,12 @@
 """Which facets contactors rest on where normals jump from facet to facet: changes across bends, corners entered and left.
 
-A part of the fourth step on the data's way; it answers with new states and projections, and the pair takes them over.
+States are handed in and out; only the geometry of the target is kept.
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from uem_dolfinx.geometry.projection import FacetProjection
 if TYPE_CHECKING:
     from uem_dolfinx.contact.state import PairState
     from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection
+    from uem_dolfinx.geometry.projection import Projection, Target
     from uem_dolfinx.geometry.search import MeshTarget
 
 Array = npt.NDArray[np.float64]
@@ -25,15 +25,23 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
+#: [heuristic; changes in a step; -]
 HOLD_AFTER = 2
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
+#: [heuristic; changes in a step; -]
 MOST_CHANGES = 8
 #: A corner holds a contactor if its free components keep this part of each of the corner's directions.
+#: [heuristic; length of a unit vector; -]
 FREE_ENOUGH = 1e-3
 
 
-class FacetChanges:
-    """Follows contactors from facet to facet of a target with the facets' own normals.
+def create_valleys(config: Configuration, target: Target, free: Bools) -> Valleys | None:
+    """What follows contactors from facet to facet; None where normals do not jump between facets."""
+    return Valleys(config, cast("MeshTarget", target), free) if target.faceted else None
+
+
+class Valleys:
+    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its valleys.
 
     Args:
         config: configuration of the displacement.
@@ -43,95 +51,104 @@ class FacetChanges:
 
     def __init__(self, config: Configuration, target: MeshTarget, free: Bools):
         self.config, self.target, self.free = config, target, free
-        #: Corners that hold contactors, None if no rank has any.
-        self.corners: Corners | None = None
-        self._nearest: FacetProjection
-        self._left: Bools = np.zeros(len(free), dtype=bool)
 
-    def place(self, nearest: Projection, state: PairState, points: Array) -> Projection:
+    def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
         """Put contactors that a corner holds into it, and give those that change facets too often averaged normals (collective).
 
         Args:
             nearest: the contactors on their nearest facets.
-            state: of the pair.
             points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair.
+
+        Returns:
+            The projection, and the corners that hold contactors, None if no rank has any.
         """
-        assert isinstance(nearest, FacetProjection)
-        self._nearest = nearest
+        nearest = cast("FacetProjection", nearest)
         locked = state.changes >= MOST_CHANGES
         gap = np.einsum("ng,ng->n", nearest.averaged, points - nearest.foot)
         normal = np.where(locked[:, None], nearest.averaged, nearest.normal)
         projection = replace(nearest, normal=normal, gap=np.where(locked, gap, nearest.gap))
-        held = np.flatnonzero((state.held >= 0).any(axis=1))
-        self.corners = c = self._corners_of(state, points, held, state.held[held])
+        held = np.flatnonzero(state.in_corner)
+        c = self._corners_of(state, points, held, state.held[held])
         if c is None:
-            return projection
+            return projection, None
         at_corner: dict[str, Any] = {"normal": c.axes[:, 0], "gap": c.gaps(points[held])[:, 0], "facet": state.facet[held]}
-        return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0})
+        return projection.with_rows(held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": 0.0}), c
 
-    def place_again(self, state: PairState, points: Array) -> Projection:
-        """The projection after contactors have entered or left corners, their positions being the same (collective)."""
-        # one that has just left is still as near to the facet it left
-        left = np.flatnonzero(self._left & (state.held < 0).all(axis=1))
-        nearest = self._nearest
-        if self.config.comm.allreduce(len(left)):
-            own = self.target.project_on(points[left], state.facet[left])
+    def place_again(
+        self, nearest: Projection, left: Bools, points: Array, state: PairState
+    ) -> tuple[Projection, Projection, Corners | None]:
+        """Place contactors that have entered or left corners, their positions being the same (collective).
+
+        Args:
+            nearest: the contactors on their nearest facets.
+            left: those that have just left a corner ``(n,)``.
+            points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair.
+
+        Returns:
+            ``nearest``, and what ``place`` returns. A contactor that has just left is still as near to the facet that it left.
+        """
+        nearest = cast("FacetProjection", nearest)
+        i = np.flatnonzero(left & ~state.in_corner)
+        if self.config.comm.allreduce(len(i)):
+            own = self.target.project_on(points[i], state.facet[i])
             own = replace(own, normal=self.target.outward(own))
-            own = replace(own, gap=np.einsum("ng,ng->n", own.normal, points[left] - own.foot))
-            nearest = nearest.with_rows(left, {f.name: getattr(own, f.name) for f in fields(own)})
-        return self.place(nearest, state, points)
+            own = replace(own, gap=np.einsum("ng,ng->n", own.normal, points[i] - own.foot))
+            nearest = nearest.with_rows(i, {f.name: getattr(own, f.name) for f in fields(own)})
+        return nearest, *self.place(nearest, points, state)
 
-    def leave(self, state: PairState, trusted: bool) -> tuple[PairState, bool]:
+    def leave(self, corners: Corners | None, state: PairState, trusted: bool) -> tuple[PairState, Bools]:
         """Let go of the facet of a corner that would have to pull.
 
         Args:
+            corners: that hold contactors.
             state: of the pair.
             trusted: whether its forces tell; otherwise only contactors that are not active let go.
 
         Returns:
-            The new state, and whether a contactor on this rank has let go.
+            The new state, and which contactors have let go ``(n,)``.
         """
-        self._left = np.zeros(len(self.free), dtype=bool)
-        c = self.corners
-        if c is None or not len(c.which):
-            return state, False
-        i = c.which
-        pulls = c.pulls(state.force[i])
+        left = np.zeros(len(self.free), dtype=bool)
+        if corners is None or not len(corners.which):
+            return state, left
+        i = corners.which
+        pulls = corners.pulls(state.force[i])
         leaving = (trusted & (pulls < 0).any(axis=1)) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)
         facets[rows, np.argmin(pulls[rows], axis=1)] = -1
-        # the facets that stay move up
-        facets = np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)
+        facets = _moved_up(facets)
         facet, held = state.facet.copy(), state.held.copy()
         facet[i], held[i] = facets[:, 0], facets[:, 1:]
         held[~state.active] = -1
-        self._left[i[leaving]] = True
-        return replace(state, facet=facet, held=held), bool(leaving.any())
+        left[i[leaving]] = True
+        return replace(state, facet=facet, held=held), left
 
-    def follow(self, state: PairState, points: Array) -> tuple[PairState, bool]:
+    def follow(self, nearest: Projection, left: Bools, points: Array, state: PairState) -> tuple[PairState, bool]:
         """Follow contactors onto new facets; into a concave corner they take the old facet with them (collective).
 
         Args:
-            state: of the pair, after ``leave``.
+            nearest: the contactors on their nearest facets.
+            left: those that have just left a corner ``(n,)``.
             points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair, after ``leave``.
 
         Returns:
             The new state, and whether a contactor on this rank has entered a corner or left it for good.
         """
-        nearest = self._nearest.facet
-        known = (state.facet == nearest) | (state.held == nearest[:, None]).any(axis=1) | (state.facet < 0)
-        moved = ~known & state.active & ~self._left & (state.changes < MOST_CHANGES)
+        number = nearest.facet
+        known = (state.facet == number) | (state.held == number[:, None]).any(axis=1) | (state.facet < 0)
+        moved = ~known & state.active & ~left & (state.changes < MOST_CHANGES)
         i = np.flatnonzero(moved)
         facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
-        settled = ~moved & ~self._left & (held < 0).all(axis=1)
-        facet[settled] = nearest[settled]
+        settled = ~moved & ~left & ~state.in_corner
+        facet[settled] = number[settled]
         # first together with all facets that it is on, then with the first of them alone
-        together = np.column_stack([state.held[i], nearest[i]])
+        together = _moved_up(np.column_stack([state.held[i], number[i]]))[:, : held.shape[1]]
         full = (state.held[i] >= 0).all(axis=1)
-        together = np.take_along_axis(together, np.argsort(together < 0, axis=1, kind="stable"), axis=1)[:, : held.shape[1]]
         alone = np.full_like(together, -1)
-        alone[:, 0] = nearest[i]
+        alone[:, 0] = number[i]
         taken = np.zeros(len(i), dtype=bool)
         entered = False
         for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)):
@@ -145,12 +162,11 @@ class FacetChanges:
             changes[c.which[~c.flat]] += 1
             entered |= bool(hold.any())
         switch = i[~taken]
-        facet[switch], held[switch] = nearest[switch], -1
+        facet[switch], held[switch] = number[switch], -1
         # one that is still led past the end of what holds it goes on with averaged normals
         past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
-        facet[past], held[past] = nearest[past], -1
-        entered |= bool(past.any())
-        return replace(state, facet=facet, held=held, changes=changes), entered
+        facet[past], held[past] = number[past], -1
+        return replace(state, facet=facet, held=held, changes=changes), entered or bool(past.any())
 
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
         """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
@@ -161,3 +177,8 @@ class FacetChanges:
         asked = np.arange(self.config.gdim) < c.count[:, None]
         A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
         return (np.linalg.svd(A, compute_uv=False) > FREE_ENOUGH).sum(axis=1) == c.count
+
+
+def _moved_up(facets: Ints) -> Ints:
+    """Rows with their facets first, then the empty places."""
+    return np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)

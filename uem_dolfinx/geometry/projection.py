@@ -43,6 +43,14 @@ class Projection(Protocol):
         """Number of the facet over all ranks ``(n,)``."""
 
     @property
+    def foot(self) -> Array:
+        """Where the force on the target acts ``(n, gdim)``: the closest point of a mesh; a rigid target takes it at the contactor."""
+
+    @property
+    def facet_size(self) -> Array:
+        """Length of a side of the facet ``(n,)``; infinite where the target has no facets."""
+
+    @property
     def beyond(self) -> Array:
         """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
 
@@ -59,16 +67,48 @@ class Target(Protocol):
     Attributes:
         n_nodes: that a contactor follows; 0 if the target is rigid.
         stride: how far a contactor may move past it unseen, a length.
+        averaged: whether normals are averaged at nodes and interpolated, so that they lean from the facets'.
+        faceted: whether normals jump from facet to facet.
+        dofs: local nodes of this rank's facets ``(m, nn)``.
+        keys: what tells each of these facets in any partition ``(m,)``.
     """
 
     n_nodes: int
     stride: float
+    averaged: bool
+
+    @property
+    def faceted(self) -> bool:
+        """See above."""
+
+    @property
+    def dofs(self) -> npt.NDArray[np.int32]:
+        """See above."""
+
+    @property
+    def keys(self) -> Ints:
+        """See above."""
 
     def project(self, points: Array) -> Projection:
         """Closest points in the current configuration (collective)."""
 
     def follow(self, points: Array, old: Any) -> Projection:
         """Gaps with the feet, normals and weights of an earlier projection of this target (small sliding, collective)."""
+
+    def continued(self, projection: Any, which: Ints) -> Projection:
+        """The projection with some feet moved past the target's open end, as far as their points lie beyond it."""
+
+    def chords(self, projection: Any) -> Array:
+        """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
+
+    def reference(self, gdim: int) -> Array:
+        """Point about which the moment on the target is taken ``(gdim,)``."""
+
+    def keys_of(self, facet: Ints) -> Ints:
+        """What tells facets in any partition, from their numbers ``(n,)``; -1 for -1 (collective)."""
+
+    def facets_of(self, keys: Ints) -> Ints:
+        """Numbers of the facets that keys tell ``(n,)``; -1 where there is none (collective)."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +138,11 @@ class FacetProjection:
     dN: Array
     ddN: Array
     bend: Array
+
+    @property
+    def facet_size(self) -> Array:
+        """Length of a side of each facet ``(n,)``."""
+        return np.linalg.norm(self.x[:, 0] - self.x[:, 1], axis=1)
 
     def with_gap(self, gap: Array) -> FacetProjection:
         """The same projection of points that have moved along the normal."""

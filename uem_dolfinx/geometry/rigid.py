@@ -61,6 +61,16 @@ class RigidProjection:
     bend: Array
     motion: Motion | None = None
 
+    @property
+    def foot(self) -> Array:
+        """A rigid surface, which has no nodes, takes forces where the contactors are ``(n, gdim)``."""
+        return self.points
+
+    @property
+    def facet_size(self) -> Array:
+        """There are no facets."""
+        return np.full(len(self.gap), np.inf)
+
     def with_gap(self, gap: Array) -> RigidProjection:
         """The same projection of points that have moved along the normal."""
         return replace(self, gap=gap)
@@ -89,6 +99,9 @@ class RigidSurface:
     """
 
     n_nodes = 0
+    averaged = faceted = False
+    dofs: npt.NDArray[np.int32] = np.zeros((0, 0), np.int32)
+    keys: Ints = np.zeros(0, np.int64)
 
     def __init__(
         self,
@@ -177,6 +190,22 @@ class RigidSurface:
             touched, normal, bend = now.carry(then.back(touched)), normal @ Q.T, Q @ bend @ Q.T
         gap = old.gap + np.einsum("ng,ng->n", normal, points - touched)
         return replace(old, gap=gap, normal=normal, points=points.copy(), bend=bend, motion=self.motion)
+
+    def continued(self, projection: RigidProjection, which: Ints) -> RigidProjection:
+        """The surface has no end."""
+        return projection
+
+    def chords(self, projection: RigidProjection) -> Array:
+        """The surface has no nodes ``(n, 0)``."""
+        return projection.weights
+
+    def keys_of(self, facet: Ints) -> Ints:
+        """The surface has no facets to number."""
+        return facet
+
+    def facets_of(self, keys: Ints) -> Ints:
+        """The surface has no facets to number."""
+        return keys
 
     def _bend(self, points: Array, normal: Array, length: Array) -> Array:
         """``t . grad^2 phi . t / |grad phi|`` in the tangent plane."""

@@ -75,6 +75,33 @@ class MeshTarget:
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
 
+    @property
+    def faceted(self) -> bool:
+        """Whether normals jump from facet to facet."""
+        return not self.averaged
+
+    @property
+    def dofs(self) -> npt.NDArray[np.int32]:
+        """Local nodes of this rank's facets ``(m, nn)``."""
+        return self.facets.dofs
+
+    @property
+    def keys(self) -> Ints:
+        """What tells each of this rank's facets in any partition ``(m,)``."""
+        return self.facets.keys
+
+    def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
+        """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
+        return projection.reaching_out(which, self.shape)
+
+    def chords(self, projection: FacetProjection) -> Array:
+        """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
+        return self.shape.chords(projection.xi)
+
+    def reference(self, gdim: int) -> Array:
+        """The origin."""
+        return np.zeros(gdim)
+
     def outward(self, projection: FacetProjection) -> Array:
         """The facets' own outward normals at the feet, also where ``normal`` is an averaged one ``(n, gdim)``."""
         own = _unit_normals_of(projection)

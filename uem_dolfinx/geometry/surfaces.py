@@ -59,11 +59,10 @@ def tributary_areas(config: Configuration, tag: Tag) -> Array:
     return areas
 
 
-def followed_nodes(config: Configuration, targets: list[TargetFacets]) -> npt.NDArray[np.bool_]:
-    """Which local nodes lie on any of the targets ``(n_local,)`` (collective)."""
+def followed_nodes(config: Configuration, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+    """Which local nodes ``(n_local,)`` any rank names among its local nodes ``dofs``, of any shape (collective)."""
     mark = fem.Function(config.V)
-    for target in targets:
-        mark.x.array.reshape(-1, config.gdim)[target.dofs.ravel()] = 1.0
+    mark.x.array.reshape(-1, config.gdim)[dofs.ravel()] = 1.0
     forms.sum_ghosts(mark)
     return mark.x.array.reshape(-1, config.gdim)[:, 0] > 0
 
@@ -74,7 +73,7 @@ def check_distinct(config: Configuration, contactor: npt.NDArray[np.int32], targ
     Raises:
         SurfaceError: naming the first shared node.
     """
-    shared = contactor[followed_nodes(config, [target])[contactor]]
+    shared = contactor[followed_nodes(config, target.dofs)[contactor]]
     error = None
     if len(shared):
         error = SurfaceError(

@@ -129,8 +129,8 @@ class EnergyBook:
         contact = np.zeros(n)
         for c in problem.contacts:
             contact += c.force.x.array[:n]
-        problem.system.assemble_residual()
-        reaction = (problem.system.residual.array_r - contact) * ~problem.system.free[: problem.config.n_owned].ravel()
+        problem.forces.assemble()
+        reaction = (problem.forces.residual.array_r - contact) * ~problem.forces.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])

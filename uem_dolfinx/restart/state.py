@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from uem_dolfinx import compat
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
-from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
 
 if TYPE_CHECKING:
@@ -92,8 +91,8 @@ class ContactEntry:
         places = nodes.place[pair.nodes]
         self.numbering = Numbering(comm, places, nodes.total)
         surfaces = [hashes(self.numbering.to_table(places))]
-        if isinstance(pair.target, MeshTarget):
-            keys = pair.target.facets.keys
+        keys = pair.target.keys
+        if comm.allreduce(len(keys)):
             surfaces.append(hashes(Numbering(comm, keys, MOST_SIDES * n_cells(contact.config.mesh)).to_table(keys)))
         self._surfaces = fingerprint(comm, surfaces)
         self._columns = " ".join(self.rows().dtype.names or ())
@@ -104,7 +103,7 @@ class ContactEntry:
 
     def rows(self) -> Array:
         """One record for each contactor ``(n,)``."""
-        kept = self.contact.pair.keep()
+        kept = self.contact.pair.to_checkpoint()
         rows = np.empty(len(self.contact.pair.nodes), dtype=[(name, a.dtype.str, a.shape[1:]) for name, a in kept.items()])
         for name, a in kept.items():
             rows[name] = a
@@ -112,7 +111,7 @@ class ContactEntry:
 
     def take(self, rows: Array) -> None:
         """Hand the records to the pair."""
-        self.contact.pair.recall({name: rows[name] for name in rows.dtype.names or ()})
+        self.contact.pair.from_checkpoint({name: rows[name] for name in rows.dtype.names or ()})
 
 
 @dataclass

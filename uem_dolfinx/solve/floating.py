@@ -1,262 +1,185 @@
-"""Bodies that nothing holds: which motions are open to them, how they come to rest, and what keeps the united system regular.
+"""Bodies that only contact holds: how they come to rest, and what keeps the united system regular until they do.
 
-Between uniting equations and the united system on the data's way. A body without enough Dirichlet conditions can move as a rigid
-body until contact holds it. Each motion that conditions and active contacts leave open is either loaded, and then the body falls
-along it until it touches something, or neutral, and then it is held in a statically determinate way, where the reaction is zero.
+A body without enough Dirichlet conditions can move as a rigid body until contact holds it. Each motion that conditions and active
+contacts leave open is either loaded, and then the body falls along it until it touches something, or neutral, and then it is held in a
+statically determinate way, where the reaction is zero.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.errors import FloatingBodyError
-from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
-from uem_dolfinx.geometry.rigid import rotation_matrix
+from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.log import logger
+from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions, find_open_motions
 
 if TYPE_CHECKING:
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.geometry.configuration import Configuration
+    from collections.abc import Callable, Sequence
+
+    from uem_dolfinx.contact.pair import ContactPair
+    from uem_dolfinx.solve.body_forces import BodyForces
 
 Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-#: A motion is open if conditions and contacts resist it with less than this part of its size.
-OPEN = 1e-5
 #: Until contact has developed, motions that it resists with less than this part are held as well: a body that has touched ground
 #: with one or two nodes would else swing about them.
+#: [heuristic; size of the motion; -]
 HARDLY_HELD = 0.03
-#: A motion is loaded if the forces along it exceed this part of all forces; supports may be left with less.
-LOADED = 1e-6
-#: Forces up to this part of all forces take a body no farther than ``NUDGE`` of the model's size: on a single facet it would slide
+#: Forces up to this part of all forces take a body no farther than ``SHORT_WAY`` of the model's size: on a single facet it would slide
 #: away as soon as the facet tilts in the least.
+#: [heuristic; sum of all forces; -]
 BARELY_LOADED = 1e-3
-NUDGE = 0.01
+#: See ``BARELY_LOADED``.
+#: [heuristic; the model's size; -]
+SHORT_WAY = 0.01
+#: A contactor comes nearer if it closes its gap by more than this part of the motion.
+#: [convention; size of the motion; test_floating.py::test_what_counts_as_coming_nearer]
+CLOSING = 1e-9
+#: A body that falls touches ground after so many stations at most.
+#: [bound; stations; -]
+MOST_STATIONS = 200
 
 
 class FloatingBodies:
-    """Rigid motions of the bodies of a scene that its Dirichlet conditions do not hold.
-
-    A motion is a vector with as many entries per body as it has rigid-body modes: translations, then rotations about the body's
-    middle in units of its radius, so that all entries are lengths.
+    """What a step does about bodies that only contact holds.
 
     Args:
-        config: configuration of the displacement.
-        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-        finite: whether bodies turn by finite rotations, not by linearised ones.
-
-    Attributes:
-        loose: whether the conditions leave any motion open.
+        forces: of the bodies.
+        pairs: of all contacts; without any, nothing is done about bodies that float.
+        place: projects all contactors (collective).
     """
 
-    def __init__(self, config: Configuration, free: Bools, finite: bool):
-        self.config, self.comm, self.free, self.finite = config, config.comm, free, finite
-        self._body, self.count = find_bodies(config)
-        own = self._body[: config.n_owned]
-        self.middle = self._middles()
-        radius = np.zeros(self.count)
-        np.maximum.at(radius, own, np.linalg.norm(config.X[: config.n_owned] - self.middle[own], axis=1))
-        self.radius: Array = np.max(self.comm.allgather(radius), axis=0)
-        self._pins: tuple[Array, Bools] | None = None
-        #: Part that the largest force along an open motion was of all forces when last asked for.
-        self.share = 0.0
-        self.loose = self.open_motions(None).shape[1] > 0
+    def __init__(self, forces: BodyForces, pairs: Sequence[ContactPair], place: Callable[[], None]):
+        self._forces, self._pairs, self._place = forces, pairs, place
+        config, dynamics = forces.config, forces.dynamics
+        self._at_rest: RigidMotions | None = None
+        self._in_motion: RigidMotions | None = None
+        if pairs:
+            free, finite = forces.free[: config.n_owned], not forces.tangent.linear
+            self._at_rest = find_open_motions(config, free, finite)
+            if dynamics is not None:
+                # in a step in time, inertia holds what has mass
+                self._in_motion = find_open_motions(config, free & ~dynamics.massy, finite)
+        #: Motions of the present step, None if conditions and inertia hold all bodies.
+        self.motions = self._at_rest
+        #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
+        self._open: Array = np.zeros((0, 0))
+        #: Whether contact has yet to develop in this step.
+        self._developing = False
 
-    # -- motions ---------------------------------------------------------------------------------------------------------
+    def begin_step(self) -> None:
+        """Let bodies fall until they touch (collective).
 
-    @property
-    def _places(self) -> Array:
-        """Where the owned nodes are that a motion takes along ``(n_owned, gdim)``."""
-        return (self.config.x if self.finite else self.config.X)[: self.config.n_owned]
-
-    def _middles(self) -> Array:
-        """Means of the bodies' nodes ``(count, gdim)`` (collective)."""
-        own = self._body[: self.config.n_owned]
-        sums = np.zeros((self.count, self.config.gdim + 1))
-        np.add.at(sums, own, np.column_stack([np.ones(len(own)), self._places]))
-        sums = self.comm.allreduce(sums)
-        return np.asarray(sums[:, 1:] / sums[:, :1])
-
-    def _modes(self, x: Array, body: Ints) -> Array:
-        """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each of their own modes ``(n, n_modes, gdim)``."""
-        return rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
-
-    @property
-    def n_modes(self) -> int:
-        """Rigid-body modes of one body."""
-        return 3 if self.config.gdim == 2 else 6
-
-    @property
-    def every_motion(self) -> Array:
-        """All motions of all bodies ``(n_motions, n_motions)``."""
-        return np.eye(self.count * self.n_modes)
-
-    def _spread(self, values: Array, body: Ints) -> Array:
-        """Rows in all motions from rows in the modes of one body each ``(n, count * n_modes)``."""
-        rows = np.zeros((len(values), self.count, self.n_modes))
-        rows[np.arange(len(values)), body] = values
-        return rows.reshape(len(values), self.count * self.n_modes)
-
-    def rates(self, equations: UnitingEquations) -> Array:
-        """How fast each motion opens the gap of each equation ``(m, n_motions)`` (collective)."""
-        config, g = self.config, self.config.gdim
-        own = self._body[: config.n_owned]
-        x = self._places
-        known = config.ask_owners(equations.followed, np.column_stack([own, x]))
-        modes = self._modes(x[equations.node], own[equations.node])
-        rows = self._spread(np.einsum("nmg,ng->nm", modes, equations.direction), own[equations.node])
-        body = known[:, 0].astype(np.int64)
-        terms = np.einsum("nmg,ng->nm", self._modes(known[:, 1 : 1 + g], body), equations.coefficients)
-        np.subtract.at(rows, equations.row, self._spread(terms, body))
-        return rows
-
-    def open_motions(self, equations: UnitingEquations | None, resistance: float = OPEN) -> Array:
-        """Orthonormal motions that neither conditions nor active equations resist ``(n_motions, k)`` (collective).
-
-        Args:
-            equations: of all contactors, or None.
-            resistance: what counts as none, as part of the motion's size.
+        Raises:
+            FloatingBodyError: naming a body, and the motion that nothing stops.
         """
-        if self.finite:
-            self.middle = self._middles()
-        i, c = np.nonzero(~self.free)
-        body = self._body[i]
-        held = self._spread(self._modes(self._places[i], body)[np.arange(len(i)), :, c], body)
-        resisted = held.T @ held
-        if equations is not None:
-            rows = self.rates(equations)[equations.active]
-            resisted = resisted + rows.T @ rows
-        values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
-        return vectors[:, values < resistance**2]
+        if self._forces.dynamics is not None:
+            self.motions = self._in_motion if self._forces.dynamics.moving else self._at_rest
+        self._developing = self.motions is not None
+        if self.motions is not None:
+            self.motions.forget_supports()
+            self._fall(freely=True, small_loads=False)
 
-    def load(self, motions: Array, residual: Array) -> Array:
-        """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
+    def begin_motion(self) -> None:
+        """Take the motions of a step in time for the first acceleration."""
+        self.motions = self._in_motion
 
-        Args:
-            motions: ``(n_motions, k)``.
-            residual: ``F`` at the owned nodes ``(n_owned, gdim)``.
-        """
-        own = self._body[: self.config.n_owned]
-        work = -np.einsum("nmg,ng->nm", self._modes(self._places, own), residual)
-        force = np.zeros((self.count, self.n_modes))
-        np.add.at(force, own, work)
-        total, scale = (sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual).sum()))))
-        along = motions.T @ total
-        self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
-        force = motions @ np.where(np.abs(along) > LOADED * scale, along, 0.0)
-        # bodies that are held stay where they are, to the last bit
-        return np.where(np.abs(force) > OPEN**2 * np.abs(force).max(initial=0.0), force, 0.0)
-
-    def part(self, motions: Array, du: Array) -> Array:
-        """What an increment ``(n_owned, gdim)`` holds of some motions ``(n_motions, k)``, of the same shape (collective).
-
-        Without it the increment does not depend on the supports: bodies stay where they are along neutral motions.
-        """
-        own = self._body[: self.config.n_owned]
-        modes = self._modes(self._places, own)
-        parts = motions.reshape(self.count, self.n_modes, motions.shape[1])
-        fields = np.einsum("nmg,nmk->ngk", modes, parts[own]).reshape(du.size, -1)
-        gram, along = (sum(a) for a in zip(*self.comm.allgather((fields.T @ fields, fields.T @ du.ravel()))))
-        return (fields @ np.linalg.solve(gram, along)).reshape(du.shape) if motions.shape[1] else np.zeros_like(du)
-
-    def move(self, motion: Array) -> None:
-        """Move the bodies (collective)."""
-        config, g = self.config, self.config.gdim
-        u = config.displacement
-        parts = motion.reshape(self.count, self.n_modes)
-        body = self._body
-        if not self.finite:
-            u += np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body])
-            return
-        x = config.x
-        for b in np.flatnonzero(np.abs(parts).max(axis=1) > 0):
-            turn = rotation_matrix(_turn(parts[b, g:] / self.radius[b]))
-            here = body == b
-            u[here] += (x[here] - self.middle[b]) @ (turn - np.eye(g)).T + parts[b, :g]
-
-    # -- what keeps the system regular -------------------------------------------------------------------------------------
-
-    def supports(self, motions: Array, equations: UnitingEquations) -> Bools:
-        """Components of owned nodes that hold neutral motions without any reaction ``(n_owned, gdim)`` (collective).
-
-        One component per motion, each where what the earlier ones leave open moves it most; contactors are spared.
-        """
-        if self._pins is not None:
-            before, pins = self._pins
-            same = before.shape == motions.shape and np.abs(before @ (before.T @ motions) - motions).max(initial=0.0) < OPEN
-            if same:
-                return pins
-        config, g = self.config, self.config.gdim
-        pins = np.zeros((config.n_owned, g), dtype=bool)
-        own = self._body[: config.n_owned]
-        allowed = np.array(self.free)
-        allowed[equations.node] = False
-        i, c = np.nonzero(allowed)
-        rows = self._spread(self._modes(self._places, own)[i, :, c], own[i]) @ motions
-        for _ in range(motions.shape[1]):
-            size = np.linalg.norm(rows, axis=1)
-            best = int(size.argmax()) if len(size) else -1
-            # equally good ones on several ranks are told apart by rank
-            offers = self.comm.allgather(float(size[best]) if best >= 0 else -1.0)
-            winner = int(np.argmax(offers))
-            if winner == self.comm.rank:
-                pins[i[best], c[best]] = True
-            direction = self.comm.bcast(rows[best] / size[best] if winner == self.comm.rank else None, root=winner)
-            rows -= np.outer(rows @ direction, direction)
-        self._pins = motions, pins
-        return pins
-
-    def release(self) -> None:
-        """Let the supports be chosen anew: a step must not depend on how those before it were found."""
-        self._pins = None
-
-    def reach(self, nudge: bool) -> float:
-        """How far the loads last asked for take a body, a length.
-
-        Args:
-            nudge: whether small ones do at all.
-        """
-        return np.inf if self.share > BARELY_LOADED else NUDGE * self.config.size if nudge else 0.0
-
-    def tell(self) -> None:
-        """Say so if supports carry more than rounding, at the end of a step."""
-        if self.share > LOADED:
+    def end_step(self) -> None:
+        """Say so if supports carry more than rounding."""
+        if self.motions is not None and self.motions.share > LOADED:
             logger.warning(
                 "a body that only contact holds is driven sideways by %.1g of the forces, and is held where it is: its contact does "
-                "not tell its place", self.share,
+                "not tell its place", self.motions.share,
             )  # fmt: skip
 
-    def error(self, motion: Array) -> FloatingBodyError:
-        """What to tell about a loaded motion that nothing stops: which body moves most, and how."""
-        g = self.config.gdim
-        parts = motion.reshape(self.count, self.n_modes)
-        b = int(np.abs(parts).max(axis=1).argmax())
-        size = np.abs(parts[b]).max()
-        shift, turn = parts[b, :g] / size, parts[b, g:] / size
-        ways = []
-        if np.abs(shift).max() > 1e-6:
-            ways.append("moves along (" + ", ".join(f"{c:.3g}" for c in shift / np.linalg.norm(shift)) + ")")
-        if np.abs(turn).max() > 1e-6:
-            axis = "" if g == 2 else " about (" + ", ".join(f"{c:.3g}" for c in _turn(turn)) + ")"
-            ways.append("turns" + axis)
-        middle = np.where(np.abs(self.middle[b]) > 1e-9 * self.config.size, self.middle[b], 0.0)
-        where = "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
-        return FloatingBodyError(
-            f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
-            "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on"
-        )
+    def hold(self, free: Bools, equations: UnitingEquations) -> Bools:
+        """Free components ``(n_owned, gdim)`` without those that hold neutral motions (collective)."""
+        if self.motions is None:
+            return free
+        self._open = self.motions.open_motions(equations, HARDLY_HELD if self._developing else OPEN)
+        return free & ~self.motions.supports(self._open, equations)
 
+    def fall_again(self, changed: bool, settled: bool) -> bool:
+        """Let bodies that have lost their hold fall (collective).
 
-def find_floating(config: Configuration, free: Bools, finite: bool) -> FloatingBodies | None:
-    """Bodies with open motions, None if there are none (collective); arguments as of ``FloatingBodies``."""
-    floating = FloatingBodies(config, free, finite)
-    return floating if floating.loose else None
+        Args:
+            changed: whether the active set has.
+            settled: whether the bodies are in equilibrium.
 
+        Returns:
+            Whether anything has changed now.
+        """
+        if self.motions is None:
+            return changed
+        if self._developing and settled and not changed:
+            # go on if more was held than must be
+            self._developing = False
+            changed = self._open.shape[1] > self.motions.open_motions(self._equations()).shape[1]
+        if changed or settled:
+            # a body that has lost its hold on the way falls only when the others have come to rest
+            changed |= self._fall(freely=not changed, small_loads=not changed)
+        return changed
 
-def _turn(angles: Array) -> Array:
-    """Angle ``(1,)`` or rotation vector ``(3,)`` from rotations in the planes that ``rigid_velocities`` lists."""
-    return angles if len(angles) == 1 else np.array([angles[2], -angles[1], angles[0]])
+    def without_open_motions(self, du: Array) -> Array:
+        """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
+        if self.motions is None:
+            return du
+        return du - self.motions.part(self._open, du.reshape(-1, self._forces.config.gdim)).ravel()
+
+    def deformation(self, du: Array) -> Array:
+        """An increment ``(n_owned * gdim,)`` without any rigid motion of the bodies that only contact holds (collective)."""
+        if self.motions is None:
+            return du
+        return du - self.motions.part(self.motions.every_motion, du.reshape(-1, self._forces.config.gdim)).ravel()
+
+    def _equations(self) -> UnitingEquations:
+        """Uniting equations of all pairs."""
+        return UnitingEquations.join([pair.equations().test for pair in self._pairs], self._forces.config.gdim)
+
+    def _fall(self, freely: bool, small_loads: bool) -> bool:
+        """Move bodies rigidly along their loads until contact holds them (collective).
+
+        Args:
+            freely: otherwise they only take hold of what they touch already.
+            small_loads: follow small loads as well, to what is near.
+
+        Returns:
+            Whether any body has moved or touched something.
+
+        Raises:
+            FloatingBodyError: naming a body, and the motion that nothing stops.
+        """
+        motions, config = self.motions, self._forces.config
+        assert motions is not None
+        changed, motion = False, motions.every_motion[0]
+        for _ in range(MOST_STATIONS):
+            self._place()
+            self._forces.assemble()
+            motion = motions.load(motions.open_motions(self._equations()), self._forces.residual.array_r.reshape(-1, config.gdim))
+            way = np.inf if motions.share > BARELY_LOADED else SHORT_WAY * config.size if small_loads else 0.0
+            if not motion.any() or not way:
+                return changed
+            motion /= np.linalg.norm(motion)
+            closing, distance = [], np.inf
+            for pair in self._pairs:
+                ahead = pair.approach
+                rate = motions.rates(ahead) @ motion
+                closing.append(rate < -CLOSING)
+                ways = np.where(rate < -CLOSING, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, CLOSING), np.inf)
+                distance = min(distance, float(ways.min(initial=np.inf)))
+            distance = config.comm.allreduce(distance, op=MPI.MIN)
+            if not any([pair.activate_closing(c) for pair, c in zip(self._pairs, closing)]):
+                if not freely or way < distance:
+                    return changed
+                if np.isinf(distance):
+                    raise motions.error(motion)
+                # on curved surfaces the touch may come later than it seems; then the next station is nearer
+                motions.move(distance * motion)
+            changed = True
+        raise motions.error(motion)

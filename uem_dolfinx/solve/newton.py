@@ -1,12 +1,15 @@
 """The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, unite, solve, until equilibrium and contact hold.
 
-Seventh step on the data's way. The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics alike.
+The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics alike.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
 from uem_dolfinx.log import logger, say
@@ -16,19 +19,28 @@ if TYPE_CHECKING:
 
     from uem_dolfinx.algebra.restriction import Restriction
 
+Array = npt.NDArray[np.float64]
+
 #: A residual that keeps this part of its norm twice has met its rounding.
+#: [heuristic; norm of the residual; -]
 STALLED = 0.5
 #: An active set that still changes after so many iterations changes by one contactor at a time from then on.
+#: [heuristic; iterations; -]
 CAUTIOUS_AFTER = 10
 #: Shortest step of the line search.
-SHORTEST_STEP = 1.0 / 64
+#: [bound; halvings of a step; -]
+SHORTEST_SEARCH = 1.0 / 64
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
+#: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 ENOUGH_DECREASE = 0.9
 #: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
-PASSING = 1e-4
+#: [heuristic; right-hand side; -]
+ACCURACY_ON_THE_WAY = 1e-4
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
-LAST = 0.1
+#: [heuristic; right-hand side; -]
+ACCURACY_AT_THE_END = 0.1
 #: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
+#: [heuristic; norm of the forces; -]
 LARGEST_ROUNDING = 1e-4
 
 
@@ -37,7 +49,7 @@ class Iteration:
     """One line of the history.
 
     Attributes:
-        residual: norm of ``P'r`` over the forces at work.
+        residual: norm of ``Q'r`` over the forces at work.
         gap: largest gap of an active contactor, a length.
         active: number of active contactors over all ranks.
         changed: whether contactors were activated or released.
@@ -54,13 +66,13 @@ class Iteration:
 
 
 @dataclass(frozen=True)
-class United:
+class IterationState:
     """A state of the united system as the loop sees it.
 
     Attributes:
-        restriction: P and c.
-        step: P and c that the step is taken with; the same unless a contact approximates curved facets by chords.
-        residual: ``P'F``, the out-of-balance forces.
+        trial: P and c, by which the bodies move.
+        test: Q, by which forces are handed on; the same object as P unless a coupling tells trial from test rows.
+        residual: ``Q'F``, the out-of-balance forces.
         norm: its norm.
         scale: norm of the forces at work.
         rounding: norm below which a force is rounding of the displacement.
@@ -71,8 +83,8 @@ class United:
         closed: whether gaps and Dirichlet conditions are met.
     """
 
-    restriction: Restriction
-    step: Restriction
+    trial: Restriction
+    test: Restriction
     residual: PETSc.Vec
     norm: float
     scale: float
@@ -85,7 +97,25 @@ class United:
 
 
 class UnitedSystem(Protocol):
-    """What the loop needs of the problem; every method is collective."""
+    """Bodies in contact as loop and problem see them; every method is collective.
+
+    ``system.BodySystem`` eliminates the contactors; another method of contact implements the same.
+    """
+
+    def begin_step(self) -> None:
+        """Begin a step, before the loop."""
+
+    def end_step(self) -> None:
+        """End a step in which the loop has converged; may refuse it."""
+
+    def deformation(self, du: Array) -> Array:
+        """An increment ``(n_owned * gdim,)`` without the rigid motions that say nothing about the next step."""
+
+    def accelerate(self) -> None:
+        """Find the acceleration that the bodies start with, in dynamics."""
+
+    def forget(self) -> None:
+        """Let the next step assemble and factorise anew, as the first of a run does."""
 
     @property
     def linear(self) -> bool:
@@ -101,19 +131,19 @@ class UnitedSystem(Protocol):
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
 
-    def unite(self, cautious: bool) -> United:
+    def unite(self, cautious: bool) -> IterationState:
         """Contact forces, activation and release, and the uniting equations that follow."""
 
     def active_set(self) -> int:
         """Fingerprint of the active set, the same on all ranks."""
 
-    def linearise(self, state: United, first: bool) -> PETSc.Vec:
-        """Tangent and united matrix; returns the right-hand side ``P'(r - K c)``."""
+    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
+        """Tangent and united matrix ``Q'KP``; returns the right-hand side ``Q'(r - K c)``."""
 
     def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
 
-    def move(self, state: United, dq: PETSc.Vec) -> PETSc.Vec:
+    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
 
     def displacement(self) -> PETSc.Vec:
@@ -125,18 +155,18 @@ class UnitedSystem(Protocol):
     def inverted(self) -> str | None:
         """Where a cell is inside out, if one is."""
 
-    def reduced_residual(self, state: United) -> PETSc.Vec:
-        """``P'F`` at the present displacement, with the active set of ``state``."""
+    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
+        """``Q'F`` at the present displacement, with the active set of ``state``."""
 
 
 def solve_united(
     system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool, forces_before: float = 0.0
 ) -> list[Iteration]:
-    """Iterate until ``P'r`` vanishes against the forces at work and every contact condition holds.
+    """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
 
     Args:
         system: the problem.
-        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        rtol: bound on the norm of ``Q'r`` relative to the forces at work.
         max_iterations: bound on the number of linear solves.
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
@@ -181,8 +211,8 @@ def solve_united(
         driving = rhs.norm()
         thrust = max(thrust, driving if k == 0 else 0.0)
         passing = not cautious and (not system.linear or state.changed or (k == 0 and system.in_contact))
-        needed = LAST * rtol * forces / driving if driving > 0 else 0.0
-        dq, iterations = system.solve(rhs, min(max(needed, PASSING if passing else 0.0), LAST))
+        needed = ACCURACY_AT_THE_END * rtol * forces / driving if driving > 0 else 0.0
+        dq, iterations = system.solve(rhs, min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END))
         residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
         history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
         _report(history, verbose)
@@ -195,13 +225,13 @@ def solve_united(
     )
 
 
-def _advance(system: UnitedSystem, state: United, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
+def _advance(system: UnitedSystem, state: IterationState, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
     """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
     du, start = system.move(state, dq), system.displacement()
     work, norm = abs(dq.dot(rhs)), rhs.norm()
     length = 1.0
     while True:
-        last = not line_search or length <= SHORTEST_STEP
+        last = not line_search or length <= SHORTEST_SEARCH
         system.displace(start, du, length)
         where = system.inverted()
         if where is not None:

@@ -1,7 +1,4 @@
-"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, wired up and solved for one state after the other.
-
-Eighth step on the data's way, and the only file that knows all the others.
-"""
+"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, wired up and solved for one state after the other."""
 
 from __future__ import annotations
 
@@ -12,11 +9,11 @@ from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.contact.checks import check_prescribed
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.restart.state import State
+from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.newton import Iteration, solve_united
 from uem_dolfinx.solve.system import BodySystem
 
@@ -26,12 +23,15 @@ if TYPE_CHECKING:
     import ufl
 
     from uem_dolfinx.contact.contact import Contact
+    from uem_dolfinx.contact.pair import ContactPair
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.geometry.gmsh import Tag
     from uem_dolfinx.materials.elastic import HistoryMaterial
+    from uem_dolfinx.solve.newton import UnitedSystem
 
 #: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
 #: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
+#: [derived; the last step; test_prediction.py::test_a_rim_that_moves_on_at_its_pace_is_found]
 RIM = 1.0 / (2.0**1.5 - 1.0)
 
 
@@ -62,6 +62,8 @@ class UnitedProblem:
         check_inversion: look for cells turned inside out in every iteration; None does so unless K is constant.
         rtol: bound on the norm of ``P'r`` relative to the forces at work.
         max_iterations: bound on the linear solves of one step.
+        method: how contact is reached, by default by elimination: called with the arguments of ``solve.system.BodySystem`` it makes a
+            ``solve.newton.UnitedSystem``.
         verbose: print one line per iteration.
 
     Raises:
@@ -69,9 +71,6 @@ class UnitedProblem:
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
-
-    #: Brings bodies and contact together for the Newton loop; a subclass may reach contact in another way.
-    system_type: Callable[..., BodySystem] = BodySystem
 
     def __init__(
         self,
@@ -91,6 +90,7 @@ class UnitedProblem:
         check_inversion: bool | None = None,
         rtol: float = 1e-8,
         max_iterations: int = 50,
+        method: Callable[..., UnitedSystem] = BodySystem,
         verbose: bool = False,
     ):
         if newton not in ("full", "modified"):
@@ -101,18 +101,22 @@ class UnitedProblem:
         self.comm = self.config.comm
         self.contacts, self.dynamics, self.materials = list(contacts), dynamics, list(materials)
         damping = dynamics.attach(self.config) if dynamics is not None else None
-        self.system = self.system_type(
+        #: What the bodies do without contact.
+        self.forces = BodyForces(
             self.config,
             F if damping is None else F + damping,
             bcs,
-            UnitedSolver(self.config, petsc_options_prefix, petsc_options),
-            newton=newton,
-            consistent_tangent=consistent_tangent,
-            check_inversion=check_inversion,
             materials=self.materials,
             dynamics=dynamics,
+            check_inversion=check_inversion,
         )
-        self.system.add_pairs([contact.attach(self.system) for contact in self.contacts])
+        solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
+        free = self.forces.free[: self.config.n_owned]
+        pairs = [contact.attach(self.config, free) for contact in self.contacts]
+        if dynamics is not None:
+            dynamics.weigh(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
+        #: Bodies and contact as the Newton loop sees them.
+        self.system = method(self.forces, pairs, solver, newton=newton, consistent_tangent=consistent_tangent)
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
@@ -146,12 +150,12 @@ class UnitedProblem:
         """
         start = self.committed if start is None else start
         wanted = np.array(start)
-        compat.set_bc_values(wanted, self.system.bcs)
-        self.system.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
+        compat.set_bc_values(wanted, self.forces.bcs)
+        self.forces.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
         try:
             if ratio > 0.0:
                 self._predict(ratio)
-            self.system.land()
+            self.system.begin_step()
             history = solve_united(
                 self.system,
                 rtol=self.rtol,
@@ -160,10 +164,7 @@ class UnitedProblem:
                 verbose=self.verbose,
                 forces_before=self._largest_forces,
             )
-            for pair in self.system.pairs:
-                check_prescribed(pair)
-            if self.system.floating is not None:
-                self.system.floating.tell()
+            self.system.end_step()
         except UEMError:
             self.restore()
             raise
@@ -172,12 +173,12 @@ class UnitedProblem:
     def commit(self) -> None:
         """Keep the present displacement and contact state."""
         self._last, self.committed = self.committed, np.array(self.u.x.array)
-        self._largest_forces = max(self._largest_forces, self.system.residual.norm())
+        self._largest_forces = max(self._largest_forces, self.forces.residual.norm())
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
-        for pair in self.system.pairs:
+        for pair in self.pairs:
             pair.commit()
             pair.project()
 
@@ -188,7 +189,7 @@ class UnitedProblem:
             material.update()
         if self.dynamics is not None:
             self.dynamics.restore()
-        for pair in self.system.pairs:
+        for pair in self.pairs:
             pair.restore()
             pair.project()
 
@@ -209,7 +210,7 @@ class UnitedProblem:
 
         def collect() -> None:
             before.x.array[:] = self._last
-            known = self.system.keep_stiffness(stiffness)
+            known = self.forces.to_checkpoint(stiffness)
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
             state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
@@ -219,7 +220,7 @@ class UnitedProblem:
         def restore() -> None:
             self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
             self._largest_forces = state.numbers["largest forces"]
-            self.system.recall_stiffness(stiffness if state.numbers["stiffness known"] else None)
+            self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             if self.dynamics is not None:
                 self.dynamics.resume(state.numbers)
 
@@ -233,28 +234,26 @@ class UnitedProblem:
         Args:
             tag: entities of any dimension; components without Dirichlet condition count as zero.
         """
-        self.system.assemble_residual()
+        self.forces.assemble()
         nodes, shape = surface_nodes(self.config, tag), (-1, self.config.gdim)
-        force = self.system.residual.array_r.reshape(shape)[nodes]
+        force = self.forces.residual.array_r.reshape(shape)[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(shape)[nodes]
-        return np.sum(self.comm.allgather(np.where(self.system.free[nodes], 0.0, force).sum(axis=0)), axis=0)
+        return np.sum(self.comm.allgather(np.where(self.forces.free[nodes], 0.0, force).sum(axis=0)), axis=0)
 
-    def _deformation(self, du: np.ndarray) -> np.ndarray:
-        """What an increment of the displacement holds besides rigid motions of bodies that only contact holds (collective)."""
-        floating = self.system.floating
-        if floating is None:
-            return du
-        n, g = self.config.n_owned, self.config.gdim
-        rest = fem.Function(self.config.V)
-        rest.x.array[: n * g] = du[: n * g] - floating.part(floating.every_motion, du[: n * g].reshape(n, g)).ravel()
-        rest.x.scatter_forward()
-        return np.asarray(rest.x.array)
+    @property
+    def pairs(self) -> list[ContactPair]:
+        """Contactors and targets of the contacts."""
+        return [contact.pair for contact in self.contacts]
 
     def _predict(self, ratio: float) -> None:
         """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
-        self.u.x.array[:] = self.committed + RIM * ratio * self._deformation(self.committed - self._last)
-        for pair in self.system.pairs:
+        n = self.config.n_owned * self.config.gdim
+        ahead = fem.Function(self.config.V)
+        ahead.x.array[:n] = self.system.deformation((self.committed - self._last)[:n])
+        ahead.x.scatter_forward()
+        self.u.x.array[:] = self.committed + RIM * ratio * ahead.x.array
+        for pair in self.pairs:
             pair.project()
             pair.predict(ratio)
         self.u.x.array[:] = self.committed

@@ -290,7 +290,7 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     set_load(problem, problem.dynamics.time + length)
     problem.dynamics.begin(length)
     iterations = problem.attempt()
-    check_tunnelling(problem.system, problem.committed)
+    check_tunnelling(problem.config, problem.pairs, problem.committed)
     return iterations
 
 

@@ -8,12 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.errors import TunnellingError
-from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import agree
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.pair import ContactPair
-    from uem_dolfinx.solve.system import BodySystem
+    from uem_dolfinx.geometry.configuration import Configuration
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
 PASSING = 0.1
@@ -21,28 +20,26 @@ PASSING = 0.1
 MOST_LOOKS = 256
 
 
-def check_tunnelling(system: BodySystem, start: npt.NDArray[np.float64]) -> None:
+def check_tunnelling(config: Configuration, pairs: list[ContactPair], start: npt.NDArray[np.float64]) -> None:
     """Refuse a step within which a contactor went through a target (collective).
 
     One that touches at the end must have come from in front of the facet it touches. Of one that does not, the straight way is looked
     at in pieces no longer than the target's stride; most steps are shorter than that and are not looked at.
 
     Args:
-        system: at the end of the step.
+        config: configuration of the displacement at the end of the step.
+        pairs: of all contacts.
         start: displacement at its beginning ``(n_local incl. ghosts,)``.
 
     Raises:
         TunnellingError: naming the deepest such contactor of the first rank that has one.
     """
-    u, config = system.u.x.array, system.config
+    u = config.u.x.array
     end = np.array(u)
     way = np.linalg.norm((end - start).reshape(-1, config.gdim), axis=1)
-    for pair in system.pairs:
+    for pair in pairs:
         target, stride = pair.target, pair.target.stride
-        moves = [
-            way[pair.nodes].max(initial=0.0),
-            way[target.facets.dofs].max(initial=0.0) if isinstance(target, MeshTarget) else 0.0,
-        ]
+        moves = [way[pair.nodes].max(initial=0.0), way[target.dofs].max(initial=0.0)]
         new = pair.trial.active & ~pair.committed.active
         *moves, touches = np.max(config.comm.allgather([*moves, float(new.any())]), axis=0)
         looks = np.ceil(sum(moves) / stride)

@@ -1,0 +1,137 @@
+"""The seam of contact: a coupling ties contactors to one target, and says so in uniting equations.
+
+A pair asks its coupling, state by state, for gaps, for equations with the contactor and the kind of each, for contact forces from the
+equations' multipliers, and for the curvature of the contact. It never asks how they come about, so that nodes against facets, control
+gaps of quadratic surfaces, or integrals over segments differ in nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from uem_dolfinx.algebra.equations import UnitingEquations
+    from uem_dolfinx.contact.state import PairState
+    from uem_dolfinx.geometry.projection import Projection, Target
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+#: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
+NORMAL = 0
+
+
+@dataclass(frozen=True)
+class LabelledEquations:
+    """Uniting equations of one pair, each with its contactor and kind.
+
+    Attributes:
+        trial: rows of P: how contactors move, ``du = P dq + c``.
+        test: rows of Q: how contact forces are handed on, ``Q'r = 0``; the same object unless the two differ. Equations of both are
+            in the same order and eliminate the same nodes.
+        contactor: place of each equation's contactor among the pair's ``(m,)``.
+        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
+    """
+
+    trial: UnitingEquations
+    test: UnitingEquations
+    contactor: Ints
+    kind: Ints
+
+    def __len__(self) -> int:
+        return len(self.contactor)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where contactors stand relative to their target, in one state and at one displacement.
+
+    Attributes:
+        projection: of the contactors; those that a corner holds are in the corner.
+        gap: that decides on contact ``(n,)``: the nodal gap, or the control gap on a quadratic surface.
+        target_moves: whether the target can move along the normal ``(n,)``; None where no contactor is prescribed.
+        details: what else the coupling keeps of it.
+    """
+
+    projection: Projection
+    gap: Array
+    target_moves: Bools | None
+    details: Any
+
+
+class Coupling(Protocol):
+    """Ties contactors to a target. States are handed in and out; nothing of them is kept."""
+
+    target: Target
+
+    @property
+    def followed(self) -> npt.NDArray[np.int32]:
+        """Local nodes that contactors may follow, repeated or not ``(k,)``."""
+
+    @property
+    def chained(self) -> bool:
+        """Whether contactors may follow each other."""
+
+    @property
+    def prescribed(self) -> bool:
+        """Whether any contactor on any rank has a Dirichlet condition."""
+
+    def with_nodal_gaps(self) -> Coupling:
+        """The same contactors and target with nodal gaps, for methods that push nodes."""
+
+    def place(self, points: Array, state: PairState) -> Placement:
+        """Project contactors at ``points (n, gdim)`` (collective)."""
+
+    def place_again(self, placement: Placement, points: Array, state: PairState) -> Placement:
+        """The placement at the same points in another state (collective)."""
+
+    def with_active(self, placement: Placement, state: PairState) -> Placement:
+        """The placement in a state of which only the active set is another (collective)."""
+
+    def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
+        """The placement after the normal return to ``points``, which left the nodal gaps ``gap (n,)`` (collective)."""
+
+    def off(self, placement: Placement, state: PairState) -> Bools:
+        """Contactors that have slid past an end of the target ``(n,)``."""
+
+    def movable(self, placement: Placement) -> Bools:
+        """Contactors whose gap can be closed, for all the Dirichlet conditions on both sides ``(n,)``."""
+
+    def change_facets(
+        self, placement: Placement, points: Array, state: PairState, trusted: bool
+    ) -> tuple[Placement, PairState, bool]:
+        """Follow contactors across bends and corners, if forces can be ``trusted``: whether equations change here (collective)."""
+
+    def return_vectors(self, placement: Placement, points: Array, state: PairState) -> Array:
+        """Displacements that put the active contactors back onto the target [UEM, 4.2], zero for others ``(n, gdim)``."""
+
+    def near(self, placement: Placement, state: PairState) -> Bools:
+        """Contactors so near that a row in the sparsity of P pays ``(n,)``."""
+
+    def approach(self, placement: Placement, which: Ints) -> UnitingEquations:
+        """The equations that the contactors ``which (k,)`` would have if they were active."""
+
+    def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:
+        """Uniting equations of the contactors ``which (k,)``; those of inactive ones only keep their place."""
+
+    def forces(
+        self, placement: Placement, state: PairState, equations: LabelledEquations, multipliers: Array
+    ) -> tuple[Array, Array, Array]:
+        """``lam``, ``nodal`` and ``force`` of a state from the multipliers of its equations ``(m,)`` (collective)."""
+
+    def nodal_forces(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
+        """The state's contact forces at nodes of both bodies: global nodes, repeated or not ``(k,)``, and forces ``(k, gdim)``."""
+
+    def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
+        """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)``, values ``(k, (1 + nn) gdim, (1 + nn) gdim)``."""
+
+    def areas(self, placement: Placement, areas: Array) -> Array:
+        """What ``lam`` is an integral of the pressure over, from the integrals of the shape functions ``(n,)`` (collective)."""
+
+    def commit(self) -> None:
+        """A step has been kept."""

@@ -1,0 +1,195 @@
+"""What the bodies do without contact: forces and tangent of the UFL residual, Dirichlet conditions, materials with history, inertia."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.solve.tangent import Inversions, Tangent
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.geometry.configuration import Configuration
+    from uem_dolfinx.materials.elastic import HistoryMaterial
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+#: Multiple of the rounding of K u that the residual may be left with.
+#: [derived; rounding of K u; test_body_forces.py::test_rounding_of_forces]
+FORCE_ROUNDING = 4.0 * np.finfo(float).eps
+#: Dirichlet values are met if they are to this part of the largest.
+#: [derived; the largest prescribed value; test_body_forces.py::test_dirichlet_values_are_met]
+VALUE_ROUNDING = 4.0 * np.finfo(float).eps
+
+
+class BodyForces:
+    """Bodies in statics and dynamics, before contact.
+
+    Args:
+        config: configuration of the displacement.
+        F: UFL residual, damping included.
+        bcs: Dirichlet conditions.
+        materials: with history, whose stresses are brought up to date before the residual is assembled.
+        dynamics: inertia, or None in statics.
+        check_inversion: whether to look for cells turned inside out; None does so unless K is constant.
+
+    Attributes:
+        free: components without Dirichlet condition ``(n_local, gdim)``.
+        wanted: displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
+        tangent: K.
+        stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, by which forces are told from rounding; None until known.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        F: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        *,
+        materials: Sequence[HistoryMaterial] = (),
+        dynamics: Dynamics | None = None,
+        check_inversion: bool | None = None,
+    ):
+        self.config, self.comm, self.u, self.bcs = config, config.comm, config.u, list(bcs)
+        self.materials, self.dynamics = list(materials), dynamics
+        self.tangent = Tangent(F, self.u, self.materials, dynamics)
+        with compiling("the residual"):
+            self._F = compat.form(F)
+        self._b = compat.create_vector(config.V)
+        self._u = compat.petsc_vector(self.u)
+        free = np.ones(config.n_local * config.gdim, dtype=bool)
+        for bc in self.bcs:
+            free[compat.bc_dofs(bc)[0]] = False
+        self.free: Bools = free.reshape(-1, config.gdim)
+        self.wanted: Array = np.array(config.displacement)
+        self.stiffness: Array | None = None
+        check = not self.tangent.linear if check_inversion is None else check_inversion
+        self._inversions = Inversions(config) if check else None
+
+    # -- forces --------------------------------------------------------------------------------------------------------
+
+    def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
+        """A vector with the displacement's layout and these values at the owned components, or zeros."""
+        v = PETSc.Vec().createMPI(self._b.getSizes(), bsize=self.config.gdim, comm=self.comm)
+        if values is not None:
+            v.array[:] = np.ravel(values)
+        return v
+
+    def assemble(self) -> bool:
+        """Residual ``F(u)`` at the present displacement: whether it is finite on all ranks (collective)."""
+        try:
+            for material in self.materials:
+                material.update()
+        except NotFiniteError:
+            return False
+        with timed("assemble residual"):
+            forms.assemble_vector(self._b, self._F)
+            if self.dynamics is not None:
+                self._b.array[:] += self.dynamics.load().array_r
+        return bool(np.isfinite(self._b.norm()))
+
+    @property
+    def residual(self) -> PETSc.Vec:
+        """Owned part of the assembled residual, internal minus external forces."""
+        return self.vector(self._b.array_r)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the forces are linear in the displacement."""
+        return self.tangent.linear and not self.materials
+
+    def update_tangent(self) -> PETSc.Mat:
+        """K at the present displacement, and its diagonal (collective)."""
+        self.tangent.update()
+        diagonal = self.tangent.K.getDiagonal()
+        self.stiffness = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
+        diagonal.destroy()
+        return self.tangent.K
+
+    def rounding(self, positioned: npt.NDArray[np.integer]) -> float:
+        """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).
+
+        Args:
+            positioned: owned nodes whose position counts, not their displacement alone; repeated ones count repeatedly.
+        """
+        if self.stiffness is None:
+            return 0.0
+        rounded = np.abs(self.config.displacement[: self.config.n_owned])
+        np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
+        return float(FORCE_ROUNDING * self.vector(rounded * self.stiffness).norm())
+
+    def strain_rounding(self) -> float:
+        """Norm of the forces that rounding of ``1 + grad(u)`` can make (collective)."""
+        return (
+            0.0 if self.stiffness is None else float(np.finfo(float).eps * self.vector(self.stiffness).norm() * self.config.size)
+        )
+
+    # -- Dirichlet conditions ------------------------------------------------------------------------------------------
+
+    @property
+    def prescribed(self) -> Array:
+        """Increments that the Dirichlet conditions ask for at the owned nodes, zero where free ``(n_owned, gdim)``."""
+        return np.where(self.free, 0.0, self.wanted - self.config.displacement)[: self.config.n_owned]
+
+    def dirichlet_met(self) -> bool:
+        """Whether the Dirichlet values are there (collective)."""
+        held = ~self.free
+        short = np.abs(self.wanted - self.config.displacement)[held].max(initial=0.0)
+        both = np.array([short, np.abs(self.wanted[held]).max(initial=0.0)])
+        self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
+        return bool(both[0] <= VALUE_ROUNDING * both[1])
+
+    # -- displacement --------------------------------------------------------------------------------------------------
+
+    def check_displacement(self) -> None:
+        """Refuse a displacement that is not finite (collective).
+
+        Raises:
+            NotFiniteError: if it is not.
+        """
+        if not np.isfinite(self._u.norm()):
+            raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the present displacement."""
+        return self.vector(self._u.array_r)
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set the displacement to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""
+        self._u.array[:] = start.array_r + length * du.array_r
+        if length == 1.0:
+            held = ~self.free[: self.config.n_owned]
+            self.config.displacement[: self.config.n_owned][held] = self.wanted[: self.config.n_owned][held]
+        self.u.x.scatter_forward()
+
+    def inverted(self) -> str | None:
+        """Where a cell is inside out, if one is (collective)."""
+        return self._inversions.find() if self._inversions is not None else None
+
+    # -- checkpoints ---------------------------------------------------------------------------------------------------
+
+    def to_checkpoint(self, u: fem.Function) -> bool:
+        """Write the diagonal of K into a Function: whether it is known yet (collective)."""
+        if self.stiffness is None:
+            return False
+        u.x.array[: self.stiffness.size] = self.stiffness.ravel()
+        u.x.scatter_forward()
+        return True
+
+    def from_checkpoint(self, u: fem.Function | None) -> None:
+        """Go on from a diagonal of K that was kept, None if none was known."""
+        n = self.config.n_owned * self.config.gdim
+        self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.gdim)
