@@ -23,7 +23,9 @@ import hypothesis
 import numpy as np
 import pytest
 
-pytest.register_assert_rewrite("helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "restart_scenes")
+pytest.register_assert_rewrite(
+    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "restart_scenes", "resting_scenes"
+)
 from helpers import complementary, highest
 
 import uem_dolfinx as uem
