@@ -6,6 +6,10 @@ action = reaction.
 
 from __future__ import annotations
 
+import atexit
+import json
+import os
+import shutil
 import sys
 import tempfile
 import time
@@ -18,17 +22,36 @@ from mpi4py import MPI
 import hypothesis
 import numpy as np
 import pytest
+
+pytest.register_assert_rewrite(
+    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "restart_scenes", "resting_scenes"
+)
 from helpers import complementary, highest
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.solve.system import BodySystem
 
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # where two workers need a form at once the second waits for the compiler of the first, and longer than DOLFINx's 10 s
+    _settings = Path(tempfile.mkdtemp())
+    (_settings / "dolfinx").mkdir()
+    for _name in ("dolfinx_jit_parameters.json", "dolfinx_jit_options.json"):
+        (_settings / "dolfinx" / _name).write_text(json.dumps({"timeout": 240}))
+    os.environ["XDG_CONFIG_HOME"] = str(_settings)
+    atexit.register(shutil.rmtree, _settings, ignore_errors=True)
+
 hypothesis.settings.register_profile("ranks", deadline=None, derandomize=True, database=None, max_examples=25)
 hypothesis.settings.load_profile("ranks")
 
 
 _MEETING = MPI.COMM_WORLD.Dup()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Tests run side by side on all cores, under mpirun on its ranks alone."""
+    return 0 if MPI.COMM_WORLD.size > 1 else len(os.sched_getaffinity(0))
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra import linear_solver
 from uem_dolfinx.parallel import agree
 
 COMM = MPI.COMM_WORLD
@@ -268,7 +269,7 @@ def test_prescribed_normal_of_a_contactor(target):
     [("hypre", {"pc_type": "hypre"}), ("mumps", {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"})],
 )
 def test_missing_backend(monkeypatch, backend, options):
-    monkeypatch.setattr(compat, f"has_{backend}", lambda: False)
+    monkeypatch.setattr(linear_solver, f"has_{backend}", lambda: False)
     b = blocks(COMM, "triangle", 2, 2)
     error = on_every_rank(
         uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options)
@@ -279,7 +280,7 @@ def test_missing_backend(monkeypatch, backend, options):
 def test_without_backends_a_default_is_found(monkeypatch):
     """Without MUMPS and hypre the default options still solve."""
     for backend in ("hypre", "mumps"):
-        monkeypatch.setattr(compat, f"has_{backend}", lambda: False)
+        monkeypatch.setattr(linear_solver, f"has_{backend}", lambda: False)
     if COMM.size > 1:
         monkeypatch.setattr("uem_dolfinx.algebra.linear_solver.DIRECT_UP_TO", {2: 0, 3: 0})
     b = blocks(COMM, "triangle", 2, 4)

@@ -124,7 +124,7 @@ def test_two_pass_of_pressed_discs():
         bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.03])]
         run(uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=contacts))
         forces.append(sum(sign * c.resultant().force[1] for sign, c in zip((1, -1), contacts)))
-    assert forces[0] == pytest.approx(forces[1], rel=0.05)
+    assert forces[0] == pytest.approx(forces[1], rel=1e-9)
 
 
 # -- prescribed contactors -------------------------------------------------------------------------------------------------

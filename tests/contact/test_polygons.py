@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import arch, at, blocks, box, clamp, complementary, highest, linear, lowest, modulus, run, scene, st_venant
+from helpers import arch, at, blocks, box, clamp, complementary, highest, linear, modulus, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -58,7 +58,7 @@ def test_sliding_along_a_polygon(cell, height, normals):
     touched, facets = [], set()
     for step in uem.load_steps(problem, 16):
         # averaged normals are no gradient of the gap, so that Newton is linear with them
-        assert step.cuts == 0 and step.newton_iterations <= (25 if normals == "facet" else 30)
+        assert step.cuts == 0 and step.newton_iterations <= (12 if normals == "facet" else 20)
         complementary(contact, 1e-12, 1e-10)
         touched.append(contact.n_active)
         facets |= {int(f) for part in COMM.allgather(contact.pair.projection.facet[contact.pair.trial.active]) for f in part}
@@ -91,7 +91,7 @@ def test_sliding_off_the_end(normals):
 
 
 @pytest.mark.parametrize("normals", ["facet", "averaged"])
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
 def test_contactor_exactly_on_a_vertex(cell, normals):
     """Matching meshes over a roof: every contactor starts on a vertex, the middle ones on a ridge.
 
@@ -113,12 +113,15 @@ def test_contactor_exactly_on_a_vertex(cell, normals):
         contacts=[contact],
     )
     steps = run(problem, 2)
-    assert max(s.newton_iterations for s in steps) <= 12 and not any(s.cuts for s in steps)
+    assert max(s.newton_iterations for s in steps) <= (8 if normals == "facet" else 12) and not any(s.cuts for s in steps)
     complementary(contact, 1e-13, 1e-12)
     u, x = b.scene.gather(b.u), b.scene.drawing
+    sign, lower = np.r_[-1.0, np.ones(b.gdim - 1)], np.arange(len(x)) < len(x) - b.n_high_nodes
     ridge = (np.abs(x[:, 0] - 0.5) < 1e-9) & (np.abs(x[:, -1]) < 1e-9)
-    if cell == "hexahedron" and normals == "averaged":
-        assert np.abs(u[ridge, 0]).max() < 1e-9
+    if cell != "triangle" and normals == "averaged":
+        # triangles have diagonals, and facets' normals no balance on the ridge: all else mirrors itself
+        turned = np.linalg.norm(x[:, None] * sign + (1 - sign) / 2 - x[None], axis=2) + 2 * (lower[:, None] != lower)
+        assert np.abs(u - sign * u[turned.argmin(axis=1)]).max() < 1e-9
     assert u[ridge, -1].max() < -0.005
     assert contact.resultant().force[-1] > 0
 
@@ -171,10 +174,8 @@ def test_tip_in_a_groove(normals, off_centre):
     assert force[1] > 1e-3
     if normals == "facet":
         # the tip rests in the corner: it and the corner are one point, and neither face pulls
-        x = problem.config.X + problem.config.displacement
         place = s.gather(u) + s.drawing
         corner = place[np.linalg.norm(s.drawing - [0.5, 0.0], axis=1).argmin()]
         apex = place[np.linalg.norm(s.drawing - [0.5 + off_centre, 0.05], axis=1).argmin()]
         assert np.abs(corner - apex).max() < 1e-12
         assert abs(force[0]) <= 0.8 * force[1] * (1 + 1e-9)
-        assert lowest(COMM, x) > -2

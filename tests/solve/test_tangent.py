@@ -56,9 +56,9 @@ def test_gap_derivatives_on_a_facet(cell, degree, height):
     p = target.project(points)
     assert np.abs(p.gap - height).max() < 1e-12
 
-    def gradients():
-        now = target.project(points)
-        assert np.array_equal(now.facet, p.facet)
+    def gradients(i=slice(None)):
+        now = target.project(points[i])
+        assert np.array_equal(now.facet, p.facet[i])
         # with respect to the point, then to the facet's nodes
         return now.gap, np.concatenate([now.normal[:, None], -now.weights[:, :, None] * now.normal[:, None]], axis=1)
 
@@ -74,7 +74,7 @@ def test_gap_derivatives_on_a_facet(cell, degree, height):
                     where = (points, i) if k == 0 else (u, f.dofs[p.facet[i], k - 1])
                     before = where[0][where[1], c]
                     where[0][where[1], c] = before + step
-                    values.append([v[i].copy() for v in gradients()])
+                    values.append([v[0].copy() for v in gradients(slice(i, i + 1))])
                     where[0][where[1], c] = before
                 first = (values[0][0] - values[1][0]) / (2 * h)
                 second = (values[0][1] - values[1][1]).ravel() / (2 * h)

@@ -1,0 +1,43 @@
+"""Tables that go on with a run: what is made before the checkpoint is read refuses its first row."""
+
+from __future__ import annotations
+
+import pytest
+from resting_scenes import COMM, Bar
+
+import uem_dolfinx as uem
+
+# ---------------------------------------------------------------------------------------------- tables
+
+
+@pytest.mark.parametrize("kind", ["energy", "history"])
+def test_table_made_before_the_checkpoint_is_read(kind, folder):
+    """It refuses the first row and leaves the file alone; made after the checkpoint was read it goes on."""
+
+    def run(end, early):
+        bar, checkpoint = Bar((0.0, -3.0)), uem.Checkpoint(folder / "run", every=2)
+        if not early:
+            checkpoint.begin(bar.problem.state())
+        path = folder / "table.csv"
+        if kind == "energy":
+            table = uem.EnergyBook(bar.problem, path=path, resume=True)
+        else:
+            table = uem.HistoryWriter(path, bar.problem, resume=True)
+        with table:
+            for step in uem.time_steps(bar.problem, 0.01, end, checkpoint=checkpoint):
+                table.write(step)
+        COMM.barrier()
+
+    def text():
+        COMM.barrier()
+        return (folder / "table.csv").read_text().splitlines()
+
+    run(0.04, early=True)
+    before = text()
+    assert len(before) == 5 + (kind == "energy")
+    with pytest.raises(uem.CheckpointError, match="table.csv was made to go on with before the checkpoint was read"):
+        run(0.06, early=True)
+    assert text() == before
+    run(0.06, early=False)
+    after = text()
+    assert after[: len(before)] == before and len(after) == len(before) + 2

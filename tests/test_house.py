@@ -1,0 +1,190 @@
+"""What the code as a whole keeps to: imports that point one way, short files, versions in one place, thresholds that are told and tested.
+
+The test to read first is ``test_thresholds_are_told``.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import thresholds
+
+REPOSITORY = thresholds.REPOSITORY
+#: Rooms from the ground up; files import only from their own room and from those before it.
+ROOMS = [
+    ("errors", "compat", "log", "parallel", "forms"), ("geometry",), ("algebra",), ("contact",), ("materials", "dynamics"),
+    ("restart",), ("solve",), ("output",),
+]  # fmt: skip
+LONGEST = 450
+#: Names of modules whose versions differ.
+THIRD = {"dolfinx", "fem", "mesh", "io", "gmshio", "geometry", "ufl", "basix", "np", "numpy", "PETSc", "gmsh", "la", "cpp"}
+
+
+def modules(top):
+    """Files of a folder by the name they are imported with."""
+    names = {".".join(p.relative_to(top.parent).with_suffix("").parts).removesuffix(".__init__"): p for p in top.rglob("*.py")}
+    return names
+
+
+def imports(files):
+    """Which of these modules each imports, also within functions and under TYPE_CHECKING."""
+    edges = {}
+    for name, path in files.items():
+        edges[name] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            found = []
+            if isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert not node.level, f"{path}: relative import"
+                found = [f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in files else node.module for a in node.names]
+            edges[name] |= {f for f in found if f in files and f != name}
+    return edges
+
+
+def circles(edges):
+    """Sets of nodes that reach each other."""
+
+    def reach(start):
+        seen, todo = set(), [start]
+        while todo:
+            new = edges.get(todo.pop(), set()) - seen
+            seen |= new
+            todo += new
+        return seen
+
+    far = {node: reach(node) for node in edges}
+    return sorted({tuple(sorted(m for m in far[n] if n in far.get(m, ()))) for n in edges if n in far[n]})
+
+
+def python_files(*tops):
+    return [p for top in tops for p in sorted((REPOSITORY / top).rglob("*.py"))]
+
+
+def package():
+    """Imports among the modules of the package; its front door collects them all."""
+    edges = imports(modules(thresholds.PACKAGE))
+    edges.pop("uem_dolfinx")
+    return {name: {to for to in found if to != "uem_dolfinx"} for name, found in edges.items()}
+
+
+def room(module):
+    """Folder of a module, or the module itself where it is in none."""
+    return module.split(".")[1]
+
+
+def test_circles_are_seen():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [("a", "b", "c")]
+    assert circles({"a": {"b"}, "b": set()}) == []
+
+
+def test_no_circle_of_imports_between_files():
+    assert circles(package()) == []
+    assert circles(imports(modules(REPOSITORY / "demos" / "evidence"))) == []
+
+
+def test_no_circle_of_imports_between_rooms():
+    rooms = {}
+    for name, found in package().items():
+        rooms.setdefault(room(name), set()).update(room(to) for to in found if room(to) != room(name))
+    assert circles(rooms) == []
+
+
+def test_imports_point_one_way():
+    """A room knows only those before it."""
+    floor = {name: k for k, names in enumerate(ROOMS) for name in names}
+    edges = package()
+    assert {room(name) for name in edges} == set(floor)
+    assert [(a, b) for a, found in edges.items() for b in found if floor[room(b)] > floor[room(a)]] == []
+
+
+def test_tests_do_not_import_from_each_other():
+    for path in python_files("tests"):
+        assert not re.search(r"^\s*(from|import) test_", path.read_text(encoding="utf-8"), re.M), path
+
+
+def test_names_of_test_files_are_unique():
+    names = Counter(path.name for path in python_files("tests"))
+    assert max(names.values()) == 1, names.most_common(3)
+
+
+@pytest.mark.parametrize("top", ["uem_dolfinx", "demos", "tests"])
+def test_files_are_short(top):
+    lengths = {
+        path.relative_to(REPOSITORY).as_posix(): path.read_text(encoding="utf-8").count("\n") for path in python_files(top)
+    }
+    assert {path: n for path, n in lengths.items() if n > LONGEST} == {}
+
+
+def asks_for_a_version(node):
+    """Whether a piece of code depends on the version of another package or of Python."""
+    if isinstance(node, ast.Attribute):
+        return node.attr in ("__version__", "version_info") or node.attr == "DOLFINX_VERSION"
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("hasattr", "getattr"):
+        return isinstance(node.args[0], ast.Name) and node.args[0].id in THIRD
+    if isinstance(node, ast.ExceptHandler):
+        return isinstance(node.type, ast.Name) and node.type.id == "AttributeError"
+    return isinstance(node, ast.alias) and node.name == "DOLFINX_VERSION"
+
+
+def test_versions_are_asked_for_in_compat_alone():
+    """Nowhere else in the package, the demos and the tests; what was measured where is told by ``demos/evidence/measure.py``."""
+    asking = set()
+    for path in python_files("uem_dolfinx", "demos", "tests"):
+        if any(map(asks_for_a_version, ast.walk(ast.parse(path.read_text(encoding="utf-8"))))):
+            asking.add(path.relative_to(REPOSITORY).as_posix())
+    assert asking - {"demos/evidence/measure.py"} == {"uem_dolfinx/compat.py"}
+
+
+# -- thresholds ------------------------------------------------------------------------------------------------------------
+
+ALL = list(thresholds.thresholds())
+
+
+def test_numbers_are_seen():
+    """What counts as a number, and that the constants of the code are found."""
+    for text in (
+        "1e-9",
+        "-3",
+        "4.0 * np.finfo(float).eps",
+        "1 / 1024",
+        "{2: 300_000, 3: 30_000}",
+        "2**30",
+        "128 + signal.SIGTERM",
+    ):
+        assert thresholds.is_number(ast.parse(text, mode="eval").body), text
+    for text in ("'a'", "True", "('a', 1)", "{'a': 1}", "np.array([1.0])", "TypeVar('T')", "{1: 2, 2: 3}"):
+        assert not thresholds.is_number(ast.parse(text, mode="eval").body), text
+    assert len(ALL) > 30
+
+
+@pytest.mark.parametrize("threshold", ALL, ids=lambda t: f"{t.module}-{t.name}")
+def test_thresholds_are_told(threshold):
+    """Each says what it does, of which kind it is and on which scale; what is derived or a convention has a test that brackets it."""
+    where = f"{threshold.module}: {threshold.name}"
+    assert threshold.kind in thresholds.KINDS, f"{where}: expected the comment to end in [KIND; SCALE; TEST]"
+    assert threshold.what and threshold.scale, where
+    if threshold.test == "-":
+        assert threshold.kind not in thresholds.TESTED, f"{where}: expected a test that brackets it"
+        return
+    file, _, name = threshold.test.partition("::")
+    found = [path for path in python_files("tests") if path.name == Path(file).name]
+    assert found, f"{where}: no file {file} in tests"
+    assert re.search(rf"^def {re.escape(name)}\(", found[0].read_text(encoding="utf-8"), re.M), (
+        f"{where}: no test {threshold.test}"
+    )
+
+
+def test_names_of_thresholds_are_unique():
+    names = Counter(t.name for t in ALL)
+    assert [name for name, n in names.items() if n > 1] == []
+
+
+def test_table_in_the_readme_is_that_of_the_code():
+    """After a change of a threshold: ``python3 tests/thresholds.py``."""
+    text = thresholds.README.read_text(encoding="utf-8")
+    assert text == thresholds.with_table(text)
