@@ -422,18 +422,18 @@ class ContactPair:
         if self._facet_changes is not None:
             self._facet_changes.corners = None
 
-    def keep(self) -> dict[str, npt.NDArray[Any]]:
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
         kept: dict[str, npt.NDArray[Any]] = {"reserved": self._reserved, "redundant": self.redundant}
         for when, state in (("committed", self.committed), ("last", self.last_commit)):
-            kept |= {f"{when}_{name}": array for name, array in state.keep(self.target).items()}
+            kept |= {f"{when}_{name}": array for name, array in state.to_checkpoint(self.target).items()}
         return kept
 
-    def recall(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what ``keep`` returned, to be followed by ``project`` (collective)."""
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
 
         def state(when: str) -> PairState:
-            return PairState.recall({f.name: kept[f"{when}_{f.name}"] for f in fields(PairState)}, self.target)
+            return PairState.from_checkpoint({f.name: kept[f"{when}_{f.name}"] for f in fields(PairState)}, self.target)
 
         self._reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
         self.committed, self.last_commit = state("committed"), state("last")

@@ -73,7 +73,7 @@ class PairState:
             passed=np.zeros(n, bool),
         )
 
-    def keep(self, target: Target) -> dict[str, npt.NDArray[Any]]:
+    def to_checkpoint(self, target: Target) -> dict[str, npt.NDArray[Any]]:
         """The attributes by name, facets of a mesh by what tells them in any partition (collective)."""
         kept = {f.name: getattr(self, f.name) for f in fields(self)}
         if isinstance(target, MeshTarget):
@@ -82,8 +82,8 @@ class PairState:
         return kept
 
     @classmethod
-    def recall(cls, kept: Mapping[str, npt.NDArray[Any]], target: Target) -> PairState:
-        """The state of which ``keep`` returned these arrays (collective)."""
+    def from_checkpoint(cls, kept: Mapping[str, npt.NDArray[Any]], target: Target) -> PairState:
+        """The state of which ``to_checkpoint`` returned these arrays (collective)."""
         arrays = {name: np.array(array) for name, array in kept.items()}
         if isinstance(target, MeshTarget):
             for name in FACETS:

@@ -1,6 +1,6 @@
 """Pictures of 2D scenes, of pressure profiles and of whatever else is drawn into their panels.
 
-Last step on the data's way; it reads a solved problem and changes nothing.
+They read a solved problem and change nothing.
 """
 
 from __future__ import annotations

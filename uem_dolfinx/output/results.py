@@ -1,6 +1,6 @@
 """Results to keep: files for ParaView and a history in CSV.
 
-Tenth step on the data's way; it reads a solved problem and changes nothing.
+Writers read a solved problem and change nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.log import timed
 from uem_dolfinx.output.tables import CsvTable
-from uem_dolfinx.solve.steps import LoadStep, TimeStep
+from uem_dolfinx.solve.load_steps import LoadStep
+from uem_dolfinx.solve.time_steps import TimeStep
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

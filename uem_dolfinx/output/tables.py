@@ -1,7 +1,4 @@
-"""Tables in CSV files: one row per step, complete after every row, and continued where a run is resumed.
-
-A part of the tenth step on the data's way.
-"""
+"""Tables in CSV files: one row per step, complete after every row, and continued where a run is resumed."""
 
 from __future__ import annotations
 

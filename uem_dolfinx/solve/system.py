@@ -122,7 +122,7 @@ class BodySystem:
         self._find_mutual(self.pairs)
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
         if self.dynamics is not None:
-            self.dynamics.weigh(np.unique(contactors))
+            self.dynamics.make_contactors_massless(np.unique(contactors))
         if self.pairs:
             free, finite = self.free[: self.config.n_owned], not self.tangent.linear
             self.floating = self._floating[False] = find_floating(self.config, free, finite)
@@ -370,7 +370,7 @@ class BodySystem:
         self._factored = None
         self.solver.forget()
 
-    def keep_stiffness(self, u: fem.Function) -> bool:
+    def to_checkpoint(self, u: fem.Function) -> bool:
         """Write the diagonal of K, by which forces are told from rounding, into a Function; whether it is known yet (collective)."""
         if self._stiffness is None:
             return False
@@ -378,7 +378,7 @@ class BodySystem:
         u.x.scatter_forward()
         return True
 
-    def recall_stiffness(self, u: fem.Function | None) -> None:
+    def from_checkpoint(self, u: fem.Function | None) -> None:
         """Go on from a diagonal of K that was kept, None if none was known."""
         self._stiffness = None
         if u is not None:
