@@ -58,6 +58,7 @@ class Dynamics:
         time: of the committed state.
         start: time at the start.
         accelerated: whether the acceleration fits the forces yet.
+        moving: whether a step has begun that is neither kept nor left.
         massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
         resumed: how often a checkpoint has been read into them.
     """
@@ -123,7 +124,7 @@ class Dynamics:
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
-        self._moving = False
+        self.moving = False
         #: Virtual work of the damping forces.
         self.damping_form: ufl.Form | None = None
         if self.damping is not None:
@@ -179,7 +180,7 @@ class Dynamics:
         """Begin a step of length ``dt`` from the committed state."""
         s = self.scheme
         u, v, a = self._u, self._velocity, self._acceleration
-        self._until, self._moving = self.time + dt, True
+        self._until, self.moving = self.time + dt, True
         # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
         self._a_rate = 1.0 / (s.beta * dt**2)
         self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
@@ -192,12 +193,12 @@ class Dynamics:
 
     def restore(self) -> None:
         """Leave a step that has begun; the forces are those of the committed state again."""
-        self._until, self._moving = self.time, False
+        self._until, self.moving = self.time, False
 
     @timed("inertia forces")
     def load(self) -> PETSc.Vec:
         """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
-        load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
+        load = self._inertia() if self.moving else self._like(self.forces.x.array[: self._n])
         load.axpy(-1.0, self._weight)
         return load
 
@@ -267,7 +268,7 @@ class Dynamics:
 
     def commit(self) -> None:
         """Keep velocity and acceleration that belong to the present displacement."""
-        if self._moving:
+        if self.moving:
             n, dt = self._n, self._until - self.time
             du, massy = self._increment[:n], self.massy.ravel()
             self.forces.x.array[:n] = self._inertia().array_r
@@ -276,18 +277,13 @@ class Dynamics:
             self.velocity.x.array[:n] = np.where(massy, self._v_rate * du + self._v_past[:n], du / dt)
             for field in (self.forces, self.acceleration, self.velocity):
                 field.x.scatter_forward()
-            self.time, self._moving = self._until, False
+            self.time, self.moving = self._until, False
         self._copy_committed()
 
     def _copy_committed(self) -> None:
         """Displacement, velocity and acceleration as they are are those at the start of the next step."""
         self._u = np.array(self.config.u.x.array)
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
-
-    @property
-    def moving(self) -> bool:
-        """Whether a step has begun that is neither kept nor left."""
-        return self._moving
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers that a run goes on from beside the Functions, by name."""

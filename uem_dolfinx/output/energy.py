@@ -15,11 +15,10 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
-from uem_dolfinx.output.tables import CsvTable
+from uem_dolfinx.output.tables import Closing, CsvTable
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from types import TracebackType
 
     import ufl
 
@@ -54,7 +53,7 @@ class Energies:
     defect: float
 
 
-class EnergyBook:
+class EnergyBook(Closing):
     """Book of energies and momenta, one row per time step, as a table in a CSV file if wanted.
 
     Columns: those of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... that the
@@ -199,9 +198,3 @@ class EnergyBook:
         """Close the file."""
         if self.table is not None:
             self.table.close()
-
-    def __enter__(self) -> EnergyBook:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

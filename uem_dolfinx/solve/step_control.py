@@ -6,14 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uem_dolfinx.errors import (
-    ConvergenceError,
-    InvertedElementError,
-    LinearSolveError,
-    NotFiniteError,
-    TunnellingError,
-    UEMError,
-)
+from uem_dolfinx import errors
 from uem_dolfinx.log import logger
 
 if TYPE_CHECKING:
@@ -30,12 +23,15 @@ EASY = 6
 REMAINDER = 1e-9
 
 
-class EnergyGivenError(UEMError):
+class EnergyGivenError(errors.UEMError):
     """Contacts have given the bodies energy within a step; never leaves the time stepping."""
 
 
 #: What a shorter step may mend.
-MENDABLE = (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError, EnergyGivenError)
+MENDABLE = (
+    errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
+    errors.TunnellingError, EnergyGivenError,
+)  # fmt: skip
 
 
 class StepControl:
@@ -63,7 +59,7 @@ class StepControl:
         """Length of the next step, where nothing else ends it."""
         return min(self.longest, self.nominal)
 
-    def shorten(self, length: float, error: UEMError) -> bool:
+    def shorten(self, length: float, error: errors.UEMError) -> bool:
         """Halve a step of this length that failed.
 
         Returns:
