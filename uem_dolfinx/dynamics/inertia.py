@@ -86,8 +86,11 @@ class Dynamics:
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.resumed, self.accelerated, self._attached = 0, False, False
+        self.moving = False
         #: Factor of M in the tangent.
         self.factor = 0.0
+        #: Virtual work of the damping forces.
+        self.damping_form: ufl.Form | None = None
 
     # -- set-up ------------------------------------------------------------------------------------------------------
 
@@ -120,13 +123,9 @@ class Dynamics:
         if down.shape != (g,) or not np.isfinite(down).all():
             raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
         self._down = down
-        self._u = np.array(config.u.x.array)
-        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+        self._copy_committed()
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
-        self.moving = False
-        #: Virtual work of the damping forces.
-        self.damping_form: ufl.Form | None = None
         if self.damping is not None:
             self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
             self._past.x.array[:] = self.velocity.x.array

@@ -37,7 +37,7 @@ Bools = npt.NDArray[np.bool_]
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]
 LEAST_ROW_SUM = 0.1
 #: Part of its own mass that a node loses at most when the contactors of its body become massless.
-#: [convention; nodal mass; test_mass.py::test_refused_only_where_impossible]
+#: [convention; nodal mass; test_massless_contactors.py::test_refused_only_where_impossible]
 LARGEST_LOSS = 0.5
 #: Newton's method for the masses of the other nodes ends when the body's moments of mass are met to this part.
 #: [bound; moments of mass; -]

@@ -34,18 +34,18 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 
 #: Version of the file's layout and of the names in it.
-#: [format; -; test_checkpoint.py::test_another_format]
+#: [format; -; test_checkpoint_refused.py::test_another_format]
 FORMAT = 2
 #: What a checkpoint begins with.
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
-#: [format; bytes; test_checkpoint.py::test_damaged_files]
+#: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
 #: Bytes that MPI-IO gets at once, because it counts them in C's int.
 #: [format; bytes; -]
 PIECE = 2**30
 #: Exit status of a run that has ended on SIGTERM, as shells have it.
-#: [format; exit status; test_checkpoint.py::test_terminated]
+#: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
 TERMINATED = 128 + signal.SIGTERM
 
 
