@@ -39,5 +39,6 @@ from uem_dolfinx.output.pictures import figure, outline, plot_pressure, plot_sce
 from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
+from uem_dolfinx.solve.load_steps import LoadStep, load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps import LoadStep, TimeStep, load_steps, time_steps
+from uem_dolfinx.solve.time_steps import TimeStep, time_steps

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import pickle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mpi4py import MPI
 
 Ints = npt.NDArray[np.int64]
@@ -31,6 +34,30 @@ def agree(comm: MPI.Comm, error: Exception | None) -> None:
         error = next((e for e in errors if e is not None), None)
     if error is not None:
         raise error
+
+
+def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
+    """Call a function on every rank; what it raises on one is raised on all (collective).
+
+    Args:
+        comm: the communicator whose ranks have to agree.
+        f: called with ``args``.
+        args: of the function.
+
+    Raises:
+        Exception: the function's own error, on several ranks a RuntimeError with its words if it cannot be sent as it is.
+    """
+    found: Exception | None = None
+    try:
+        f(*args)
+    except Exception as error:
+        found = error
+        if comm.size > 1:
+            try:
+                pickle.loads(pickle.dumps(error))
+            except Exception:
+                found = RuntimeError(f"{type(error).__name__}: {error}")
+    agree(comm, found)
 
 
 def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:

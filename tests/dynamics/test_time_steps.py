@@ -266,9 +266,9 @@ def test_no_step_jumps_through_a_plate():
 
 def test_a_passage_that_no_step_resolves_is_named(monkeypatch):
     """Where steps may not be shortened far enough the error names contact and contactor, and the last good state is kept."""
-    from uem_dolfinx.solve import steps
+    from uem_dolfinx.solve import step_control
 
-    monkeypatch.setattr(steps, "SHORTEST_STEP", 0.9)
+    monkeypatch.setattr(step_control, "SHORTEST_LENGTH", 0.9)
     problem, contact, _ = bullet()
     with pytest.raises(uem.TunnellingError, match="tip on plate: the contactor at .* (passes|touches) .*the target .* a step"):
         list(uem.time_steps(problem, 0.02, 0.06))

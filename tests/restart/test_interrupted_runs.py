@@ -203,7 +203,7 @@ def test_killed(folder):
         assert lines[0] == last + 1
         there = Impact()
         uem.read_checkpoint(path, there.problem.state())
-        last = there.problem.dynamics.number
+        last = there.problem.step_control.number
         assert lines[-1] - 3 <= last <= lines[-1] < n
     process = start(path, 3)
     lines = [int(line) for line in process.stdout.read().split()]
@@ -225,7 +225,7 @@ def test_terminated(folder):
     there = Impact()
     uem.read_checkpoint(path, there.problem.state())
     # the signal may come between a step's end and its print
-    assert lines[-1] <= there.problem.dynamics.number <= lines[-1] + 1 < n
+    assert lines[-1] <= there.problem.step_control.number <= lines[-1] + 1 < n
     process = start(path, 10**6)
     assert int(process.stdout.read().split()[-1]) == n and process.wait() == 0
     assert path.read_bytes() == (alone / "run").read_bytes()

@@ -44,11 +44,10 @@ def test_curvature_without_equations(again):
     """Forces may outlive the last equation by an iteration; the united matrix then holds their curvature all the same."""
     b = blocks(COMM, "triangle", 2, 3)
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)])
-    system, config = problem.system, problem.config
-    free = system.free[: config.n_owned]
+    config = problem.config
+    free = problem.forces.free[: config.n_owned]
     none = Restriction(config, UnitingEquations.join([], config.gdim), free, np.zeros(free.shape))
-    system.tangent.update()
-    K, pair = system.tangent.K, problem.contacts[0].pair
+    K, pair = problem.forces.update_tangent(), problem.contacts[0].pair
     nodes = np.column_stack([config.to_global(pair.nodes), pair.projection.nodes])
     size = nodes.shape[1] * config.gdim
     blocks_of = np.random.default_rng(COMM.rank).normal(size=(len(nodes), size, size))

@@ -1,6 +1,6 @@
 """Inertia: velocities, accelerations and the forces they make, by Newmark's rule or the generalised-alpha method.
 
-It turns a static residual into a dynamic one: the solver adds its forces to the residual and its multiple of M to K.
+They turn a static residual into a dynamic one: the solver adds these forces to the residual and a multiple of M to K.
 """
 
 from __future__ import annotations
@@ -31,6 +31,13 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
+#: Components with less mass than this part of the largest have no acceleration at the start.
+#: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
+MASSLESS = 1e-12
+#: Residual that the first acceleration is solved to.
+#: [bound; forces; -]
+ACCELERATED = 1e-13
+
 
 class Dynamics:
     """What a problem needs to move in time; hand it to ``UnitedProblem`` and step by ``time_steps``.
@@ -50,12 +57,15 @@ class Dynamics:
         acceleration: a Function; zero at components without mass.
         time: of the committed state.
         start: time at the start.
-        number: of steps done.
-        longest: bound on the length of the next step, after steps that had to be cut.
+        accelerated: whether the acceleration fits the forces yet.
+        moving: whether a step has begun that is neither kept nor left.
+        massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
+        resumed: how often a checkpoint has been read into them.
     """
 
     velocity: fem.Function
     acceleration: fem.Function
+    massy: Bools
 
     def __init__(
         self,
@@ -75,16 +85,12 @@ class Dynamics:
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
-        self.number, self.longest = 0, np.inf
-        #: Largest kinetic energy that a step has been judged by.
-        self.largest = 0.0
-        #: How often a checkpoint has been read into them.
-        self.resumed = 0
-        self._attached = False
+        self.resumed, self.accelerated, self._attached = 0, False, False
+        self.moving = False
         #: Factor of M in the tangent.
         self.factor = 0.0
-        #: Whether the acceleration fits the forces yet.
-        self.accelerated = False
+        #: Virtual work of the damping forces.
+        self.damping_form: ufl.Form | None = None
 
     # -- set-up ------------------------------------------------------------------------------------------------------
 
@@ -117,13 +123,9 @@ class Dynamics:
         if down.shape != (g,) or not np.isfinite(down).all():
             raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
         self._down = down
-        self._u = np.array(config.u.x.array)
-        self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
+        self._copy_committed()
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
-        self._moving = False
-        #: Virtual work of the damping forces.
-        self.damping_form: ufl.Form | None = None
         if self.damping is not None:
             self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
             self._past.x.array[:] = self.velocity.x.array
@@ -145,8 +147,11 @@ class Dynamics:
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 
-    def weigh(self, contactors: npt.NDArray[np.int32]) -> None:
-        """Take the mass of the contactors, this rank's nodes ``(n,)``, or warn that they keep it (collective).
+    def make_contactors_massless(self, contactors: npt.NDArray[np.int32]) -> None:
+        """Hand the mass of the contactors on to the nodes around, or warn that they keep it (collective).
+
+        Args:
+            contactors: owned local nodes ``(n,)`` of all contacts.
 
         Raises:
             MassError: if the nodes around cannot carry it.
@@ -160,8 +165,7 @@ class Dynamics:
                 "contactors='massless' avoids both",
                 massy,
             )
-        #: Components that have mass, of the owned nodes ``(n_owned, gdim)``.
-        self.massy: Bools = self.mass.of_nodes > 0
+        self.massy = self.mass.of_nodes > 0
         self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
 
     def _like(self, values: Array) -> PETSc.Vec:
@@ -175,7 +179,7 @@ class Dynamics:
         """Begin a step of length ``dt`` from the committed state."""
         s = self.scheme
         u, v, a = self._u, self._velocity, self._acceleration
-        self._until, self._moving = self.time + dt, True
+        self._until, self.moving = self.time + dt, True
         # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
         self._a_rate = 1.0 / (s.beta * dt**2)
         self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
@@ -188,12 +192,12 @@ class Dynamics:
 
     def restore(self) -> None:
         """Leave a step that has begun; the forces are those of the committed state again."""
-        self._until, self._moving = self.time, False
+        self._until, self.moving = self.time, False
 
     @timed("inertia forces")
     def load(self) -> PETSc.Vec:
         """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
-        load = self._inertia() if self._moving else self._like(self.forces.x.array[: self._n])
+        load = self._inertia() if self.moving else self._like(self.forces.x.array[: self._n])
         load.axpy(-1.0, self._weight)
         return load
 
@@ -236,14 +240,14 @@ class Dynamics:
             M = self.mass.M.PtAP(restriction.P)
         rhs = restriction.reduce(restriction.pass_on(F))
         diagonal = M.getDiagonal()
-        idle = diagonal.array_r <= 1e-12 * diagonal.max()[1]
+        idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
         diagonal.array[idle] = 1.0
         M.setDiagonal(diagonal)
         rhs.array[idle] = 0.0
         ksp = PETSc.KSP().create(self.config.comm)
         ksp.setType("cg")
         ksp.getPC().setType("jacobi")
-        ksp.setTolerances(rtol=1e-13, max_it=10_000)
+        ksp.setTolerances(rtol=ACCELERATED, max_it=10_000)
         ksp.setOperators(M)
         q = rhs.duplicate()
         with timed("first acceleration"):
@@ -263,7 +267,7 @@ class Dynamics:
 
     def commit(self) -> None:
         """Keep velocity and acceleration that belong to the present displacement."""
-        if self._moving:
+        if self.moving:
             n, dt = self._n, self._until - self.time
             du, massy = self._increment[:n], self.massy.ravel()
             self.forces.x.array[:n] = self._inertia().array_r
@@ -272,32 +276,24 @@ class Dynamics:
             self.velocity.x.array[:n] = np.where(massy, self._v_rate * du + self._v_past[:n], du / dt)
             for field in (self.forces, self.acceleration, self.velocity):
                 field.x.scatter_forward()
-            self.time, self._moving = self._until, False
-        self.remember()
+            self.time, self.moving = self._until, False
+        self._copy_committed()
 
-    def remember(self) -> None:
-        """Take displacement, velocity and acceleration as they are for the start of the next step."""
+    def _copy_committed(self) -> None:
+        """Displacement, velocity and acceleration as they are are those at the start of the next step."""
         self._u = np.array(self.config.u.x.array)
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
 
-    @property
-    def moving(self) -> bool:
-        """Whether a step has begun that is neither kept nor left."""
-        return self._moving
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Numbers that a run goes on from beside the Functions, by name."""
+        return {"time": self.time, "start": self.start, "accelerated": self.accelerated}
 
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What a checkpoint keeps beside the Functions."""
-        names = ("time", "start", "number", "longest", "accelerated", "largest")
-        return {name: getattr(self, name) for name in names}
-
-    def resume(self, numbers: dict[str, Any]) -> None:
-        """Go on from the Functions as they are and the numbers of a checkpoint."""
-        for name in self.numbers:
-            setattr(self, name, numbers[name])
+    def from_checkpoint(self, kept: dict[str, Any]) -> None:
+        """Go on from the Functions as they are and what ``to_checkpoint`` returned; other numbers may stand beside it."""
+        self.time, self.start, self.accelerated = (kept[name] for name in self.to_checkpoint())
         self.resumed += 1
         self.restore()
-        self.remember()
+        self._copy_committed()
 
     def weight(self) -> PETSc.Vec:
         """Forces of gravity."""

@@ -1,6 +1,6 @@
-"""Mass of the bodies, and bodies whose contactors are massless, so that impact itself takes no energy [UEM].
+"""Mass of the bodies, and bodies whose contactors are massless, so that impact itself loses no energy [UEM, 5].
 
-Between surfaces and the equations of motion on the data's way: a density or nodal masses become a matrix with the layout of K.
+A density or nodal masses become a matrix with the layout of K.
 """
 
 from __future__ import annotations
@@ -34,15 +34,26 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 #: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
-POSITIVE = 0.1
-#: Part of its own mass that a node gives up at most when the contactors of its body become massless.
-TAKEN = 0.5
-#: Parts of a body's moments of mass to which they are to be kept, and to which they have to be.
-ROUNDING, REQUIRED = 1e-14, 1e-10
+#: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]
+LEAST_ROW_SUM = 0.1
+#: Part of its own mass that a node loses at most when the contactors of its body become massless.
+#: [convention; nodal mass; test_massless_contactors.py::test_refused_only_where_impossible]
+LARGEST_LOSS = 0.5
+#: Newton's method for the masses of the other nodes ends when the body's moments of mass are met to this part.
+#: [bound; moments of mass; -]
+MOMENTS_MET = 1e-14
+#: Part of a body's moments of mass to which they have to be kept.
+#: [convention; moments of mass; test_thresholds_motion.py::test_moments_of_a_thin_body]
+MOMENTS_KEPT = 1e-10
 #: When coordinates are scaled, a body spreads in every direction by this part of its largest spread at least.
+#: [convention; largest spread; test_thresholds_motion.py::test_moments_of_a_thin_body]
 THIN = 1e-4
-#: Bounds on the iterations that find where the contactors' mass goes, and on the halvings of each step.
-MOST_ITERATIONS, MOST_HALVINGS = 60, 20
+#: Steps of that method.
+#: [bound; steps; -]
+MOST_ITERATIONS = 60
+#: Halvings of each of them.
+#: [bound; halvings; -]
+MOST_HALVINGS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,38 +167,38 @@ class Mass:
         xi = self._coordinates(kept)
         a, b = np.triu_indices(g + 1)
         phi = xi[..., a] * xi[..., b]
-        asked = self._moments(xi, np.ones(xi.shape[:2]))[0][..., a, b]
-        scale = np.maximum(np.abs(asked), asked[..., :1])
+        wanted = self._moments(xi, np.ones(xi.shape[:2]))[0][..., a, b]
+        scale = np.maximum(np.abs(wanted), wanted[..., :1])
         scale = np.where(scale > 0, scale, 1.0)
         body, count = self._bodies
         xi = xi * kept[:, None, None]
 
-        def look(alpha: Array) -> tuple[Array, Array, Array]:
-            """Factors, moments that are missing as parts of what is asked for, and products whose sums are the derivatives."""
-            s = np.maximum(1.0 + np.einsum("nck,nck->nc", phi, alpha[body]), np.sqrt(1.0 - TAKEN))
+        def evaluate(alpha: Array) -> tuple[Array, Array, Array]:
+            """Factors, moments that are missing as parts of what is wanted, and products whose sums are the derivatives."""
+            s = np.maximum(1.0 + np.einsum("nck,nck->nc", phi, alpha[body]), np.sqrt(1.0 - LARGEST_LOSS))
             moments, momenta = self._moments(xi, s)
-            slopes = (xi[..., a] * momenta[..., b] + momenta[..., a] * xi[..., b]) * (s > np.sqrt(1.0 - TAKEN))[..., None]
-            return s, (asked - moments[..., a, b]) / scale, slopes
+            slopes = (xi[..., a] * momenta[..., b] + momenta[..., a] * xi[..., b]) * (s > np.sqrt(1.0 - LARGEST_LOSS))[..., None]
+            return s, (wanted - moments[..., a, b]) / scale, slopes
 
         alpha = np.zeros((count, g, len(a)))
-        s, missing, slopes = look(alpha)
+        s, missing, slopes = evaluate(alpha)
         stuck = np.zeros((count, g), dtype=bool)
         for _ in range(MOST_ITERATIONS):
             size = np.abs(missing).max(axis=2)
-            done = stuck | (size <= ROUNDING)
+            done = stuck | (size <= MOMENTS_MET)
             if done.all():
                 break
             J = self._products(slopes, phi) / scale[..., None]
-            step = np.einsum("bcij,bcj->bci", np.linalg.pinv(J, rcond=REQUIRED), missing)
+            step = np.einsum("bcij,bcj->bci", np.linalg.pinv(J, rcond=MOMENTS_KEPT), missing)
             step[done] = 0.0
             for _ in range(MOST_HALVINGS):
-                s, new, slopes = look(alpha + step)
+                s, new, slopes = evaluate(alpha + step)
                 stuck = np.abs(new).max(axis=2) >= size
                 if done[stuck].all():
                     break
                 step[stuck] *= 0.5
             alpha, missing = alpha + step, new
-        lacking = np.flatnonzero((np.abs(missing) > REQUIRED).any(axis=(1, 2)))
+        lacking = np.flatnonzero((np.abs(missing) > MOMENTS_KEPT).any(axis=(1, 2)))
         if len(lacking):
             raise self._unable(body == lacking[0], kept)
         return s
@@ -324,7 +335,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
         scaled = config.to_owners(cells.ravel(), np.outer(of_cells, shares / shares.sum()).ravel())[: config.n_owned]
         body, count = find_bodies(config)
         body = body[: config.n_owned]
-        refused = _body_sums(config.comm, (rows < POSITIVE * scaled).astype(float), body, count) > 0
+        refused = _body_sums(config.comm, (rows < LEAST_ROW_SUM * scaled).astype(float), body, count) > 0
         m = np.where(refused[body], scaled, rows)
     return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True)
 

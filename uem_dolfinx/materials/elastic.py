@@ -1,6 +1,6 @@
 """Elastic laws in UFL: stored energy, stress and internal virtual work, in 3D, plane strain and plane stress.
 
-A convenience on the data's way, between mesh and forms: the united solver takes any UFL residual.
+A convenience: the united solver takes any UFL residual.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Quadrature points of chosen cells: values of expressions there, Functions that hold what is known only there, sums and means.
 
-Between forms and the laws with history on the data's way: those compute on arrays with one row for each point.
+Laws with history compute on arrays with one row for each point.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 #: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
+#: [convention; reference cell; test_thresholds_motion.py::test_points_beside_the_centre]
 BESIDE_CENTRE = 1e-4
 #: Their directions by dimension: sums of all coordinates and of products of two different ones vanish, but for that of the plane.
 DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]}

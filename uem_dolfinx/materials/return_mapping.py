@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    pass
-
 Array = npt.NDArray[np.float64]
 
 #: A stress outside the yield surface by no more than this part of the yield stress is on it.
+#: [convention; yield stress; test_thresholds_motion.py::test_on_the_yield_surface]
 ON_SURFACE = 1e-10
 #: The plane-stress return ends with a Newton step below this part of the consistency parameter; the next one would be its square.
+#: [bound; consistency parameter; -]
 RETURNED = 1e-10
-#: Bound on those steps; they come from one side and are quadratic, and random states took 7 at most.
+#: Those steps; they come from one side and are quadratic, and random states took 7 at most.
+#: [bound; steps; -]
 MAX_STEPS = 50
 
 

@@ -1,6 +1,6 @@
 """Von Mises plasticity: return mapping at quadrature points, consistent tangent, trial and committed history.
 
-A convenience on the data's way, beside the elastic laws: stress and tangent enter forms as functions known at quadrature points.
+Stress and tangent enter forms as Functions known at quadrature points.
 """
 
 from __future__ import annotations
@@ -33,12 +33,6 @@ STRAINS = ("small", "green_lagrange")
 #: 0 is the cell's centre.
 SIMPLEX_DEGREES = {1: (1, 1), 2: (2, 2)}
 TENSOR_DEGREES = {1: (2, 0), 2: (4, 2)}
-
-
-# -- kernels -----------------------------------------------------------------------------------------------------------
-
-
-# -- the law -----------------------------------------------------------------------------------------------------------
 
 
 class VonMises:
@@ -149,12 +143,15 @@ class VonMises:
 
     def _spreading(self) -> Array:
         """Values at the stress points of the pressure, which its own points give as a constant or (multi)linear: rows sum to 1."""
+        if self._pressure_points.degree == 0:
+            # the points beside a centre count as one
+            count = len(self._pressure_points.points)
+            return np.full((len(self._points.points), count), 1.0 / count)
         linear = forms.create_lagrange_element(compat.cell_name(self.mesh), 1)
         at, known = (
             linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in (self._points, self._pressure_points)
         )
-        # the points beside a centre count as one
-        spread = at @ np.linalg.pinv(known, rcond=1e-2)
+        spread = at @ np.linalg.pinv(known)
         return spread / spread.sum(axis=1, keepdims=True)
 
     def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:

@@ -1,6 +1,6 @@
 """Energy book: where the energy of a run is after every step, what work was done, and the momentum beside.
 
-A part of the tenth step on the data's way; it reads a solved problem and changes nothing.
+It reads a solved problem and changes nothing.
 """
 
 from __future__ import annotations
@@ -15,17 +15,15 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
-from uem_dolfinx.output.tables import CsvTable
-from uem_dolfinx.solve.steps import set_load
+from uem_dolfinx.output.tables import Closing, CsvTable
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from types import TracebackType
 
     import ufl
 
     from uem_dolfinx.solve.problem import UnitedProblem
-    from uem_dolfinx.solve.steps import TimeStep
+    from uem_dolfinx.solve.time_steps import TimeStep
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +53,7 @@ class Energies:
     defect: float
 
 
-class EnergyBook:
+class EnergyBook(Closing):
     """Book of energies and momenta, one row per time step, as a table in a CSV file if wanted.
 
     Columns: those of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... that the
@@ -111,18 +109,18 @@ class EnergyBook:
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
         # the work of the first step begins with the load of this instant
-        set_load(problem, self.dynamics.time)
-        self._look()
+        problem.set_load(self.dynamics.time)
+        self._read_forces()
         # the sum at the start, from which the defect is counted
         if self.table is not None and begin:
             self._first = sum(self.table.first[name] for name in ("kinetic", "stored", "dissipated"))
         else:
-            held = self._held()
-            self._first = sum(held)
-            self._enter(held)
+            energies = self._energies()
+            self._first = sum(energies)
+            self._append(energies)
 
-    def _look(self) -> None:
-        """Take the forces and the displacement of this instant (collective)."""
+    def _read_forces(self) -> None:
+        """Read the forces and the displacement of this instant (collective)."""
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
         self._u = np.array(problem.u.x.array[:n])
         self._time = self.dynamics.time
@@ -145,7 +143,7 @@ class EnergyBook:
         b.destroy()
         return values
 
-    def _held(self) -> tuple[float, float, float]:
+    def _energies(self) -> tuple[float, float, float]:
         """Energies kinetic, stored and dissipated (collective)."""
         stored = forms.assemble_scalar(self._stored, self.problem.comm) if self._stored is not None else 0.0
         stored += sum(material.energy() for material in self.problem.materials)
@@ -162,15 +160,15 @@ class EnergyBook:
             The new row.
         """
         u, forces, resultants, time = self._u, self._forces, self._resultants, self._time
-        self._look()
+        self._read_forces()
         self._works += self.problem.comm.allreduce(0.5 * (forces + self._forces) @ (self._u - u))
         self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
-        return self._enter(self._held())
+        return self._append(self._energies())
 
-    def _enter(self, held: tuple[float, float, float]) -> Energies:
+    def _append(self, energies: tuple[float, float, float]) -> Energies:
         damped, external, contact = (float(w) for w in self._works)
-        defect = sum(held) + damped - external - contact - self._first
-        row = Energies(self._time, *held, damped, external, contact, defect)
+        defect = sum(energies) + damped - external - contact - self._first
+        row = Energies(self._time, *energies, damped, external, contact, defect)
         self.rows.append(row)
         self.momenta.append(self.dynamics.momentum())
         self.impulses.append(self._impulse.copy())
@@ -200,9 +198,3 @@ class EnergyBook:
         """Close the file."""
         if self.table is not None:
             self.table.close()
-
-    def __enter__(self) -> EnergyBook:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

@@ -1,6 +1,6 @@
 """Pictures of 2D scenes, of pressure profiles and of whatever else is drawn into their panels.
 
-Last step on the data's way; it reads a solved problem and changes nothing.
+They read a solved problem and change nothing.
 """
 
 from __future__ import annotations
@@ -72,6 +72,16 @@ def figure(
     canvas.savefig(path, dpi=150, bbox_inches="tight")
 
 
+@contextmanager
+def _panel(picture: str | Path | Any, comm: MPI.Comm) -> Iterator[Any]:
+    """The panel that is given, or the one of a picture of this name (collective)."""
+    if isinstance(picture, (str, Path)):
+        with figure(picture, comm) as (panel,):
+            yield panel
+    else:
+        yield picture
+
+
 def plot_scene(
     problem: UnitedProblem,
     picture: str | Path | Any,
@@ -111,13 +121,6 @@ def plot_scene(
         raise ValueError(
             f"plot_scene draws 2D scenes, this one has dimension {problem.config.gdim}: open the XDMF file in ParaView"
         )
-    if isinstance(picture, (str, Path)):
-        with figure(picture, problem.comm) as (panel,):
-            plot_scene(
-                problem, panel, field=field, label=label, levels=levels, scale=scale, window=window, mirror=mirror,
-                cells=cells, arrows=arrows, cmap=cmap,
-            )  # fmt: skip
-        return
     config, comm = problem.config, problem.comm
     if field is None:
         field, label = ufl.sqrt(ufl.dot(problem.u, problem.u)), label or "|u|"
@@ -126,17 +129,18 @@ def plot_scene(
     points = comm.gather(x)
     parts = comm.gather((triangles, outline, values))
     forces = [_gather_contactors(contact, scale) for contact in problem.contacts] if arrows else []
-    if picture is None or points is None or parts is None:
-        return
-    start = np.cumsum([0, *(len(p) for p in points)])
-    triangles = np.concatenate([t + s for (t, _, _), s in zip(parts, start)])
-    outline = np.concatenate([o + s for (_, o, _), s in zip(parts, start)])
-    values = np.concatenate([v for _, _, v in parts])
-    x = np.concatenate(points)
-    _draw_scene(picture, x, triangles, outline, values, levels, label, window, mirror, cells, cmap)
-    longest = max((float(p.max(initial=0.0)) for _, _, p in forces), default=0.0)
-    for at, force, pressure in forces:
-        _draw_arrows(picture, at, force, pressure, longest, mirror)
+    with _panel(picture, comm) as panel:
+        if panel is None or points is None or parts is None:
+            return
+        start = np.cumsum([0, *(len(p) for p in points)])
+        triangles = np.concatenate([t + s for (t, _, _), s in zip(parts, start)])
+        outline = np.concatenate([o + s for (_, o, _), s in zip(parts, start)])
+        values = np.concatenate([v for _, _, v in parts])
+        x = np.concatenate(points)
+        _draw_scene(panel, x, triangles, outline, values, levels, label, window, mirror, cells, cmap)
+        longest = max((float(p.max(initial=0.0)) for _, _, p in forces), default=0.0)
+        for at, force, pressure in forces:
+            _draw_arrows(panel, at, force, pressure, longest, mirror)
 
 
 def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:
@@ -246,37 +250,31 @@ def plot_pressure(
         MissingBackendError: if matplotlib cannot be imported.
     """
     pairs: list[Contact] = list(contacts) if isinstance(contacts, Sequence) else [contacts]
-    if isinstance(picture, (str, Path)):
-        with figure(picture, pairs[0].config.comm) as (panel,):
-            plot_pressure(
-                pairs, panel, along=along, reference=reference, reference_label=reference_label, label=label,
-                along_label=along_label, window=window, mirror=mirror,
-            )  # fmt: skip
-        return
     found = [_gather_contactors(contact, None) for contact in pairs]
-    if picture is None:
-        return
-    ax, gdim = picture, pairs[0].config.gdim
-    along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))
-    curves = [(along(at), pressure) for at, _, pressure in found]
-    pressed = np.concatenate([s[p > 0] for s, p in curves])
-    if window is None:
-        lo, hi = (pressed.min(), pressed.max()) if len(pressed) else (0.0, 1.0)
-        lo = -hi if mirror else (0.0 if gdim == 3 else lo)
-        window = (lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo))
-    if reference is not None:
-        s = np.linspace(*window, 1001)
-        ax.plot(s, reference(s), color="0.25", lw=1.2, label=reference_label, zorder=1)
-    for contact, (s, p) in zip(pairs, curves):
-        if mirror:
-            s, p = np.concatenate([-s, s]), np.concatenate([p, p])
-        ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
-    ax.set_xlim(window)
-    ax.set_ylim(bottom=0.0)
-    ax.set_xlabel(along_label or ("x" if gdim == 2 else "r"))
-    ax.set_ylabel(label)
-    ax.grid(alpha=0.25)
-    ax.legend(frameon=False)
+    with _panel(picture, pairs[0].config.comm) as ax:
+        if ax is None:
+            return
+        gdim = pairs[0].config.gdim
+        along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))
+        curves = [(along(at), pressure) for at, _, pressure in found]
+        pressed = np.concatenate([s[p > 0] for s, p in curves])
+        if window is None:
+            lo, hi = (pressed.min(), pressed.max()) if len(pressed) else (0.0, 1.0)
+            lo = -hi if mirror else (0.0 if gdim == 3 else lo)
+            window = (lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo))
+        if reference is not None:
+            s = np.linspace(*window, 1001)
+            ax.plot(s, reference(s), color="0.25", lw=1.2, label=reference_label, zorder=1)
+        for contact, (s, p) in zip(pairs, curves):
+            if mirror:
+                s, p = np.concatenate([-s, s]), np.concatenate([p, p])
+            ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
+        ax.set_xlim(window)
+        ax.set_ylim(bottom=0.0)
+        ax.set_xlabel(along_label or ("x" if gdim == 2 else "r"))
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.25)
+        ax.legend(frameon=False)
 
 
 def nodal_average(expression: Any, mesh: Any) -> Array:

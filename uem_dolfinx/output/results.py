@@ -1,6 +1,6 @@
 """Results to keep: files for ParaView and a history in CSV.
 
-Tenth step on the data's way; it reads a solved problem and changes nothing.
+Writers read a solved problem and change nothing.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.output.tables import CsvTable
-from uem_dolfinx.solve.steps import LoadStep, TimeStep
+from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.solve.load_steps import LoadStep
+from uem_dolfinx.solve.time_steps import TimeStep
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
 
     from uem_dolfinx.contact.contact import Contact
     from uem_dolfinx.solve.problem import UnitedProblem
@@ -30,7 +30,7 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-class HistoryWriter:
+class HistoryWriter(Closing):
     """CSV file with one row per load step or time step, complete after every row.
 
     Columns: ``factor`` or ``time``, ``newton_iterations``, and for every contact ``active``, ``max_gap``, the resultant
@@ -68,14 +68,8 @@ class HistoryWriter:
         """Close the file."""
         self.table.close()
 
-    def __enter__(self) -> HistoryWriter:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-
-class ResultsWriter:
+class ResultsWriter(Closing):
     """Time series of everything there is to see: fields for ParaView and the history.
 
     Writes ``PATH.xdmf`` on every DOLFINx, ``PATH_vectors.bp`` and ``PATH_scalars.bp`` where it has ADIOS2, and
@@ -156,12 +150,6 @@ class ResultsWriter:
         for writer in self._vtx:
             writer.close()
         self._vtx = []
-
-    def __enter__(self) -> ResultsWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def clock(step: LoadStep | TimeStep | float) -> float:

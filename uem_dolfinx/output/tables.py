@@ -1,11 +1,9 @@
-"""Tables in CSV files: one row per step, complete after every row, and continued where a run is resumed.
-
-A part of the tenth step on the data's way.
-"""
+"""Tables in CSV files: one row per step, complete after every row, and continued where a run is resumed."""
 
 from __future__ import annotations
 
 import csv
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -14,8 +12,7 @@ from uem_dolfinx.log import timed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from types import TracebackType
-    from typing import IO
+    from typing import IO, Self
 
     from mpi4py import MPI
 
@@ -27,7 +24,21 @@ class Clock(Protocol):
     resumed: int
 
 
-class CsvTable:
+class Closing(ABC):
+    """Base of what is closed at the end of its ``with`` block."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the files."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class CsvTable(Closing):
     """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
 
     A file that is gone on with stays as it is until the first row is written.
@@ -161,9 +172,3 @@ class CsvTable:
         if self._file is not None:
             self._file.close()
             self._file = None
-
-    def __enter__(self) -> CsvTable:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

@@ -1,7 +1,7 @@
 """Checkpoints: what a long run goes on from, in one file that any number of ranks can write and read.
 
-Last step on the data's way, beside the results. The file is in the order of the mesh's input; every rank writes and reads its own part
-of it through MPI-IO, as the bytes that numbers have in memory.
+The file is in the order of the mesh's input; every rank writes and reads its own part of it through MPI-IO, as the bytes that numbers
+have in memory.
 """
 
 from __future__ import annotations
@@ -33,15 +33,19 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[Any]
 
-#: Version of the file's layout.
-FORMAT = 1
+#: Version of the file's layout and of the names in it.
+#: [format; -; test_checkpoint_refused.py::test_another_format]
+FORMAT = 2
 #: What a checkpoint begins with.
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
+#: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
 #: Bytes that MPI-IO gets at once, because it counts them in C's int.
+#: [format; bytes; -]
 PIECE = 2**30
 #: Exit status of a run that has ended on SIGTERM, as shells have it.
+#: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
 TERMINATED = 128 + signal.SIGTERM
 
 
@@ -91,7 +95,7 @@ def write_checkpoint(path: str | Path, state: State) -> None:
     for hook in state.collect:
         hook()
     with timed("write checkpoint"):
-        told, beside = state.describe(), _beside(path)
+        described, beside = state.describe(), _beside(path)
         trouble = _Trouble(comm, f"the checkpoint {path} cannot be written", "check the folder, its rights and its free space")
         with trouble:
             if comm.rank == 0:
@@ -103,13 +107,13 @@ def write_checkpoint(path: str | Path, state: State) -> None:
         trouble.agree()
         end, tables = HEAD, []
         for entry in state.entries:
-            part = entry.numbering.to_table(entry.rows())
+            part = entry.numbering.to_table(entry.to_checkpoint())
             width = part.dtype.itemsize * int(np.prod(part.shape[1:]))
             tables.append(hashes(part))
             with trouble:
                 _write(file, end + width * entry.numbering.first, part)
             end += width * entry.numbering.total
-        content = {"state": told, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers}
+        content = {"state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers}
         with trouble:
             if comm.rank == 0:
                 text = _text(content)
@@ -164,7 +168,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
                 raise _damaged(path, f"data with the hash {content['data']}", f"the hash {found}")
         if not any(comm.allgather(not trouble.none)):
             for entry, part in zip(state.entries, _parts(file, state, trouble)):
-                entry.take(entry.numbering.from_table(part))
+                entry.from_checkpoint(entry.numbering.from_table(part))
         with trouble:
             file.Close()
         trouble.agree()
@@ -206,7 +210,7 @@ def _parts(file: MPI.File, state: State, trouble: _Trouble) -> Iterator[Array]:
     """This rank's parts of the tables, one after the other (collective)."""
     end = HEAD
     for entry in state.entries:
-        rows = entry.rows()
+        rows = entry.to_checkpoint()
         part = np.zeros((entry.numbering.count, *rows.shape[1:]), dtype=rows.dtype)
         width, data = part.dtype.itemsize * int(np.prod(part.shape[1:])), as_bytes(part)
         with trouble:
@@ -393,14 +397,14 @@ class Checkpoint:
         logger.warning("ended by SIGTERM; the checkpoint %s holds the last step", self.path)
         raise SystemExit(TERMINATED)
 
-    def _told(self, number: int, frame: FrameType | None) -> None:
+    def _on_sigterm(self, number: int, frame: FrameType | None) -> None:
         self._asked_to_end = True
 
     def __enter__(self) -> Checkpoint:
         # elsewhere Python does not allow it
         self._handles = threading.current_thread() is threading.main_thread()
         if self._handles:
-            self._before = signal.signal(signal.SIGTERM, self._told)
+            self._before = signal.signal(signal.SIGTERM, self._on_sigterm)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -1,6 +1,6 @@
-"""What a run goes on from: Functions, the states of contacts and numbers, with the way of each to the order of the input.
+"""What a run goes on from: Functions, the states of contacts and numbers, each in the order of the mesh's input.
 
-A part of the last step on the data's way; whoever leads a run collects its state here, and checkpoints write and read it.
+Whoever leads a run collects its state here; checkpoints write and read it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 
 #: Sides of a cell are fewer.
+#: [format; sides; -]
 MOST_SIDES = 8
 
 
@@ -40,10 +41,10 @@ class Entry(Protocol):
     def describe(self) -> str:
         """What tells it from others (collective)."""
 
-    def rows(self) -> Array:
+    def to_checkpoint(self) -> Array:
         """Values at this rank's nodes ``(n, ...)`` (collective)."""
 
-    def take(self, rows: Array) -> None:
+    def from_checkpoint(self, kept: Array) -> None:
         """Put values back (collective)."""
 
 
@@ -62,17 +63,17 @@ class FunctionEntry:
     def describe(self) -> str:
         """Element and size."""
         family, degree = compat.element_family(self.u.function_space) or ("", 0)
-        return f"{family} {degree}, {self.rows().shape[1]} components at {self.numbering.total} nodes"
+        return f"{family} {degree}, {self.to_checkpoint().shape[1]} components at {self.numbering.total} nodes"
 
-    def rows(self) -> Array:
+    def to_checkpoint(self) -> Array:
         """A view of the owned part ``(n_owned, block size)``."""
         dofmap = self.u.function_space.dofmap
         rows = self.u.x.array.reshape(-1, dofmap.index_map_bs)
         return np.asarray(rows[: dofmap.index_map.size_local])
 
-    def take(self, rows: Array) -> None:
+    def from_checkpoint(self, kept: Array) -> None:
         """Overwrite the Function."""
-        self.rows()[:] = rows
+        self.to_checkpoint()[:] = kept
         self.u.x.scatter_forward()
 
 
@@ -95,13 +96,13 @@ class ContactEntry:
         if comm.allreduce(len(keys)):
             surfaces.append(hashes(Numbering(comm, keys, MOST_SIDES * n_cells(contact.config.mesh)).to_table(keys)))
         self._surfaces = fingerprint(comm, surfaces)
-        self._columns = " ".join(self.rows().dtype.names or ())
+        self._columns = " ".join(self.to_checkpoint().dtype.names or ())
 
     def describe(self) -> str:
         """Size, the surfaces, and what is remembered of a contactor."""
         return f"{self.numbering.total} contactors, surfaces {self._surfaces}, each with {self._columns}"
 
-    def rows(self) -> Array:
+    def to_checkpoint(self) -> Array:
         """One record for each contactor ``(n,)``."""
         kept = self.contact.pair.to_checkpoint()
         rows = np.empty(len(self.contact.pair.nodes), dtype=[(name, a.dtype.str, a.shape[1:]) for name, a in kept.items()])
@@ -109,14 +110,14 @@ class ContactEntry:
             rows[name] = a
         return rows
 
-    def take(self, rows: Array) -> None:
+    def from_checkpoint(self, kept: Array) -> None:
         """Hand the records to the pair."""
-        self.contact.pair.from_checkpoint({name: rows[name] for name in rows.dtype.names or ()})
+        self.contact.pair.from_checkpoint({name: kept[name] for name in kept.dtype.names or ()})
 
 
 @dataclass
 class State:
-    """What a run goes on from; the way to the order of the input is found when it is first written or read, and kept.
+    """What a run goes on from; the order of the mesh's input is found when it is first written or read, and kept.
 
     Attributes:
         mesh: on which everything lives.
@@ -163,9 +164,9 @@ class State:
     def describe(self) -> dict[str, str]:
         """What tells this state from others, in the order in which it is compared (collective)."""
         cells = f"{n_cells(self.mesh)} {compat.cell_name(self.mesh)} cells in {self.mesh.geometry.dim}D"
-        told = {"mesh": f"{cells}, fingerprint {self.fingerprint}"}
-        told |= {entry.name: entry.describe() for entry in self.entries}
-        return told | {f"number '{name}'": "a value" for name in self.numbers}
+        described = {"mesh": f"{cells}, fingerprint {self.fingerprint}"}
+        described |= {entry.name: entry.describe() for entry in self.entries}
+        return described | {f"number '{name}'": "a value" for name in self.numbers}
 
     def motions(self) -> list[dict[str, Any] | None]:
         """Where the contacts' rigid surfaces have been moved to."""

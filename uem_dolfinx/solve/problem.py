@@ -12,9 +12,11 @@ from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.parallel import agree_on_call
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.newton import Iteration, solve_united
+from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.system import BodySystem
 
 if TYPE_CHECKING:
@@ -114,15 +116,24 @@ class UnitedProblem:
         free = self.forces.free[: self.config.n_owned]
         pairs = [contact.attach(self.config, free) for contact in self.contacts]
         if dynamics is not None:
-            dynamics.weigh(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
+            dynamics.make_contactors_massless(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
         #: Bodies and contact as the Newton loop sees them.
         self.system = method(self.forces, pairs, solver, newton=newton, consistent_tangent=consistent_tangent)
+        #: Length of time steps, and what is known of those before.
+        self.step_control = StepControl()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
         self._largest_forces = 0.0
 
     # -- one step ----------------------------------------------------------------------------------------------------
+
+    def set_load(self, at: float) -> None:
+        """Set loads, and what else ``load`` sets, of a load factor or a time; what it raises is raised on all ranks (collective)."""
+        if isinstance(self.load, fem.Constant):
+            self.load.value = at
+        elif self.load is not None:
+            agree_on_call(self.comm, self.load, at)
 
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
@@ -215,14 +226,15 @@ class UnitedProblem:
             self.system.forget()
             state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
             if self.dynamics is not None:
-                state.numbers |= self.dynamics.numbers
+                state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
         def restore() -> None:
             self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
             self._largest_forces = state.numbers["largest forces"]
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             if self.dynamics is not None:
-                self.dynamics.resume(state.numbers)
+                self.dynamics.from_checkpoint(state.numbers)
+                self.step_control.from_checkpoint(state.numbers)
 
         state.collect.append(collect)
         state.restore.append(restore)

@@ -1,4 +1,4 @@
-"""Steps within which a contactor would go through a target are refused."""
+"""Refusal of steps within which a contactor would pass through a target."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ if TYPE_CHECKING:
     from uem_dolfinx.geometry.configuration import Configuration
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
-PASSING = 0.1
-#: A step that would have to be looked at more often than this is too long.
-MOST_LOOKS = 256
+#: [convention; the target's stride; test_thresholds_motion.py::test_depth_of_a_passage]
+PASSAGE_DEPTH = 0.1
+#: A step that would have to be examined at more places than this is too long.
+#: [bound; places; test_thresholds_motion.py::test_too_many_places]
+MOST_PLACES = 256
 
 
 def check_tunnelling(config: Configuration, pairs: list[ContactPair], start: npt.NDArray[np.float64]) -> None:
     """Refuse a step within which a contactor went through a target (collective).
 
-    One that touches at the end must have come from in front of the facet it touches. Of one that does not, the straight way is looked
-    at in pieces no longer than the target's stride; most steps are shorter than that and are not looked at.
+    One that touches at the end must have come from in front of the facet it touches. Of one that does not, the straight way is
+    examined in pieces no longer than the target's stride; most steps are shorter than that and are not examined.
 
     Args:
         config: configuration of the displacement at the end of the step.
@@ -42,12 +44,12 @@ def check_tunnelling(config: Configuration, pairs: list[ContactPair], start: npt
         moves = [way[pair.nodes].max(initial=0.0), way[target.dofs].max(initial=0.0)]
         new = pair.trial.active & ~pair.committed.active
         *moves, touches = np.max(config.comm.allgather([*moves, float(new.any())]), axis=0)
-        looks = np.ceil(sum(moves) / stride)
+        places = np.ceil(sum(moves) / stride)
         error = None
-        if looks > MOST_LOOKS:
+        if places > MOST_PLACES:
             error = TunnellingError(
-                f"{pair.name}: the surfaces move by {sum(moves):.4g} within a step, {looks:.3g} times what a contactor may pass without "
-                "being looked for: take smaller steps"
+                f"{pair.name}: the surfaces move by {sum(moves):.4g} within a step, {places:.3g} times what a contactor may pass without "
+                "being noticed: take smaller steps"
             )
         agree(config.comm, error)
         if touches:
@@ -55,12 +57,14 @@ def check_tunnelling(config: Configuration, pairs: list[ContactPair], start: npt
             outside = target.project(pair.points).gap >= 0.0
             before = target.follow(pair.points, pair.projection).gap
             u[:] = end
-            _refuse_passage(pair, new & outside & (before < -PASSING * stride), before, "touches the target from behind after")
-        for k in range(1, int(looks)):
-            u[:] = start + k / looks * (end - start)
+            _refuse_passage(
+                pair, new & outside & (before < -PASSAGE_DEPTH * stride), before, "touches the target from behind after"
+            )
+        for k in range(1, int(places)):
+            u[:] = start + k / places * (end - start)
             p = target.project(pair.points)
             u[:] = end
-            inside = ~pair.trial.active & (p.gap < -PASSING * stride) & ~(p.beyond != 0).any(axis=1)
+            inside = ~pair.trial.active & (p.gap < -PASSAGE_DEPTH * stride) & ~(p.beyond != 0).any(axis=1)
             _refuse_passage(pair, inside, p.gap, "passes through the target within")
 
 

@@ -1,30 +1,20 @@
-"""Load steps and time steps: how a problem is led from state to state, shortened on failure and at instants of contact.
+"""Time steps: shortened where they fail, where contacts would give the bodies energy, and at instants of contact [UEM, 5].
 
-Ninth step on the data's way; a step is committed when it has converged, and a run that fails keeps its last good state.
+Every step that converges is committed, so that a run that fails keeps its last good state.
 """
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
 
-from uem_dolfinx.errors import (
-    ConvergenceError,
-    InvertedElementError,
-    LinearSolveError,
-    NotFiniteError,
-    SpaceError,
-    TunnellingError,
-    UEMError,
-)
+from uem_dolfinx.errors import SpaceError, UEMError
 from uem_dolfinx.geometry.rigid import RigidSurface
-from uem_dolfinx.log import logger, progress
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.log import progress
+from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH, EnergyGivenError
 from uem_dolfinx.solve.tunnelling import check_tunnelling
 
 if TYPE_CHECKING:
@@ -37,95 +27,15 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-#: A step may be cut to this part of its nominal length.
-SHORTEST_STEP = 1.0 / 1024
-#: A step that needs no more iterations than this is easy: the next one may be longer again.
-EASY = 6
-#: A remainder of a step below this part of it is rounding.
-NOTHING = 1e-9
-#: Rounding of a time, relative to the largest.
+#: Rounding of a time, a few units in its last place.
+#: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
 TIME_ROUNDING = 4 * np.finfo(float).eps
 #: Contacts may give the bodies this part of the largest kinetic energy in a step.
+#: [convention; kinetic energy; test_thresholds_motion.py::test_energy_given]
 MOST_GIVEN = 2e-3
-#: Steps in which contacts give energy are cut down to this part of the nominal length.
+#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted.
+#: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
 SHORTEST_GIVEN = 1.0 / 128
-
-
-class _EnergyGivenError(UEMError):
-    """Contacts have given the bodies energy within a step; never leaves this file."""
-
-
-#: What a shorter step may mend.
-MENDABLE = (ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError, _EnergyGivenError)
-
-
-@dataclass(frozen=True)
-class LoadStep:
-    """A converged load step.
-
-    Attributes:
-        number: counted from 1.
-        factor: load factor reached, 1 at the end.
-        iterations: history of the Newton loop.
-        cuts: how often the step had to be shortened.
-    """
-
-    number: int
-    factor: float
-    iterations: list[Iteration]
-    cuts: int
-
-    @property
-    def newton_iterations(self) -> int:
-        """Number of linear solves."""
-        return len(self.iterations) - 1
-
-
-def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
-    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length.
-
-    Args:
-        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
-        steps: nominal number of equal steps.
-
-    Yields:
-        Every converged step.
-
-    Raises:
-        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
-    """
-    nominal = 1.0 / steps
-    length, done, last, number, cuts = nominal, 0.0, 0.0, 0, 0
-    start = np.array(problem.u.x.array)
-    while done < 1.0:
-        factor = min(done + length, 1.0)
-        if 1.0 - factor < NOTHING:
-            factor = 1.0
-        fraction = _apply_load(problem, factor)
-        try:
-            iterations = problem.solve(start=start, fraction=fraction, ratio=(factor - done) / last if last else 0.0)
-        except MENDABLE as error:
-            # the last step may have been shorter than was meant
-            cuts, length = cuts + 1, 0.5 * (factor - done)
-            if length < SHORTEST_STEP * nominal:
-                _apply_load(problem, done)
-                # the targets that the load moves are back, too
-                problem.restore()
-                raise
-            logger.info("load step to factor %.6g failed (%s); cut to %.3g", factor, error, length)
-            continue
-        last, done, number = factor - done, factor, number + 1
-        yield LoadStep(number, factor, iterations, cuts)
-        cuts = 0
-        if len(iterations) - 1 <= EASY:
-            length = min(2.0 * length, nominal)
-
-
-def _apply_load(problem: UnitedProblem, factor: float) -> float:
-    """Set the load; returns how far the Dirichlet values are to be ramped."""
-    set_load(problem, factor)
-    return 1.0 if callable(problem.load) and not isinstance(problem.load, fem.Constant) else factor
 
 
 @dataclass(frozen=True)
@@ -202,7 +112,7 @@ def time_steps(
         raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
     if not dynamics.start <= end < np.inf:
         raise ValueError(f"end = {end}: expected a time that is not before the start, {dynamics.start:.6g}")
-    if _rounding(dynamics, dt, end) > SHORTEST_STEP * dt:
+    if _rounding(dynamics, dt, end) > SHORTEST_LENGTH * dt:
         raise ValueError(
             f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
@@ -217,46 +127,38 @@ def _time_steps(
     problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
 ) -> Iterator[TimeStep]:
     """The steps of ``time_steps``."""
-    set_load(problem, dynamics.time)
+    control = problem.step_control
+    control.begin(dt)
+    problem.set_load(dynamics.time)
     problem.system.accelerate()
-    cuts, before, rounding = 0, _touching(problem), _rounding(dynamics, dt, end)
+    before, rounding = _touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
         # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
         passed = (dynamics.time - dynamics.start) / dt
         rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
-        length = min(dynamics.longest, dt if abs(rest - dt) <= rounding else rest)
+        length = min(control.longest, dt if abs(rest - dt) <= rounding else rest)
         try:
             forces = _contact_forces(problem)
             length, iterations = _step(problem, length, before, tolerance)
-            if length > SHORTEST_GIVEN * dt:
-                _refuse_given_energy(problem, dynamics, forces)
+            _refuse_given_energy(problem, dynamics, length, forces)
         except UEMError as error:
             dynamics.restore()
-            set_load(problem, dynamics.time)
+            problem.set_load(dynamics.time)
             problem.restore()
-            if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_STEP * dt:
-                raise
-            cuts, dynamics.longest = cuts + 1, 0.5 * length
-            logger.info("time step from %.6g failed (%s); cut to %.3g", dynamics.time, error, dynamics.longest)
-            continue
+            if control.shorten(length, error):
+                continue
+            raise
         problem.commit()
         nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
         if abs(dynamics.time - nearest) <= rounding:
             dynamics.time = float(nearest)
-        if len(iterations) - 1 <= EASY:
-            dynamics.longest *= 2.0
-        dynamics.number += 1
+        number, cuts = control.done(iterations)
         after = _touching(problem)
-        yield TimeStep(
-            dynamics.number,
-            dynamics.time,
-            length,
-            iterations,
-            cuts,
-            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if now and not was),
-            tuple(c.name for c, was, now in zip(problem.contacts, before, after) if was and not now),
-        )
-        before, cuts = after, 0
+        changes = [(c.name, was, now) for c, was, now in zip(problem.contacts, before, after)]
+        touched = tuple(name for name, was, now in changes if now and not was)
+        left = tuple(name for name, was, now in changes if was and not now)
+        yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
+        before = after
         if checkpoint is not None:
             checkpoint.step()
     if checkpoint is not None:
@@ -287,7 +189,7 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
 def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     """Find the state at the end of a step of this length (collective)."""
     assert problem.dynamics is not None
-    set_load(problem, problem.dynamics.time + length)
+    problem.set_load(problem.dynamics.time + length)
     problem.dynamics.begin(length)
     iterations = problem.attempt()
     check_tunnelling(problem.config, problem.pairs, problem.committed)
@@ -303,7 +205,7 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     return [np.array(c.force.x.array[: problem.config.gdim * problem.config.n_owned]) for c in still if c.n_active]
 
 
-def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, before: list[Array]) -> None:
+def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
     """Refuse a step within which contacts have given the bodies energy, by more than their share (collective).
 
     The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along.
@@ -311,19 +213,20 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, before: lis
     Args:
         problem: at the end of the step.
         dynamics: of the problem.
+        length: of the step.
         before: contact forces at its beginning.
     """
-    forces = before + _contact_forces(problem)
-    if not forces:
+    control = problem.step_control
+    if length <= SHORTEST_GIVEN * control.nominal or not (forces := before + _contact_forces(problem)):
         return
     n = problem.config.gdim * problem.config.n_owned
     way = problem.u.x.array[:n] - problem.committed[:n]
     given = problem.comm.allreduce(0.5 * float(sum(f @ way for f in forces)))
-    if given <= MOST_GIVEN * dynamics.largest:
+    if given <= MOST_GIVEN * control.largest_energy:
         return
-    dynamics.largest = max(dynamics.largest, dynamics.kinetic_energy())
-    if given > MOST_GIVEN * dynamics.largest:
-        raise _EnergyGivenError(f"contacts would give the bodies {given:.3g} of energy, which have {dynamics.largest:.3g}")
+    control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
+    if given > MOST_GIVEN * control.largest_energy:
+        raise EnergyGivenError(f"contacts would give the bodies {given:.3g} of energy, which have {control.largest_energy:.3g}")
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:
@@ -333,29 +236,4 @@ def _touching(problem: UnitedProblem) -> list[bool]:
 
 def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
     """Difference of times that means nothing."""
-    return max(NOTHING * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))
-
-
-def set_load(problem: UnitedProblem, at: float) -> None:
-    """Set loads, and what else the problem's ``load`` sets, of a load factor or a time (collective).
-
-    What a function raises on some ranks is raised on all of them, where it can be sent as it is; else as a RuntimeError.
-    """
-    if isinstance(problem.load, fem.Constant):
-        problem.load.value = at
-    elif problem.load is not None:
-        try:
-            problem.load(at)
-        except Exception as error:
-            agree(problem.comm, error if problem.comm.size == 1 else _to_be_sent(error))
-        else:
-            agree(problem.comm, None)
-
-
-def _to_be_sent(error: Exception) -> Exception:
-    """The error, or its words if it does not survive the way to other ranks."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
+    return max(REMAINDER * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))

@@ -1,0 +1,87 @@
+"""Length of load steps and time steps: halved where a step fails, doubled again up to the nominal one where steps are easy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uem_dolfinx import errors
+from uem_dolfinx.log import logger
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: A step may be cut to this part of its nominal length.
+#: [convention; nominal length; test_thresholds_motion.py::test_steps_are_cut_ten_times]
+SHORTEST_LENGTH = 1.0 / 1024
+#: A step that needs no more linear solves than this is easy: the next one may be twice as long.
+#: [convention; linear solves; test_thresholds_motion.py::test_easy_steps_are_doubled]
+EASY = 6
+#: What is left to the end, or to a multiple of the nominal length, is rounding below this part of it.
+#: [convention; nominal length; test_thresholds_motion.py::test_no_step_for_rounding]
+REMAINDER = 1e-9
+
+
+class EnergyGivenError(errors.UEMError):
+    """Contacts have given the bodies energy within a step; never leaves the time stepping."""
+
+
+#: What a shorter step may mend.
+MENDABLE = (
+    errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
+    errors.TunnellingError, EnergyGivenError,
+)  # fmt: skip
+
+
+class StepControl:
+    """Length of the next step, and what is known of the steps before it.
+
+    Args:
+        nominal: length of the steps where nothing fails, in load factor or time.
+
+    Attributes:
+        longest: bound on the length of the next step.
+        number: of steps done.
+        largest_energy: largest kinetic energy of the bodies that a time step has been judged by.
+    """
+
+    def __init__(self, nominal: float = 1.0):
+        self.nominal, self.longest, self.number, self.largest_energy = nominal, np.inf, 0, 0.0
+        self._cuts = 0
+
+    def begin(self, nominal: float) -> None:
+        """Go on with steps of another nominal length."""
+        self.nominal, self._cuts = nominal, 0
+
+    @property
+    def length(self) -> float:
+        """Length of the next step, where nothing else ends it."""
+        return min(self.longest, self.nominal)
+
+    def shorten(self, length: float, error: errors.UEMError) -> bool:
+        """Halve a step of this length that failed.
+
+        Returns:
+            Whether to try again: not if the error has nothing to do with the length, or if the step would become too short.
+        """
+        if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_LENGTH * self.nominal:
+            return False
+        self.longest, self._cuts = 0.5 * length, self._cuts + 1
+        logger.info("step %d failed (%s); cut to %.3g", self.number + 1, error, self.longest)
+        return True
+
+    def done(self, iterations: Sequence[object]) -> tuple[int, int]:
+        """Count a step that converged with this history; returns its number and how often it had been cut."""
+        if len(iterations) - 1 <= EASY:
+            self.longest *= 2.0
+        cuts, self._cuts, self.number = self._cuts, 0, self.number + 1
+        return self.number, cuts
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Numbers that a run goes on from, by name."""
+        return {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
+
+    def from_checkpoint(self, kept: dict[str, Any]) -> None:
+        """Go on from what ``to_checkpoint`` returned; other numbers may stand beside them."""
+        self.number, self.longest, self.largest_energy = (kept[name] for name in self.to_checkpoint())
