@@ -30,8 +30,9 @@ from uem_dolfinx.errors import (
     TunnellingError,
     UEMError,
 )
-from uem_dolfinx.geometry.gmsh import Tag, read_gmsh
+from uem_dolfinx.geometry.gmsh import read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
+from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.materials.elastic import LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.materials.von_mises import VonMises
 from uem_dolfinx.output.energy import Energies, EnergyBook

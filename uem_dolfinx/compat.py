@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 DOLFINX_VERSION: tuple[int, int] = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])  # type: ignore[assignment]
 
+if DOLFINX_VERSION < (0, 6):
+    # the compiler's set-up logs every command to the root logger; newer FFCx keeps them off the terminal in the same way
+    logging.getLogger().addFilter(lambda record: record.levelno > logging.INFO or "distutils" not in record.pathname)
+
 # ---------------------------------------------------------------------------------------------- backends
 
 
@@ -92,6 +96,21 @@ def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
     geometry = domain.geometry
     dofmap = geometry.dofmaps[0] if DOLFINX_VERSION >= (0, 11) else geometry.dofmap
     return cell_table(domain, dofmap)
+
+
+def belongs_to(meshtags: Any, domain: Any) -> bool:
+    """Whether MeshTags are of a mesh, and not of another one."""
+    topology = getattr(meshtags, "mesh", meshtags).topology
+    return getattr(topology, "_cpp_object", topology) is getattr(domain.topology, "_cpp_object", domain.topology)
+
+
+def shared_by_ranks(index_map: Any, indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Local indices, ghosts included, of all that any rank names by its own local index, ascending (collective)."""
+    named = la.vector(index_map)
+    named.array[indices] = 1.0
+    named.scatter_reverse((la.InsertMode if hasattr(la, "InsertMode") else la.ScatterMode).add)
+    named.scatter_forward()
+    return np.flatnonzero(named.array).astype(np.int32)
 
 
 # ---------------------------------------------------------------------------------------------- spaces and functions
@@ -312,16 +331,38 @@ def on_compilation(tell: Callable[[], None]) -> Iterator[None]:
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
-    """The form with its tags at all integrals of a kind; DOLFINx 0.9 takes those over everything, which have none, for others."""
-    known = {i.integral_type(): i.subdomain_data() for i in F.integrals() if i.subdomain_data() is not None}
-    return ufl.Form(
-        [
-            i.reconstruct(subdomain_data=known[i.integral_type()])
-            if i.subdomain_data() is None and i.integral_type() in known
-            else i
-            for i in F.integrals()
-        ]
-    )
+    """The form with the same tags at all integrals of a kind, as UFL wants it, whatever each of them came with (collective).
+
+    Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
+    """
+    integrals = []
+    for kind in dict.fromkeys(i.integral_type() for i in F.integrals()):
+        own = F.integrals_by_type(kind)
+        data = list({id(d): d for i in own if (d := i.subdomain_data()) is not None}.values())
+        if len(data) > 1 and all(hasattr(d, "indices") for d in data):
+            own, data = _of_common_tags(F, own)
+        integrals += [i.reconstruct(subdomain_data=data[0]) if i.subdomain_data() is None and data else i for i in own]
+    return ufl.Form(integrals)
+
+
+def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Integrals of one kind with MeshTags that number every overlap of those they came with, and these MeshTags (collective)."""
+    of = [[(i.subdomain_data(), n) for n in np.ravel(i.subdomain_id()) if n != "everywhere"] for i in integrals]
+    pairs = list({(id(d), int(n)): (d, int(n)) for own in of for d, n in own}.values())
+    entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
+    within = np.stack([np.isin(entities, d.indices[d.values == n]) for d, n in pairs], axis=1)
+    rows, which = np.unique(within, axis=0, return_inverse=True)
+    domain = F.ufl_domain().ufl_cargo()
+    known = sorted({tuple(row) for part in domain.comm.allgather(rows.tolist()) for row in part})
+    numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
+    tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
+    column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
+    out = []
+    for integral, own in zip(integrals, of):
+        columns = [column[id(d), int(n)] for d, n in own]
+        ids = tuple(j for j, row in enumerate(known, 1) if any(row[k] for k in columns)) or (len(known) + 1,)
+        out.append(integral.reconstruct(subdomain_data=tags, subdomain_id=ids if own else "everywhere"))
+    return out, [tags]
 
 
 def petsc_forms() -> Any:

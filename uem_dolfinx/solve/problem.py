@@ -16,6 +16,7 @@ from uem_dolfinx.contact.checks import check_prescribed
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.newton import Iteration, solve_united
 from uem_dolfinx.solve.system import BodySystem
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from uem_dolfinx.contact.contact import Contact
     from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.geometry.gmsh import Tag
     from uem_dolfinx.materials.elastic import HistoryMaterial
 
 #: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
@@ -227,14 +227,15 @@ class UnitedProblem:
         state.restore.append(restore)
         return state
 
-    def reaction(self, tag: Tag) -> np.ndarray:
-        """Force with which the Dirichlet conditions act on the nodes of a tag: their sum ``(gdim,)`` (collective).
+    def reaction(self, tag: Part) -> np.ndarray:
+        """Force with which the Dirichlet conditions act on the nodes of a part of the mesh: their sum ``(gdim,)`` (collective).
 
         Args:
-            tag: entities of any dimension; components without Dirichlet condition count as zero.
+            tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero.
         """
         self.system.assemble_residual()
-        nodes, shape = surface_nodes(self.config, tag), (-1, self.config.gdim)
+        tdim, shape = self.config.tdim, (-1, self.config.gdim)
+        nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
         force = self.system.residual.array_r.reshape(shape)[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(shape)[nodes]
