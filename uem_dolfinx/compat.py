@@ -116,18 +116,24 @@ def shared_by_ranks(index_map: Any, indices: npt.NDArray[np.int32]) -> npt.NDArr
 # ---------------------------------------------------------------------------------------------- spaces and functions
 
 
-def function_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
-    """Continuous Lagrange space.
+def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[int] = ()) -> Any:
+    """Space of functions on a mesh: ``function_space(mesh, 1, (2,))`` or ``function_space(mesh, ("Lagrange", 1, (2,)))``.
 
     Args:
         domain: the mesh.
-        degree: polynomial degree.
+        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)``.
         shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
 
     Returns:
         The function space.
+
+    Raises:
+        ValueError: for another element.
     """
-    return _space(domain, "Lagrange", degree, tuple(shape))
+    given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
+    if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
+        raise ValueError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
+    return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
 
 
 def dg0_space(domain: Any, shape: Sequence[int] = ()) -> Any:
