@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
@@ -358,9 +359,11 @@ def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], l
     entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
     within = np.stack([np.isin(entities, d.indices[d.values == n]) for d, n in pairs], axis=1)
     rows, which = np.unique(within, axis=0, return_inverse=True)
-    domain = F.ufl_domain().ufl_cargo()
-    known = sorted({tuple(row) for part in domain.comm.allgather(rows.tolist()) for row in part})
+    cpp_mesh = F.ufl_domain().ufl_cargo()
+    known = sorted({tuple(row) for part in cpp_mesh.comm.allgather(rows.tolist()) for row in part})
     numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
+    # what DOLFINx 0.5 and what newer ones take from the mesh
+    domain = SimpleNamespace(_mesh=cpp_mesh, topology=SimpleNamespace(_cpp_object=cpp_mesh.topology))
     tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
     column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
     out = []
