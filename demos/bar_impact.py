@@ -25,7 +25,6 @@ from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, n=100, cfl=1.0, mass=("consistent", "lumped"))
 E, rho, L, v0, gap, g = 900.0, 1.0, 10.0, 10.0, 5.0, 10.0
@@ -45,7 +44,7 @@ def bar(dt: float, end: float, name: str, *, fall: bool = False, contactors: str
     mesh, tags = uem.read_gmsh(
         common.MESHES / "bars.geo", comm, gdim=2, parameters={"n": args.n, "L": L, "gap": 0.0 if swing else gap}
     )
-    V = compat.function_space(mesh, 1, (2,))
+    V = uem.function_space(mesh, 1, (2,))
     u, v, velocity = fem.Function(V, name="displacement"), ufl.TestFunction(V), fem.Function(V)
     y = V.tabulate_dof_coordinates()[: len(velocity.x.array) // 2, 1]
     velocity.x.array[1::2] = -v0 * np.sin(np.pi * y / (2 * L)) if swing else 0.0 if fall else -v0

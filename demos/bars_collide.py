@@ -21,7 +21,6 @@ from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, dim=2, n=100, n_width=2, cfl=0.7071, v1=4.0, v2=-6.0)
 E, rho, L, gap, width = 900.0, 1.0, 10.0, 0.1, 1.0
@@ -44,7 +43,7 @@ sizes = {
     "n_upper": args.n_width + 1,
 }
 mesh, tags = uem.read_gmsh(common.MESHES / "bars.geo", comm, gdim=d, parameters=sizes)
-V = compat.function_space(mesh, 1, (d,))
+V = uem.function_space(mesh, 1, (d,))
 u, v, velocity = fem.Function(V, name="displacement"), ufl.TestFunction(V), fem.Function(V)
 mesh.topology.create_connectivity(d, d)
 for name, value in (("lower", args.v1), ("upper", args.v2)):
@@ -62,16 +61,14 @@ problem = uem.UnitedProblem(
 
 # %%
 volume = L * width ** (d - 1)
-means = [
-    compat.form(dynamics.velocity[1] / volume * forms.cell_measure(mesh, tags[name].entities)) for name in ("lower", "upper")
-]
+means = [fem.form(dynamics.velocity[1] / volume * uem.dx(tags[name])) for name in ("lower", "upper")]
 book = uem.EnergyBook(problem, material.energy(u) * ufl.dx, path=f"{args.output}/energy.csv" if args.output else None)
 writer = uem.ResultsWriter(f"{args.output}/bars_collide", problem) if args.output else None
 meet = gap / (args.v1 - args.v2)
 rows = []
 for step in uem.time_steps(problem, args.cfl * L / args.n / c, meet + 3 * L / c, event_tolerance=1e-3):
     book.write(step)
-    rows.append((step.time, *(forms.assemble_scalar(form, comm) for form in means), contact.resultant().force[1]))
+    rows.append((step.time, *(uem.integrate(form) for form in means), contact.resultant().force[1]))
     if writer is not None and step.number % 10 == 0:
         writer.write(step)
 book.close()

@@ -17,11 +17,10 @@ python3 demos/beam_impact.py --plot beam_impact.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, dt=0.01, end=0.6)
 V0, E_beam, E_column, yield_stress = 32.0, 6e4, 2e4, 800.0
@@ -35,7 +34,7 @@ V0, E_beam, E_column, yield_stress = 32.0, 6e4, 2e4, 800.0
 def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, float], np.ndarray]:
     """The figures of an impact, and its history: time, force, contact or not."""
     mesh, tags = uem.read_gmsh(common.MESHES / "beam_impact.geo", comm, gdim=2)
-    V, S = compat.function_space(mesh, 1, (2,)), compat.dg0_space(mesh)
+    V, S = uem.function_space(mesh, 1, (2,)), uem.function_space(mesh, ("DG", 0))
     u, v, velocity = fem.Function(V, name="displacement"), ufl.TestFunction(V), fem.Function(V)
     E, strength = fem.Function(S), fem.Function(S)
     E.x.array[:], strength.x.array[:] = E_beam, np.inf
@@ -46,7 +45,7 @@ def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, floa
     mass = uem.nodal_mass(V, lambda x: np.where(x[:, 1] > 1.01, 1.0, 0.0))
     contact = uem.Contact(contactor=tags["column_bottom"], target=tags["beam_top"])
     problem = uem.UnitedProblem(
-        law.residual(v), u, bcs=[dirichlet(V, tags["beam_ends"], i, 0.0) for i in (0, 1)], contacts=[contact], materials=[law],
+        law.residual(v), u, bcs=[uem.dirichlet(V, tags["beam_ends"])], contacts=[contact], materials=[law],
         dynamics=uem.Dynamics(mass, velocity=velocity), petsc_options_prefix="beam_", verbose=args.verbose,
     )  # fmt: skip
     writer = uem.ResultsWriter(f"{args.output}/{name}", problem) if args.output else None

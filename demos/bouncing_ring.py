@@ -21,7 +21,6 @@ from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, dt=0.0015, end=6.6, n=48, layers=3, E=500.0)
 g, height, along = 2.0, 0.25, 1.0  # gravity, height of fall, velocity along the floor
@@ -31,7 +30,7 @@ g, height, along = 2.0, 0.25, 1.0  # gravity, height of fall, velocity along the
 
 # %%
 mesh, tags = uem.read_gmsh(common.MESHES / "ring.geo", comm, gdim=2, parameters={"n": args.n, "layers": args.layers})
-V = compat.function_space(mesh, 1, (2,))
+V = uem.function_space(mesh, 1, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 material = uem.StVenantKirchhoff(args.E, 0.3, kind="plane_strain")
 floor = uem.Contact(contactor=tags["outside"], target=uem.RigidPlane((0.0, -1.0 - height), (0.0, 1.0)), name="floor")

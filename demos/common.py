@@ -1,25 +1,22 @@
-"""What the demos share: their arguments, Dirichlet conditions by tag, and a table with its JSON file."""
+"""What the demos share: their arguments, and a table with its JSON file."""
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import logging
 import os
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.linear_solver import multigrid_options
-
-if TYPE_CHECKING:
-    import uem_dolfinx as uem
+import uem_dolfinx as uem
 
 MESHES = Path(__file__).resolve().parent.parent / "meshes"
 comm = MPI.COMM_WORLD
@@ -54,7 +51,7 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
 
 def cg(amg: str = "", rtol: float = 1e-10) -> dict[str, Any]:
     """PETSc options of CG with algebraic multigrid, hypre where PETSc has it."""
-    return {"ksp_type": "cg", "ksp_rtol": rtol} | multigrid_options(amg)
+    return {"ksp_type": "cg", "ksp_rtol": rtol} | uem.multigrid_options(amg)
 
 
 def numbers(text: str, mark: str = ",") -> list[int]:
@@ -68,10 +65,10 @@ def outside_mpi() -> dict[str, str]:
     return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
 
 
-def dirichlet(V: fem.FunctionSpace, tag: uem.Tag, component: int, value: float) -> fem.DirichletBC:
-    """Prescribe one component of the displacement on the facets of a tag."""
-    dofs = fem.locate_dofs_topological(V.sub(component), tag.dim, tag.entities)
-    return fem.dirichletbc(PETSc.ScalarType(value), dofs, V.sub(component))
+def free_memory() -> None:
+    """Free what Python and PETSc have let go of (collective)."""
+    gc.collect()
+    PETSc.garbage_cleanup(comm)
 
 
 def order(step: uem.LoadStep, rounding: float = 1e-12) -> float:

@@ -18,12 +18,10 @@ import time
 
 import common
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx.algebra.linear_solver import has_hypre
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, dofs=100_000, degree=1)
 CONTACT = ("search and projection", "uniting equations", "contact curvature", "united matrix P'KP")
@@ -33,12 +31,12 @@ PARTS = {
     "united matrix P'KP": ("restriction matrix P", "cross out prescribed components"),
     "linear solve": ("factorisation or preconditioner set-up",),
 }
-AMG = ("gamg", "hypre") if has_hypre() else ("gamg",)
+AMG = ("gamg", "hypre") if uem.multigrid_options()["pc_type"] == "hypre" else ("gamg",)
 
 
 def elastic(mesh, dim: int) -> tuple[fem.Function, ufl.Form]:
     """Displacement and residual of a linear elastic body."""
-    V = compat.function_space(mesh, args.degree, (dim,))
+    V = uem.function_space(mesh, args.degree, (dim,))
     u = fem.Function(V, name="displacement")
     law = uem.LinearElastic(1e6, 0.3, kind="plane_strain" if dim == 2 else "3d")
     return u, law.residual(u, ufl.TestFunction(V)) * ufl.dx
@@ -52,7 +50,7 @@ def elastic(mesh, dim: int) -> tuple[fem.Function, ufl.Form]:
 # %%
 def clock(stage: str) -> float:
     """Seconds that a stage and its parts have taken so far."""
-    return sum(compat.timing(f"~UEM: {timer}") for timer in (stage, *PARTS.get(stage, ())))
+    return sum(uem.timing(timer)[1] for timer in (stage, *PARTS.get(stage, ())))
 
 
 def share(dim: int) -> dict[str, object]:
@@ -67,8 +65,10 @@ def share(dim: int) -> dict[str, object]:
         push, fixed = -(a**2), ["symmetry_x", "symmetry_y"]
     mesh, tags = uem.read_gmsh(common.MESHES / f"{names[0]}.geo", comm, gdim=dim, parameters=parameters)
     u, F = elastic(mesh, dim)
-    bcs = [dirichlet(u.function_space, tags[name], i, 0.0) for i, name in enumerate(fixed)]
-    bcs += [dirichlet(u.function_space, tags[name], dim - 1, value) for name, value in (("block_bottom", 0.0), (names[2], push))]
+    bcs = [uem.dirichlet(u.function_space, tags[name], i) for i, name in enumerate(fixed)]
+    bcs += [
+        uem.dirichlet(u.function_space, tags[name], dim - 1, value) for name, value in (("block_bottom", 0.0), (names[2], push))
+    ]
     contact = uem.Contact(contactor=tags[names[1]], target=tags["block_top"])
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="share_")
     before = {stage: clock(stage) for stage in CONTACT + OTHERS}
@@ -97,8 +97,8 @@ def cg_iterations(dim: int, amg: str, fused: bool) -> tuple[int, int]:
     )
     u, F = elastic(mesh, dim)
     V = u.function_space
-    bcs = [dirichlet(V, tags[name], i, 0.0) for name in ("bottom", "top") for i in range(dim - 1)]
-    bcs += [dirichlet(V, tags["bottom"], dim - 1, 0.0), dirichlet(V, tags["top"], dim - 1, -0.01)]
+    bcs = [uem.dirichlet(V, tags[name], i) for name in ("bottom", "top") for i in range(dim - 1)]
+    bcs += [uem.dirichlet(V, tags["bottom"], dim - 1), uem.dirichlet(V, tags["top"], dim - 1, -0.01)]
     contacts = [] if fused else [uem.Contact(contactor=tags["upper_bottom"], target=tags["lower_top"])]
     problem = uem.UnitedProblem(
         F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=common.cg(amg, 1e-8), rtol=1e-6

@@ -17,22 +17,17 @@ python3 demos/cost.py --json cost.json --plot cost.png
 # block. Forms were compiled before. Lists are parted by commas, so that `--linear 3:100000,3:500000` asks for two sizes in 3D.
 
 # %%
-import gc
 import time
 from pathlib import Path
 
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 from evidence.measure import machine
-from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
-from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.surfaces import surface_nodes
 
 args = common.arguments(
     __doc__,
@@ -72,13 +67,13 @@ class Hertz:
             parameters = {"zone": 1.4 * a, "growth": 0.8 / a, "h": 0.1 * a * (89_000 / dofs) ** (1 / 3)}
             self.push, held = -(a**2), ["symmetry_x", "symmetry_y"]
         self.mesh, tags = uem.read_gmsh(common.MESHES / f"{names[0]}.geo", comm, gdim=dim, parameters=parameters)
-        self.V = compat.function_space(self.mesh, 1, (dim,))
+        self.V = uem.function_space(self.mesh, 1, (dim,))
         self.dim, self.tags, self.surface = dim, tags, names[1]
-        self.bcs = [dirichlet(self.V, tags[name], i, 0.0) for i, name in enumerate([*held, "block_bottom"])]
-        self.bcs.append(dirichlet(self.V, tags[names[2]], dim - 1, self.push))
+        self.bcs = [uem.dirichlet(self.V, tags[name], i) for i, name in enumerate([*held, "block_bottom"])]
+        self.bcs.append(uem.dirichlet(self.V, tags[names[2]], dim - 1, self.push))
         self.dofs = dim * self.V.dofmap.index_map.size_global
         #: Young's modulus of the cells.
-        self.E = fem.Function(compat.dg0_space(self.mesh))
+        self.E = fem.Function(uem.function_space(self.mesh, ("DG", 0)))
 
     def problem(
         self, contact: bool, finite: bool = False, stiffness: float = 1.0, options: dict | None = None
@@ -95,7 +90,7 @@ class Hertz:
             contacts = [uem.Contact(contactor=self.tags[self.surface], target=self.tags["block_top"], sliding=sliding)]
         else:
             weight = np.array([0.0] * (dim - 1) + [-1e3])
-            F = F - ufl.inner(fem.Constant(self.mesh, PETSc.ScalarType(weight)), v) * ufl.dx
+            F = F - ufl.inner(fem.Constant(self.mesh, weight), v) * ufl.dx
         return uem.UnitedProblem(
             F, u, bcs=self.bcs, contacts=contacts, petsc_options_prefix="cost_", petsc_options=options, rtol=TOLERANCE,
             verbose=args.verbose,
@@ -110,14 +105,13 @@ class Hertz:
 # %%
 def clocks() -> dict[str, float]:
     """Seconds that each stage has taken so far."""
-    return {stage: compat.timing(f"~UEM: {stage}") for stage in STAGES}
+    return {stage: uem.timing(stage)[1] for stage in STAGES}
 
 
 def measure(scene: Hertz, contact: bool, finite: bool) -> tuple[dict[str, float], list, float | None]:
     """Solve some times: seconds of the stages and of "all" in the quickest, its history, and bytes of memory (collective)."""
     best: tuple[dict[str, float], list] | None = None
-    gc.collect()
-    forms.free_petsc_garbage(comm)
+    common.free_memory()
     forget_peak()
     for _ in range(args.runs):
         comm.barrier()
@@ -127,8 +121,7 @@ def measure(scene: Hertz, contact: bool, finite: bool) -> tuple[dict[str, float]
         spent |= {stage: seconds - before[stage] for stage, seconds in clocks().items()}
         if best is None or spent["all"] < best[0]["all"]:
             best = spent, history
-        gc.collect()
-        forms.free_petsc_garbage(comm)
+        common.free_memory()
     assert best is not None
     return *best, peak()
 
@@ -157,7 +150,8 @@ def row(dim: int, dofs: int, finite: bool) -> dict[str, object]:
     scene = Hertz(dim, dofs)
     bare, path, memory = measure(scene, False, finite)
     spent, history, more = measure(scene, True, finite)
-    contactors = len(surface_nodes(Configuration(fem.Function(scene.V)), scene.tags[scene.surface]))
+    nodes = fem.locate_dofs_topological(scene.V, dim - 1, scene.tags[scene.surface].entities)
+    contactors = int((nodes < scene.V.dofmap.index_map.size_local).sum())
     return {
         "scene": "finite" if finite else "linear",
         "dim": dim,
@@ -188,8 +182,7 @@ def iterations(scene: Hertz, stiffness: float) -> dict[str, object]:
         solves = [i.linear_iterations for i in scene.problem(contact, False, stiffness, options).solve() if i.linear_iterations]
         # the one before looks for the contact, later ones may keep its preconditioner
         found[name] = solves[1] if contact else solves[0]
-        gc.collect()
-        forms.free_petsc_garbage(comm)
+        common.free_memory()
     return {"dofs": scene.dofs, "stiffness": stiffness} | found
 
 

@@ -27,11 +27,9 @@ import ufl
 from common import comm
 from dolfinx import fem
 from dolfinx.mesh import locate_entities_boundary
-from petsc4py import PETSc
 from scipy.interpolate import CubicHermiteSpline
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, length=6000.0, dt=0.001)
 k, G, V0, gap, width, Fy, w = 200.0, 10.0, 10.0, 3.5805, 20.0, 7.5, np.sqrt(200.0)
@@ -83,11 +81,11 @@ L = args.length
 mesh, tags = uem.read_gmsh(
     common.MESHES / "bars.geo", comm, gdim=2, parameters={"L": L, "width": width, "gap": gap, "n": 1, "n_width": 1}
 )
-V = compat.function_space(mesh, 1, (2,))
+V = uem.function_space(mesh, 1, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 law = uem.VonMises(u, k * L / width, 0.3, Fy, kind="plane_stress", strain="green_lagrange")
 left = locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[0], -width / 2))
-bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), fem.locate_dofs_topological(V.sub(0), 1, left), V.sub(0))]
+bcs = [uem.dirichlet(V, left, 0)]
 mass = uem.nodal_mass(V, lambda x: np.where(x[:, 1] > L / 2, 0.5, 0.0)[:, None] * [0.0, 1.0])
 ground = uem.Contact(contactor=tags["lower_bottom"], target=uem.RigidPlane((0.0, 0.0), (0.0, 1.0)), name="ground")
 problem = uem.UnitedProblem(

@@ -19,11 +19,10 @@ python3 demos/force_closed.py --plot force_closed.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__, h=1 / 60, ratio=1.5, gap=0.05, weight=1000.0, steps=1, degree=1, normals=("facet", "averaged")
@@ -39,15 +38,15 @@ mesh, tags = uem.read_gmsh(
     common.MESHES / "force_closed.geo", comm, gdim=2,
     parameters={"h": args.h, "ratio": args.ratio, "gap": args.gap, "R": R, "W": W, "order": args.degree},
 )  # fmt: skip
-V = compat.function_space(mesh, args.degree, (2,))
+V = uem.function_space(mesh, args.degree, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 material = uem.LinearElastic(E, nu, kind="plane_strain")
-inside = fem.Function(compat.dg0_space(mesh), name="inside")
+inside = fem.Function(uem.function_space(mesh, ("DG", 0)), name="inside")
 inside.x.array[tags["disc"].entities] = 1.0
 load = fem.Constant(mesh, 0.0)
 density = args.weight / (np.pi * R**2 / 2) * inside
 F = material.residual(u, v) * ufl.dx + load * density * v[1] * ufl.dx
-bcs = [dirichlet(V, tags["block_bottom"], i, 0.0) for i in range(2)]
+bcs = [uem.dirichlet(V, tags["block_bottom"])]
 contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], normals=args.normals)
 
 # %% [markdown]
@@ -64,7 +63,7 @@ steps = list(uem.load_steps(problem, args.steps))
 # The weight is that of the mesh, whose arc is a polygon.
 
 # %%
-weight = forms.assemble_scalar(compat.form(density * ufl.dx), comm)
+weight = uem.integrate(density * ufl.dx)
 P = contact.resultant().force
 p0 = np.sqrt(P[1] * E / (2 * (1 - nu**2)) / (np.pi * R))
 results = {

@@ -20,11 +20,10 @@ import time
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__,
@@ -48,14 +47,14 @@ mesh, tags = uem.read_gmsh(
     common.MESHES / "hertz_cylinder.geo", comm, gdim=2,
     parameters={"h": args.h, "ratio": args.ratio, "quads": args.quads, "order": args.degree},
 )  # fmt: skip
-V = compat.function_space(mesh, args.degree, (2,))
+V = uem.function_space(mesh, args.degree, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 material = uem.LinearElastic(E, nu, kind="plane_strain")
 F = material.residual(u, v) * ufl.dx
 bcs = [
-    dirichlet(V, tags["symmetry"], 0, 0.0),
-    dirichlet(V, tags["block_bottom"], 1, 0.0),
-    dirichlet(V, tags["disc_top"], 1, -0.006),
+    uem.dirichlet(V, tags["symmetry"], 0),
+    uem.dirichlet(V, tags["block_bottom"], 1),
+    uem.dirichlet(V, tags["disc_top"], 1, -0.006),
 ]
 contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], normals=args.normals, chords=bool(args.chords))
 
@@ -88,11 +87,11 @@ seconds = time.perf_counter() - start
 P = 2 * contact.resultant().force[1]
 E_star = E / (2 * (1 - nu**2))
 p0 = np.sqrt(P * E_star / (np.pi * R))
-arc = forms.surface_measure(mesh, tags["disc_arc"].entities)
+arc = uem.ds(tags["disc_arc"])
 balance = contact.balance()
 results = {
     "P": float(P),
-    "a": forms.assemble_scalar(compat.form(contact.active * arc), comm),
+    "a": uem.integrate(contact.active * arc),
     "a_hertz": float(2 * P / (np.pi * p0)),
     "p0_hertz": float(p0),
     "p_max": contact.max_pressure(),

@@ -21,14 +21,12 @@ import time
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
+from dolfinx.fem import petsc
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
-from uem_dolfinx.algebra.linear_solver import rigid_body_modes
-from uem_dolfinx.geometry.configuration import Configuration
 
 args = common.arguments(__doc__, N=30, degree=1)
 R, d = 0.5, 0.02
@@ -47,11 +45,10 @@ def h(x):
 mesh, tags = uem.read_gmsh(common.MESHES / "hertz_penalty.geo", comm, gdim=3, parameters={"N": args.N})
 x = mesh.geometry.x
 x[:] = x**2 * [1, 1, -1]
-V = compat.function_space(mesh, args.degree, (3,))
+V = uem.function_space(mesh, args.degree, (3,))
 u, v, du = fem.Function(V, name="displacement"), ufl.TestFunction(V), ufl.TrialFunction(V)
 F = uem.LinearElastic(10.0, 0.3).residual(u, v) * ufl.dx
-bcs = [dirichlet(V, tags["bottom"], i, 0.0) for i in range(3)]
-bcs += [dirichlet(V, tags["side_x0"], 0, 0.0), dirichlet(V, tags["side_y0"], 1, 0.0)]
+bcs = [uem.dirichlet(V, tags["bottom"]), uem.dirichlet(V, tags["side_x0"], 0), uem.dirichlet(V, tags["side_y0"], 1)]
 top = fem.locate_dofs_topological(V, 2, tags["top"].entities)
 X_top = V.tabulate_dof_coordinates()[top]
 
@@ -91,49 +88,57 @@ def row(force: float, p_max: float, newton: int, linear: int, seconds: float) ->
 
 # %%
 pen, X = fem.Constant(mesh, 1.0), ufl.SpatialCoordinate(mesh)
-ds = forms.surface_measure(mesh, tags["top"].entities, {"quadrature_degree": 2})
+ds = uem.ds(tags["top"], quadrature_degree=2)
 pressure = pen * ufl.max_value(u[2] + d - (X[0] ** 2 + X[1] ** 2) / (2 * R), 0.0)
 residual = F + pressure * v[2] * ds
-form_b, form_A, form_F = map(compat.form, (residual, ufl.derivative(residual, u, ufl.TrialFunction(V)), pressure * ds))
+form_b, form_A, form_F = map(fem.form, (residual, ufl.derivative(residual, u, ufl.TrialFunction(V)), pressure * ds))
 
 
 def penalty(value: float) -> dict[str, float]:
     """Solve by penalty."""
     u.x.array[:] = 0.0
     pen.value = value
-    A, b, ksp = forms.create_matrix(form_A), compat.create_vector(V), PETSc.KSP().create(comm)
+    A, ksp, n = petsc.create_matrix(form_A), PETSc.KSP().create(comm), 3 * V.dofmap.index_map.size_local
     for key, option in OPTIONS.items():
         PETSc.Options()["penalty_" + key] = option
     ksp.setOptionsPrefix("penalty_")
     ksp.setFromOptions()
-    fixed = np.concatenate([dofs[:owned] for dofs, owned in map(compat.bc_dofs, bcs)])
-    A.setNearNullSpace(near_null_space(b, fixed))
+    fixed = np.concatenate([bc.dof_indices()[0] for bc in bcs])
+    fixed = fixed[fixed < n]
+    A.setNearNullSpace(near_null_space(A.createVecRight(), fixed))
     start, newton, linear, first = time.perf_counter(), 0, 0, None
     while newton < 50:
-        forms.assemble_vector(b, form_b)
+        b = petsc.assemble_vector(form_b)
+        b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         b.array[fixed] = 0.0
         first = first or b.norm()
         if b.norm() <= 1e-8 * first:
             break
         A.zeroEntries()
-        fem.petsc.assemble_matrix(A, form_A, bcs)
+        petsc.assemble_matrix(A, form_A, bcs)
         A.assemble()
         ksp.setOperators(A)
         step = b.duplicate()
         ksp.solve(b, step)
-        compat.petsc_vector(u).axpy(-1.0, step)
+        u.x.array[:n] -= step.array
         u.x.scatter_forward()
         newton, linear = newton + 1, linear + ksp.getIterationNumber()
     seconds = time.perf_counter() - start
     depth = (u.x.array.reshape(-1, 3)[top, 2] - h(X_top)).max(initial=0.0)
     p_max = value * max(comm.allgather(depth))
-    return {"penalty": value} | row(4 * forms.assemble_scalar(form_F, comm), p_max, newton, linear, seconds)
+    return {"penalty": value} | row(4 * uem.integrate(form_F), p_max, newton, linear, seconds)
 
 
 def near_null_space(b: PETSc.Vec, fixed: np.ndarray) -> PETSc.NullSpace:
     """Rigid-body modes, zero where the displacement is prescribed."""
     vectors: list[PETSc.Vec] = []
-    for mode in rigid_body_modes(Configuration(u)):
+    places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
+    for k in range(6):
+        mode, (i, j) = np.zeros_like(places), ((0, 1), (0, 2), (1, 2))[k % 3]
+        if k < 3:
+            mode[:, k] = 1.0
+        else:
+            mode[:, i], mode[:, j] = -places[:, j], places[:, i]
         vector = b.duplicate()
         vector.array[:] = mode.ravel()
         vector.array[fixed] = 0.0

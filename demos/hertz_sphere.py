@@ -22,11 +22,10 @@ import time
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, h=0.0005, ratio=1.0, normals=("facet", "averaged"), degree=1, steps=1, d=2.5e-5, refinements=3)
 E, nu, R = 1e6, 0.3, 1.0
@@ -47,14 +46,14 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
         parameters={"h": h, "ratio": args.ratio, "R": R, "W": 2 * R, "zone": 1.4 * a, "growth": 0.8 / a,
                     "order": args.degree},
     )  # fmt: skip
-    V = compat.function_space(mesh, args.degree, (3,))
+    V = uem.function_space(mesh, args.degree, (3,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     residual = uem.LinearElastic(E, nu).residual(u, v) * ufl.dx
     bcs = [
-        dirichlet(V, tags["symmetry_x"], 0, 0.0),
-        dirichlet(V, tags["symmetry_y"], 1, 0.0),
-        dirichlet(V, tags["block_bottom"], 2, 0.0),
-        dirichlet(V, tags["sphere_top"], 2, -args.d),
+        uem.dirichlet(V, tags["symmetry_x"], 0),
+        uem.dirichlet(V, tags["symmetry_y"], 1),
+        uem.dirichlet(V, tags["block_bottom"], 2),
+        uem.dirichlet(V, tags["sphere_top"], 2, -args.d),
     ]
     contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], normals=args.normals)
     problem = uem.UnitedProblem(
@@ -65,8 +64,8 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
     seconds = time.perf_counter() - start
 
     P = float(4 * contact.resultant().force[2])
-    cap, balance = forms.surface_measure(mesh, tags["sphere_cap"].entities), contact.balance()
-    area = 4 * forms.assemble_scalar(compat.form(contact.active * cap), comm)
+    cap, balance = uem.ds(tags["sphere_cap"]), contact.balance()
+    area = 4 * uem.integrate(contact.active * cap)
     return problem, {
         "h": h,
         "P": P,

@@ -18,11 +18,10 @@ import time
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(
     __doc__,
@@ -52,21 +51,21 @@ mesh, tags = uem.read_gmsh(
         "n_tip": args.n_tip or (9, 8)[g - 2], "layers": args.layers or (5, 3)[g - 2],
     },
 )  # fmt: skip
-V = compat.function_space(mesh, 1, (g,))
+V = uem.function_space(mesh, 1, (g,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
-stiffness = fem.Function(compat.dg0_space(mesh), name="E")
+stiffness = fem.Function(uem.function_space(mesh, ("DG", 0)), name="E")
 stiffness.x.array[:] = E
 material = uem.NeoHooke(stiffness, nu, kind="plane_strain" if g == 2 else "3d")
-bcs = [dirichlet(V, tags["slab_bottom"], i, 0.0) for i in range(g)]
+bcs = [uem.dirichlet(V, tags["slab_bottom"])]
 if g == 3:
-    bcs.append(dirichlet(V, tags["symmetry"], 1, 0.0))
+    bcs.append(uem.dirichlet(V, tags["symmetry"], 1))
 if rigid:
     ball = uem.RigidSphere((begin, *[0.0] * (g - 2), R), R)
     contact = uem.Contact(contactor=tags["slab_top"], target=ball)
 else:
     stiffness.x.array[tags["tool"].entities] = 1000 * E
     place = fem.Constant(mesh, np.zeros(g))
-    bcs.append(fem.dirichletbc(place, fem.locate_dofs_topological(V, g - 1, tags["tool_top"].entities), V))
+    bcs.append(uem.dirichlet(V, tags["tool_top"], value=place))
     contact = uem.Contact(contactor=tags["tool_tip"], target=tags["slab_top"], normals=args.normals)
 
 # %% [markdown]

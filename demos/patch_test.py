@@ -20,11 +20,10 @@ python3 demos/patch_test.py --plot patch_test.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, n=4, quads=0, dim=("both", "2", "3"), degree=("both", "1", "2"))
 E, nu, p = 100.0, 0.3, 1.0
@@ -51,12 +50,12 @@ def solve(dim: int, degree: int, n: tuple[int, int], passes: tuple[str, ...]) ->
     mesh, tags = uem.read_gmsh(
         common.MESHES / "blocks.geo", comm, gdim=dim, parameters={"dim": dim, "n_1": n[0], "n_2": n[1], "quads": args.quads}
     )
-    V = compat.function_space(mesh, degree, (dim,))
+    V = uem.function_space(mesh, degree, (dim,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d")
-    F = material.residual(u, v) * ufl.dx + p * v[dim - 1] * forms.surface_measure(mesh, tags["top_2"].entities)
-    bcs = [dirichlet(V, tags["bottom_1"], dim - 1, 0.0)]
-    bcs += [dirichlet(V, tags[sides], i, 0.0) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
+    F = material.residual(u, v) * ufl.dx + p * v[dim - 1] * uem.ds(tags["top_2"])
+    bcs = [uem.dirichlet(V, tags["bottom_1"], dim - 1)]
+    bcs += [uem.dirichlet(V, tags[sides], i) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
     lower, upper = tags["top_1"], tags["bottom_2"]
     contacts = [
         uem.Contact(contactor=lower, target=upper) if side == "lower" else uem.Contact(contactor=upper, target=lower)
@@ -64,8 +63,8 @@ def solve(dim: int, degree: int, n: tuple[int, int], passes: tuple[str, ...]) ->
     ]
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="patch_", verbose=args.verbose)
     problem.solve()
-    stress = fem.Function(compat.dg0_space(mesh), name="vertical_stress")
-    compat.interpolate_expression(stress, material.stress(u)[dim - 1, dim - 1] / p)
+    stress = fem.Function(uem.function_space(mesh, ("DG", 0)), name="vertical_stress")
+    uem.interpolate(stress, material.stress(u)[dim - 1, dim - 1] / p)
     error = np.abs(stress.x.array + 1).max(initial=0.0)
     return problem, stress, float(max(comm.allgather(error)))
 

@@ -25,7 +25,7 @@ import time
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 from evidence import peers
 from evidence.measure import machine
@@ -33,7 +33,6 @@ from evidence.peers import by_calculix, by_getfem
 from evidence.problems import hertz_answer
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__, sizes="1500,6000,25000,100000", codes="uem,uem_finite,calculix,getfem", runs=3, timeout=300.0, reference=1 / 240
@@ -57,16 +56,16 @@ def united(mesh, tags, sliding):
     found = []
 
     def once():
-        forms.free_petsc_garbage(comm)
+        common.free_memory()
         comm.barrier()
         start = time.perf_counter()
-        V = compat.function_space(mesh, 1, (2,))
+        V = uem.function_space(mesh, 1, (2,))
         u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
         F = uem.LinearElastic(E, nu, kind="plane_strain").residual(u, v) * ufl.dx
         bcs = [
-            dirichlet(V, tags["symmetry"], 0, 0.0),
-            dirichlet(V, tags["block_bottom"], 1, 0.0),
-            dirichlet(V, tags["disc_top"], 1, -push),
+            uem.dirichlet(V, tags["symmetry"], 0),
+            uem.dirichlet(V, tags["block_bottom"], 1),
+            uem.dirichlet(V, tags["disc_top"], 1, -push),
         ]
         contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], sliding=sliding)
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="peers_", rtol=rtol)

@@ -22,11 +22,10 @@ python3 demos/press_fit.py --plot press_fit.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(
     __doc__, h=0.05, ratio=1.5, degree=2, delta=1e-3, sliding=("finite", "small", "fixed"), normals=("facet", "averaged"),
@@ -64,14 +63,14 @@ def solve(h: float) -> tuple[uem.UnitedProblem, uem.LinearElastic, dict[str, flo
         common.MESHES / "press_fit.geo", comm, gdim=2,
         parameters={"b": b, "c": c, "delta": args.delta, "h": h, "ratio": args.ratio, "order": args.degree},
     )  # fmt: skip
-    E, nu = (fem.Function(compat.dg0_space(mesh), name=name) for name in ("E", "nu"))
+    E, nu = (fem.Function(uem.function_space(mesh, ("DG", 0)), name=name) for name in ("E", "nu"))
     for body, E_body, nu_body in (("disc", E_disc, nu_disc), ("ring", E_ring, nu_ring)):
         E.x.array[tags[body].entities], nu.x.array[tags[body].entities] = E_body, nu_body
-    V = compat.function_space(mesh, args.degree, (2,))
+    V = uem.function_space(mesh, args.degree, (2,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material = uem.LinearElastic(E, nu, kind=args.kind)
     F = material.residual(u, v) * ufl.dx
-    bcs = [dirichlet(V, tags["symmetry_x"], 0, 0.0), dirichlet(V, tags["symmetry_y"], 1, 0.0)]
+    bcs = [uem.dirichlet(V, tags["symmetry_x"], 0), uem.dirichlet(V, tags["symmetry_y"], 1)]
     contact = uem.Contact(
         contactor=tags["disc_arc"], target=tags["ring_bore"], sliding=args.sliding, normals=args.normals, max_penetration=0.01 * b
     )

@@ -29,12 +29,11 @@ from pathlib import Path
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 from evidence.traffic import Surfaces, plates, search_traffic
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(
     __doc__,
@@ -66,15 +65,15 @@ def solve(dofs: int, runs: int) -> dict[str, object]:
     a = 0.005
     parameters = {"h": 0.1 * a * (89_000 / dofs) ** (1 / 3), "zone": 1.4 * a, "growth": 0.8 / a}
     mesh, tags = uem.read_gmsh(common.MESHES / "hertz_sphere.geo", comm, gdim=3, parameters=parameters)
-    V = compat.function_space(mesh, 1, (3,))
-    bcs = [dirichlet(V, tags[name], i, 0.0) for i, name in enumerate(("symmetry_x", "symmetry_y", "block_bottom"))]
-    bcs.append(dirichlet(V, tags["sphere_top"], 2, -(a**2)))
+    V = uem.function_space(mesh, 1, (3,))
+    bcs = [uem.dirichlet(V, tags[name], i) for i, name in enumerate(("symmetry_x", "symmetry_y", "block_bottom"))]
+    bcs.append(uem.dirichlet(V, tags["sphere_top"], 2, -(a**2)))
     found = []
     for _ in range(runs):
         u = fem.Function(V, name="displacement")
         F = uem.LinearElastic(1e6, 0.3).residual(u, ufl.TestFunction(V)) * ufl.dx
         contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], sliding="small")
-        forms.free_petsc_garbage(comm)
+        common.free_memory()
         comm.barrier()
         before, start = clocks(), time.perf_counter()
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="scaling_", verbose=args.verbose)
@@ -99,7 +98,7 @@ def solve(dofs: int, runs: int) -> dict[str, object]:
 
 def clocks() -> np.ndarray:
     """Seconds that each stage has taken so far on this rank."""
-    return np.array([sum(compat.timing(f"~UEM: {timer}") for timer in timers) for timers in STAGES.values()])
+    return np.array([sum(uem.timing(timer)[1] for timer in timers) for timers in STAGES.values()])
 
 
 # %% [markdown]

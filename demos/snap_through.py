@@ -20,11 +20,10 @@ python3 demos/snap_through.py --plot snap_through.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
 
 args = common.arguments(__doc__, dw=0.05)
 depth, per_unit = 28, max(round(1 / args.dw), 1)  # whole w are always among the stations
@@ -47,16 +46,15 @@ reference = {
 
 # %%
 mesh, tags = uem.read_gmsh(common.MESHES / "cantilevers.geo", comm, gdim=2)
-V = compat.function_space(mesh, 1, (2,))
+V = uem.function_space(mesh, 1, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 material, dx = uem.StVenantKirchhoff(1000.0, 0.3, kind="plane_stress"), ufl.dx(degree=2)
-bcs = [dirichlet(V, tags[end], i, 0.0) for end in ("upper_held", "lower_held") for i in range(2)]
-bcs.append(dirichlet(V, tags["load"], 1, -depth))
+bcs = [uem.dirichlet(V, [tags["upper_held"], tags["lower_held"]]), uem.dirichlet(V, tags["load"], 1, -depth)]
 contact = uem.Contact(contactor=tags["A"], target=tags["lower_top"], thickness=4.0)
 problem = uem.UnitedProblem(
     material.residual(u, v) * dx, u, bcs=bcs, contacts=[contact], petsc_options_prefix="snap_", verbose=args.verbose
 )
-energy = compat.form(material.energy(u) * dx)
+energy = fem.form(material.energy(u) * dx)
 
 # %% [markdown]
 # ## The way
@@ -84,7 +82,7 @@ def station(w: float) -> dict:
         "gap": float(comm.allreduce(contact.pair.gap.sum())),
         "to_end": float(np.linalg.norm(at("A") - at("end") + [40.0, 2.0])),
         "lower_tip": float(np.linalg.norm(at("end"))),
-        "energy": forms.assemble_scalar(energy, comm),
+        "energy": uem.integrate(energy),
         "active": contact.n_active,
     }
 

@@ -20,11 +20,10 @@ python3 demos/stack.py --plot stack.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, n=4, dim=("2", "3"), degree=1, ratio=1e4, d=0.1, quads=0)
 dim, nu = int(args.dim), 0.3
@@ -38,14 +37,14 @@ mesh, tags = uem.read_gmsh(
     common.MESHES / "blocks.geo", comm, gdim=dim,
     parameters={"dim": dim, "n_1": args.n, "n_2": 2 * args.n, "n_3": 4 * args.n, "quads": args.quads},
 )  # fmt: skip
-E = fem.Function(compat.dg0_space(mesh), name="E")
+E = fem.Function(uem.function_space(mesh, ("DG", 0)), name="E")
 for k, value in enumerate(E_of, start=1):
     E.x.array[tags[f"block_{k}"].entities] = value
-V = compat.function_space(mesh, args.degree, (dim,))
+V = uem.function_space(mesh, args.degree, (dim,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 F = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d").residual(u, v) * ufl.dx
-bcs = [dirichlet(V, tags["bottom_1"], dim - 1, 0.0), dirichlet(V, tags["top_3"], dim - 1, -args.d)]
-bcs += [dirichlet(V, tags[sides], i, 0.0) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
+bcs = [uem.dirichlet(V, tags["bottom_1"], dim - 1), uem.dirichlet(V, tags["top_3"], dim - 1, -args.d)]
+bcs += [uem.dirichlet(V, tags[sides], i) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
 contacts = [uem.Contact(contactor=tags[f"bottom_{k + 1}"], target=tags[f"top_{k}"]) for k in (1, 2)]
 
 # %% [markdown]

@@ -57,8 +57,8 @@ sys.path.insert(0, script.rpartition("/")[0])
 start = time.perf_counter()
 runpy.run_path(script, run_name="__main__")
 wall = time.perf_counter() - start
-from uem_dolfinx import compat
-told = {t: (compat.timing_calls("~UEM: " + t), compat.timing("~UEM: " + t)) for t in json.loads(timers)}
+import uem_dolfinx
+told = {t: uem_dolfinx.timing(t) for t in json.loads(timers)}
 with open(file, "w", encoding="utf-8") as out:
     json.dump({"timers": told, "wall": wall}, out)
 """

@@ -20,11 +20,10 @@ python3 demos/two_blocks.py --plot two_blocks.png
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 args = common.arguments(__doc__, n=4, d=0.25, steps=1, degree=1)
 LAWS = {
@@ -60,17 +59,17 @@ def solve(ratio: float, law: str, contactor: str) -> tuple[uem.UnitedProblem, di
     mesh, tags = uem.read_gmsh(
         common.MESHES / "two_blocks.geo", comm, gdim=2, parameters={f"n_{side}": n for side, n in fine.items()}
     )
-    E = fem.Function(compat.dg0_space(mesh), name="E")
+    E = fem.Function(uem.function_space(mesh, ("DG", 0)), name="E")
     for side, value in (("lower", min(1.0, 1 / ratio)), ("upper", min(1.0, ratio))):
         E.x.array[tags[side].entities] = value
-    V = compat.function_space(mesh, args.degree, (2,))
+    V = uem.function_space(mesh, args.degree, (2,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material, force = LAWS[law]
     F = material(E, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
     bcs = [
-        dirichlet(V, tags["sides"], 0, 0.0),
-        dirichlet(V, tags["lower_bottom"], 1, 0.0),
-        dirichlet(V, tags["upper_top"], 1, -args.d),
+        uem.dirichlet(V, tags["sides"], 0),
+        uem.dirichlet(V, tags["lower_bottom"], 1),
+        uem.dirichlet(V, tags["upper_top"], 1, -args.d),
     ]
     surfaces = {"upper": tags["upper_bottom"], "lower": tags["lower_top"]}
     target = surfaces["lower" if contactor == "upper" else "upper"]

@@ -19,6 +19,7 @@ python3 demos/work_precision.py --plot work_precision.png
 # the mesh.
 
 # %%
+import csv
 import json
 import logging
 from argparse import Namespace
@@ -32,8 +33,6 @@ from evidence.graphs import draw_all
 from evidence.measure import at_a_glance, grouped, label, machine, measure, name_of, rate, sweep
 from evidence.problems import bar_impact, hertz_answer, hertz_cylinder, indenter
 from evidence.signorini import signorini
-
-from uem_dolfinx.output.tables import CsvTable
 
 args = common.arguments(
     __doc__, sizes=4, runs=5, problems="signorini,hertz_cylinder,hertz_penalty,bar_impact", methods=",".join(methods.METHODS)
@@ -130,11 +129,12 @@ for scene, group in grouped(points, label).items():
 results = {"machine": machine(), "rates": rates, "glance": glance}
 common.report(Namespace(json=None), results)
 keep(results)
-if args.output:
-    columns = list(dict.fromkeys(key for point in points for key in point))
-    with CsvTable(f"{args.output}/work_precision.csv", comm, columns) as table:
-        for point in points:
-            table.write([point.get(key, "") for key in columns])
+if args.output and comm.rank == 0:
+    Path(args.output).mkdir(parents=True, exist_ok=True)
+    with open(f"{args.output}/work_precision.csv", "w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, list(dict.fromkeys(key for point in points for key in point)))
+        table.writeheader()
+        table.writerows(points)
 if args.plot:
     draw_all(args.plot, points)
 

@@ -1,11 +1,38 @@
-"""Contact for FEniCSx by the United Elements Method: exact constraints, no multipliers, no penalty.
+"""Contact for FEniCSx by the United Elements Method: exact constraints by elimination, no multipliers, no penalty.
 
-du = P dq + c,    P'KP dq = P'(r - K c)
+    du = P dq + c,    P'KP dq = P'(r - K c)
+
+The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
+
+1. Unite: the normal displacement of each active contactor follows the target: ``contact``, ``algebra.restriction``.
+2. Solve the united system, then return each contactor along the normal onto the moved target: ``algebra.linear_solver``,
+   ``contact``, with gaps and normals from ``geometry``.
+3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.newton``.
+4. Activate contactors that have gone through, release those that pull, iterate: ``solve.system``, ``solve.newton``.
+
+[UEM]: K. Farahani, M. Mofid, A. Vafai: United elements method for general contact-impact problems. Computer Methods in Applied
+Mechanics and Engineering 191 (2001) 843-860.
 """
 
 from __future__ import annotations
 
-from uem_dolfinx import compat as _compat
+__all__ = [
+    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Energies",
+    "EnergyBook", "FloatingBodyError", "HistoryWriter", "InvertedElementError", "LinearElastic", "LinearSolveError",
+    "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
+    "OrientationError", "PenetrationError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
+    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
+    "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "VonMises", "consistent_mass", "dirichlet", "ds",
+    "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps", "lumped_mass",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh",
+    "time_steps", "timing", "write_checkpoint",
+]  # fmt: skip
+
+from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
+
+from uem_dolfinx.algebra.linear_solver import multigrid_options
+from uem_dolfinx.compat import function_space
+from uem_dolfinx.compat import interpolate_expression as interpolate
 from uem_dolfinx.contact.contact import Balance, Contact, Resultant
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
@@ -30,8 +57,10 @@ from uem_dolfinx.errors import (
     TunnellingError,
     UEMError,
 )
-from uem_dolfinx.geometry.gmsh import Tag, read_gmsh
+from uem_dolfinx.geometry.gmsh import read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
+from uem_dolfinx.geometry.tags import Tag, Tags
+from uem_dolfinx.log import timing
 from uem_dolfinx.materials.elastic import LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.materials.von_mises import VonMises
 from uem_dolfinx.output.energy import Energies, EnergyBook
@@ -39,6 +68,7 @@ from uem_dolfinx.output.pictures import figure, outline, plot_pressure, plot_sce
 from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
+from uem_dolfinx.scripting import dirichlet, ds, dx, integrate
 from uem_dolfinx.solve.load_steps import LoadStep, load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 DOLFINX_VERSION: tuple[int, int] = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])  # type: ignore[assignment]
+
+if DOLFINX_VERSION < (0, 6):
+    # the compiler's set-up logs every command to the root logger; newer FFCx keeps them off the terminal in the same way
+    logging.getLogger().addFilter(lambda record: record.levelno > logging.INFO or "distutils" not in record.pathname)
 
 # ---------------------------------------------------------------------------------------------- backends
 
@@ -94,21 +99,42 @@ def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
     return cell_table(domain, dofmap)
 
 
+def belongs_to(meshtags: Any, domain: Any) -> bool:
+    """Whether MeshTags are of a mesh, and not of another one."""
+    topology = getattr(meshtags, "mesh", meshtags).topology
+    return getattr(topology, "_cpp_object", topology) is getattr(domain.topology, "_cpp_object", domain.topology)
+
+
+def shared_by_ranks(index_map: Any, indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Local indices, ghosts included, of all that any rank names by its own local index, ascending (collective)."""
+    named = la.vector(index_map)
+    named.array[indices] = 1.0
+    named.scatter_reverse((la.InsertMode if hasattr(la, "InsertMode") else la.ScatterMode).add)
+    named.scatter_forward()
+    return np.flatnonzero(named.array).astype(np.int32)
+
+
 # ---------------------------------------------------------------------------------------------- spaces and functions
 
 
-def function_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
-    """Continuous Lagrange space.
+def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[int] = ()) -> Any:
+    """Space of functions on a mesh: ``function_space(mesh, 1, (2,))`` or ``function_space(mesh, ("Lagrange", 1, (2,)))``.
 
     Args:
         domain: the mesh.
-        degree: polynomial degree.
+        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)``.
         shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
 
     Returns:
         The function space.
+
+    Raises:
+        ValueError: for another element.
     """
-    return _space(domain, "Lagrange", degree, tuple(shape))
+    given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
+    if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
+        raise ValueError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
+    return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
 
 
 def dg0_space(domain: Any, shape: Sequence[int] = ()) -> Any:
@@ -312,16 +338,40 @@ def on_compilation(tell: Callable[[], None]) -> Iterator[None]:
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
-    """The form with its tags at all integrals of a kind; DOLFINx 0.9 takes those over everything, which have none, for others."""
-    known = {i.integral_type(): i.subdomain_data() for i in F.integrals() if i.subdomain_data() is not None}
-    return ufl.Form(
-        [
-            i.reconstruct(subdomain_data=known[i.integral_type()])
-            if i.subdomain_data() is None and i.integral_type() in known
-            else i
-            for i in F.integrals()
-        ]
-    )
+    """The form with the same tags at all integrals of a kind, as UFL wants it, whatever each of them came with (collective).
+
+    Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
+    """
+    integrals = []
+    for kind in dict.fromkeys(i.integral_type() for i in F.integrals()):
+        own = F.integrals_by_type(kind)
+        data = list({id(d): d for i in own if (d := i.subdomain_data()) is not None}.values())
+        if len(data) > 1 and all(hasattr(d, "indices") for d in data):
+            own, data = _of_common_tags(F, own)
+        integrals += [i.reconstruct(subdomain_data=data[0]) if i.subdomain_data() is None and data else i for i in own]
+    return ufl.Form(integrals)
+
+
+def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Integrals of one kind with MeshTags that number every overlap of those they came with, and these MeshTags (collective)."""
+    of = [[(i.subdomain_data(), n) for n in np.ravel(i.subdomain_id()) if n != "everywhere"] for i in integrals]
+    pairs = list({(id(d), int(n)): (d, int(n)) for own in of for d, n in own}.values())
+    entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
+    within = np.stack([np.isin(entities, d.indices[d.values == n]) for d, n in pairs], axis=1)
+    rows, which = np.unique(within, axis=0, return_inverse=True)
+    cpp_mesh = F.ufl_domain().ufl_cargo()
+    known = sorted({tuple(row) for part in cpp_mesh.comm.allgather(rows.tolist()) for row in part})
+    numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
+    # what DOLFINx 0.5 and what newer ones take from the mesh
+    domain = SimpleNamespace(_mesh=cpp_mesh, topology=SimpleNamespace(_cpp_object=cpp_mesh.topology))
+    tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
+    column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
+    out = []
+    for integral, own in zip(integrals, of):
+        columns = [column[id(d), int(n)] for d, n in own]
+        ids = tuple(j for j, row in enumerate(known, 1) if any(row[k] for k in columns)) or (len(known) + 1,)
+        out.append(integral.reconstruct(subdomain_data=tags, subdomain_id=ids if own else "everywhere"))
+    return out, [tags]
 
 
 def petsc_forms() -> Any:

@@ -88,17 +88,19 @@ def surface_measure(domain: Any, facets: npt.ArrayLike, metadata: Mapping[str, A
     return ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
 
 
-def cell_measure(domain: Any, cells: npt.ArrayLike) -> Any:
-    """Measure ``dx`` over the given cells only; a form may hold one of them, beside ``dx`` over all cells.
+def cell_measure(domain: Any, cells: npt.ArrayLike, metadata: Mapping[str, Any] | None = None) -> Any:
+    """Measure ``dx`` over the given cells only.
 
     Args:
         domain: the mesh.
         cells: local indices, shape ``(n,)``; each rank integrates over those it owns.
+        metadata: form compiler data, e.g. ``{"quadrature_degree": 2}``.
 
     Returns:
         The UFL measure.
     """
-    return ufl.Measure("dx", domain=domain, subdomain_data=mesh_tags(domain, domain.topology.dim, cells, 1))(1)
+    tags = mesh_tags(domain, domain.topology.dim, cells, 1)
+    return ufl.Measure("dx", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
 
 
 def quadrature_rule(domain: Any, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

@@ -50,6 +50,11 @@ def timed(stage: str) -> Iterator[None]:
         yield
 
 
+def timing(stage: str) -> tuple[int, float]:
+    """How often a stage has been timed on this rank so far, and its wall time in seconds; names as in ``timed``."""
+    return compat.timing_calls(f"~UEM: {stage}"), compat.timing(f"~UEM: {stage}")
+
+
 @contextmanager
 def compiling(what: str) -> Iterator[None]:
     """Time the compilation of forms, and tell the user if there is any: it takes a while, in the first run only.

@@ -12,7 +12,7 @@ from typing import Any
 import common
 import numpy as np
 import ufl
-from common import comm, dirichlet
+from common import comm
 from dolfinx import fem
 from evidence.scene import DIRECT, Scene, overlap
 
@@ -82,9 +82,9 @@ def hertz_cylinder(h: float, degree: int, answer: HertzAnswer | None = None) -> 
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material = uem.LinearElastic(E, nu, kind="plane_strain")
     bcs = [
-        dirichlet(V, tags["symmetry"], 0, 0.0),
-        dirichlet(V, tags["block_bottom"], 1, 0.0),
-        dirichlet(V, tags["disc_top"], 1, -d),
+        uem.dirichlet(V, tags["symmetry"], 0),
+        uem.dirichlet(V, tags["block_bottom"], 1),
+        uem.dirichlet(V, tags["disc_top"], 1, -d),
     ]
     energy = compat.form(material.energy(u) * ufl.dx)
 
@@ -143,8 +143,8 @@ def indenter(N: int) -> Scene:
     u, v, exact = fem.Function(V, name="displacement"), ufl.TestFunction(V), fem.Function(V)
     material = uem.LinearElastic(E, 0.3)
     F = material.residual(u, v) * ufl.dx
-    bcs = [dirichlet(V, tags["bottom"], i, 0.0) for i in range(3)]
-    bcs += [dirichlet(V, tags["side_x0"], 0, 0.0), dirichlet(V, tags["side_y0"], 1, 0.0)]
+    bcs = [uem.dirichlet(V, tags["bottom"], i) for i in range(3)]
+    bcs += [uem.dirichlet(V, tags["side_x0"], 0), uem.dirichlet(V, tags["side_y0"], 1)]
     paraboloid = uem.RigidSurface(
         lambda x: (x[:, 0] ** 2 + x[:, 1] ** 2) / (2 * R) - d - x[:, 2], lambda x: np.tile([0.0, 0.0, -1.0], (len(x), 1))
     )

@@ -44,8 +44,8 @@ def united(bodies):
     V = compat.function_space(mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = uem.LinearElastic(NUMBERS["E"], NUMBERS["nu"], kind="plane_strain").residual(u, v) * ufl.dx
-    bcs = [common.dirichlet(V, tags["symmetry"], 0, 0.0), common.dirichlet(V, tags["block_bottom"], 1, 0.0)]
-    bcs.append(common.dirichlet(V, tags["disc_top"], 1, -NUMBERS["push"]))
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["block_bottom"], 1)]
+    bcs.append(uem.dirichlet(V, tags["disc_top"], 1, -NUMBERS["push"]))
     contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], sliding="fixed")
     list(uem.load_steps(uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact]), 1))
     return 2 * contact.resultant().force[1], contact.max_pressure()

@@ -20,10 +20,10 @@ from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.gmsh import Tag
 from uem_dolfinx.geometry.rigid import finite_point
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.surfaces import check_distinct, check_tag, surface_nodes, tributary_areas
+from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
+from uem_dolfinx.geometry.tags import Part, as_tag, name_of
 
 if TYPE_CHECKING:
     from uem_dolfinx.geometry.configuration import Configuration
@@ -41,8 +41,9 @@ class Contact:
     """A contactor surface that may touch a target.
 
     Args:
-        contactor: facets whose nodes are the contactors, or points, which have forces but no pressures.
-        target: facets of the other body, or a rigid surface.
+        contactor: facets whose nodes are the contactors, or points, which have forces but no pressures: a tag, a list of tags,
+            ``(meshtags, value)``, or facet indices.
+        target: facets of the other body, named alike, or a rigid surface.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
@@ -58,8 +59,8 @@ class Contact:
 
     def __init__(
         self,
-        contactor: Tag,
-        target: Tag | Target,
+        contactor: Part,
+        target: Part | Target,
         *,
         sliding: str = "finite",
         normals: str = "facet",
@@ -75,8 +76,10 @@ class Contact:
             raise ValueError(f"thickness = {thickness}: expected a positive length, or None")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
-        target_name = getattr(target, "name", type(target).__name__)
-        self.name = name or f"{contactor.name} on {target_name}"
+        rigid = hasattr(target, "project")
+        self.name = (
+            name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
+        )
         self._pair: ContactPair | None = None
         self._fields: dict[str, fem.Function] = {}
 
@@ -93,17 +96,17 @@ class Contact:
             SurfaceError: if contactor and target share nodes.
             OrientationError: if a target facet lies inside a body.
         """
-        self.config = config
-        check_tag(config, self.contactor, "contactor")
+        self.config, facets = config, config.tdim - 1
+        self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
         target: Target
-        if isinstance(self.target, Tag):
-            check_tag(config, self.target, "target")
-            facets = TargetFacets(config, self.target)
-            check_distinct(config, nodes, facets, (str(self.contactor.name), str(self.target.name)))
-            target = MeshTarget(facets, averaged=self.normals == "averaged")
-        else:
+        if hasattr(self.target, "project"):
             target = self.target
+        else:
+            self.target = as_tag(self.target, config.mesh, (facets,), "target")
+            surface = TargetFacets(config, self.target)
+            check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
+            target = MeshTarget(surface, averaged=self.normals == "averaged")
         thickness = np.inf if self.thickness is None else self.thickness
         coupling = (Bernstein if config.degree == 2 else NodeToSurface)(
             config, nodes, target, free=free, sliding=self.sliding, thickness=thickness, chords=self.chords and config.degree == 2

@@ -17,7 +17,7 @@ from uem_dolfinx.parallel import agree, count_keys
 
 if TYPE_CHECKING:
     from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.gmsh import Tag
+    from uem_dolfinx.geometry.tags import Tag
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -1,33 +1,27 @@
-"""From a Gmsh model or file to a distributed mesh with its physical groups as tags.
-
-The first data on the way: every body, surface and boundary condition of the later steps is named here.
-"""
+"""From a Gmsh model or file to a distributed mesh with its physical groups as tags."""
 
 from __future__ import annotations
 
-import difflib
 import re
 import tempfile
-from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError, TagError, UEMError
+from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError, UEMError
+from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from mpi4py import MPI
 
     import numpy.typing as npt
-
-Key: TypeAlias = "str | int | tuple[int, str | int]"
 
 CELLS = {
     2: ("triangle", 1),
@@ -43,93 +37,6 @@ CELLS = {
 
 N_VERTICES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 8: 2, 9: 3, 10: 4, 11: 4, 12: 8, 15: 1}
 """Vertices of Gmsh's element types, which always come first among an element's nodes."""
-
-
-@dataclass(frozen=True)
-class Tag:
-    """A physical group of a mesh.
-
-    Attributes:
-        name: physical name; None for a group that has only a number.
-        number: physical number, unique within a dimension.
-        dim: dimension of the entities.
-        mesh: the mesh they belong to.
-        entities: local indices of the entities on this rank, ghosts included, ascending, shape ``(n,)``.
-    """
-
-    name: str | None
-    number: int
-    dim: int
-    mesh: Any = field(repr=False, compare=False)
-    entities: npt.NDArray[np.int32] = field(repr=False, compare=False)
-
-    def __str__(self) -> str:
-        """Name where there is one, else number."""
-        return f"'{self.name}'" if self.name else f"number {self.number}"
-
-
-class Tags(Mapping[Key, Tag]):
-    """Physical groups of a mesh by name, by number, or by ``(dim, name or number)``.
-
-    Args:
-        tags: all groups, alike on all ranks but for their entities.
-        sizes: number of entities of each over all ranks, shape ``(len(tags),)``.
-    """
-
-    def __init__(self, tags: list[Tag], sizes: npt.NDArray[np.int64]):
-        self._tags = tags
-        self._empty = {(tag.dim, tag.number) for tag, size in zip(tags, sizes) if size == 0}
-
-    def __getitem__(self, key: Key) -> Tag:
-        """Look a group up; no communication, and all ranks get the same answer.
-
-        Args:
-            key: name, number, or ``(dim, name or number)``.
-
-        Returns:
-            The group.
-
-        Raises:
-            TagError: no such group, several of them, or one without any entity in the mesh.
-        """
-        dim, label = key if isinstance(key, tuple) else (None, key)
-        found = [t for t in self._tags if label in (t.name, t.number) and label is not None and dim in (None, t.dim)]
-        if not found:
-            raise TagError(f"no physical group {key!r}{self._hint(label)}: {self._listing()}")
-        if len(found) > 1:
-            choices = " or ".join(f"({t.dim}, {label!r})" for t in found)
-            raise TagError(f"physical group {key!r} is ambiguous: ask for {choices}")
-        tag = found[0]
-        if (tag.dim, tag.number) in self._empty:
-            raise TagError(
-                f"physical group {tag} (dimension {tag.dim}) has no entity in the mesh: "
-                f"check that its geometry is meshed and belongs to the bodies; {self._listing()}"
-            )
-        return tag
-
-    def __iter__(self) -> Iterator[Key]:
-        """Keys of the groups that have entities: the name, or ``(dim, number)`` where there is no unique name."""
-        names = [t.name for t in self._tags]
-        for tag in self._tags:
-            if (tag.dim, tag.number) not in self._empty:
-                yield tag.name if tag.name and names.count(tag.name) == 1 else (tag.dim, tag.number)
-
-    def __len__(self) -> int:
-        """Number of groups that have entities."""
-        return len(self._tags) - len(self._empty)
-
-    def __repr__(self) -> str:
-        """List the groups."""
-        return f"Tags({self._listing()})"
-
-    def _hint(self, label: object) -> str:
-        near = difflib.get_close_matches(str(label), [t.name for t in self._tags if t.name], n=1)
-        return f", did you mean {near[0]!r}?" if near else ""
-
-    def _listing(self) -> str:
-        if not self._tags:
-            return "the mesh has no physical group"
-        return "the mesh has " + ", ".join(f"{t.name or t.number!r} (dimension {t.dim})" for t in self._tags)
 
 
 def read_gmsh(

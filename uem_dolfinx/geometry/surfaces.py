@@ -13,30 +13,16 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.errors import SpaceError, SurfaceError, TagError, UEMError
+from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.parallel import agree
 
 if TYPE_CHECKING:
     from uem_dolfinx.geometry.configuration import Configuration
     from uem_dolfinx.geometry.facets import TargetFacets
-    from uem_dolfinx.geometry.gmsh import Tag
+    from uem_dolfinx.geometry.tags import Tag
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-
-def check_tag(config: Configuration, tag: Tag, role: str) -> None:
-    """Refuse tags that are not facets of this mesh, nor points of it that a contactor may be (collective)."""
-    error: UEMError | None = None
-    if tag.mesh is not config.mesh:
-        error = SpaceError(f"{role} '{tag.name}' belongs to another mesh than the displacement: read both from one mesh")
-    elif tag.dim != config.tdim - 1 and (tag.dim != 0 or role == "target"):
-        points = "" if role == "target" else ", or points, dimension 0"
-        error = TagError(f"{role} '{tag.name}' has dimension {tag.dim}: expected facets, dimension {config.tdim - 1}{points}")
-    agree(config.comm, error)
-    if config.comm.allreduce(len(tag.entities)) == 0:
-        what = "facets" if tag.dim else "points"
-        raise TagError(f"{role} '{tag.name}' holds no {what}: check the physical group in the gmsh model")
 
 
 def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:

@@ -5,7 +5,7 @@ Laws with history compute on arrays with one row for each point.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +13,8 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.errors import SpaceError, TagError, UEMError
+from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.log import compiling
-from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.gmsh import Tag
 
 Array = npt.NDArray[np.float64]
 
@@ -29,33 +25,25 @@ BESIDE_CENTRE = 1e-4
 DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]}
 
 
-def owned_cells(domain: Any, tag: Tag | None) -> npt.NDArray[np.int32]:
-    """Cells of a tag, or all cells, that this rank owns (collective).
+def owned_cells(domain: Any, part: Part | None) -> npt.NDArray[np.int32]:
+    """Cells of a part of the mesh, or all cells, that this rank owns (collective).
 
     Args:
         domain: the mesh.
-        tag: of cells; None is all of them.
+        part: see ``as_tag``; None is the whole mesh.
 
     Returns:
         Local indices ``(n_cells,)``, ascending.
 
     Raises:
-        SpaceError: if the tag belongs to another mesh.
-        TagError: if it is not one of cells, or holds none on any rank.
+        SpaceError, TagError: see ``as_tag``.
     """
     tdim = domain.topology.dim
     owned = domain.topology.index_map(tdim).size_local
-    if tag is None:
+    if part is None:
         return np.arange(owned, dtype=np.int32)
-    error: UEMError | None = None
-    if tag.mesh is not domain:
-        error = SpaceError(f"the cells {tag} belong to another mesh than the displacement: read both from one mesh")
-    elif tag.dim != tdim:
-        error = TagError(f"the tag {tag} has dimension {tag.dim}: expected cells, dimension {tdim}")
-    agree(domain.comm, error)
-    if domain.comm.allreduce(len(tag.entities)) == 0:
-        raise TagError(f"the tag {tag} holds no cells: check the physical group in the gmsh model")
-    return np.unique(tag.entities[tag.entities < owned]).astype(np.int32)
+    entities = as_tag(part, domain, (tdim,), "the part of the material").entities
+    return np.unique(entities[entities < owned]).astype(np.int32)
 
 
 class QuadraturePoints:

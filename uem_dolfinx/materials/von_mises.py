@@ -24,7 +24,7 @@ from uem_dolfinx.parallel import agree
 if TYPE_CHECKING:
     from ufl.core.expr import Expr
 
-    from uem_dolfinx.geometry.gmsh import Tag
+    from uem_dolfinx.geometry.tags import Part
 
 Array = npt.NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class VonMises:
         kind: ``"3d"``, ``"plane_strain"`` or ``"plane_stress"``.
         strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange
             strain, with the second Piola-Kirchhoff stress in the yield surface; for large rotations and moderate strains.
-        cells: the cells made of this material, which may be none on some ranks; None is all cells.
+        cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
         quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
 
     Attributes:
@@ -93,7 +93,7 @@ class VonMises:
         *,
         kind: str = "3d",
         strain: str = "small",
-        cells: Tag | None = None,
+        cells: Part | None = None,
         quadrature_degree: int | None = None,
     ):
         for name, word, words in (("kind", kind, KINDS), ("strain", strain, STRAINS)):

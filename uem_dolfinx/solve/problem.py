@@ -12,6 +12,7 @@ from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.parallel import agree_on_call
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.contact import Contact
     from uem_dolfinx.contact.pair import ContactPair
     from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.geometry.gmsh import Tag
     from uem_dolfinx.materials.elastic import HistoryMaterial
     from uem_dolfinx.solve.newton import UnitedSystem
 
@@ -240,14 +240,15 @@ class UnitedProblem:
         state.restore.append(restore)
         return state
 
-    def reaction(self, tag: Tag) -> np.ndarray:
-        """Force with which the Dirichlet conditions act on the nodes of a tag: their sum ``(gdim,)`` (collective).
+    def reaction(self, tag: Part) -> np.ndarray:
+        """Force with which the Dirichlet conditions act on the nodes of a part of the mesh: their sum ``(gdim,)`` (collective).
 
         Args:
-            tag: entities of any dimension; components without Dirichlet condition count as zero.
+            tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero.
         """
         self.forces.assemble()
-        nodes, shape = surface_nodes(self.config, tag), (-1, self.config.gdim)
+        tdim, shape = self.config.tdim, (-1, self.config.gdim)
+        nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
         force = self.forces.residual.array_r.reshape(shape)[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(shape)[nodes]

@@ -1,0 +1,366 @@
+"""The front door: all that a script imports is ``uem_dolfinx``, whatever names surfaces and supports, on any number of ranks.
+
+Worth reading first: ``test_readme`` and ``test_whatever_names_a_surface``.
+"""
+
+from __future__ import annotations
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from helpers import at, blocks, clamp, highest, linear, modulus, outside_mpi
+from petsc4py import PETSc
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
+
+COMM = MPI.COMM_WORLD
+REPO = Path(__file__).resolve().parent.parent
+README = (REPO / "README.md").read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
+
+
+def alike(error, match, call):
+    """The same error on all ranks."""
+    with pytest.raises(error, match=match) as caught:
+        call()
+    assert len(set(COMM.allgather(f"{type(caught.value).__name__}: {caught.value}"))) == 1
+
+
+def owned(mesh, tag):
+    """The facets of a tag that this rank owns, in an order of its own."""
+    return tag.entities[tag.entities < mesh.topology.index_map(tag.dim).size_local][::-1]
+
+
+# -- the script of the README ------------------------------------------------------------------------------------------
+
+
+def test_readme(folder, monkeypatch, capsys):
+    if COMM.rank == 0:
+        (folder / "meshes").symlink_to(REPO / "meshes")
+    COMM.barrier()
+    monkeypatch.chdir(folder)
+    known = {}
+    exec(compile(README, "README.md", "exec"), known)
+    assert 2 * known["force"][1] == pytest.approx(1086.3, rel=2e-3) and known["p_max"] == pytest.approx(7900, rel=0.02)
+    if COMM.rank == 0:
+        assert "largest pressure" in capsys.readouterr().out
+        assert all((folder / "results" / name).exists() for name in ("scene.png", "hertz.csv"))
+
+
+def test_readme_is_short_and_needs_no_inner_module():
+    assert len(README.splitlines()) <= 20
+    sources = {"README.md": README} | {p.name: p.read_text(encoding="utf-8") for p in (REPO / "demos").glob("*.py")}
+    for name, source in sources.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom):
+                assert not str(node.module).startswith("uem_dolfinx"), f"{name} imports from {node.module}"
+            elif isinstance(node, ast.Import):
+                assert all(a.name == "uem_dolfinx" for a in node.names if "uem_dolfinx" in a.name), name
+
+
+def test_reference():
+    assert sorted(uem.__all__, key=str.lower) == sorted(set(uem.__all__), key=str.lower)
+    assert all(getattr(uem, name).__doc__ for name in uem.__all__)
+
+
+# -- the first run -----------------------------------------------------------------------------------------------------
+
+
+def first_run(folder, ranks, **environment):
+    """A script with an empty cache of compiled forms, told from this MPI."""
+    script = folder / "script.py"
+    script.write_text(
+        README.replace('"h": 0.01', '"h": 0.1').partition("contact =")[0] + "uem.integrate(u[0] * uem.ds(tags['disc_top']))"
+    )
+    (folder / "meshes").symlink_to(REPO / "meshes")
+    env = outside_mpi() | {"XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"} | environment
+    mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
+    command = [sys.executable, str(script)]
+    command = command if ranks == 1 else [str(mpiexec), "-n", str(ranks), *command]
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
+    done = first_run(tmp_path, ranks)
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "cache").rglob("*.so")), "nothing was compiled"
+    assert done.stdout == ""
+    assert [line for line in done.stderr.splitlines() if "later runs find it in the cache" not in line] == []
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
+def test_errors_of_the_compiler_are_shown(tmp_path):
+    done = first_run(tmp_path, 1, CC=shutil.which("false"))
+    assert done.returncode != 0 and "Error" in done.stderr and "false" in done.stderr
+
+
+# -- spaces ------------------------------------------------------------------------------------------------------------
+
+
+def test_spaces():
+    mesh = blocks(COMM, "triangle").scene.mesh
+    for ours, theirs in (
+        (uem.function_space(mesh, 1, (2,)), uem.function_space(mesh, ("Lagrange", 1, (2,)))),
+        (uem.function_space(mesh, 2), uem.function_space(mesh, ("Lagrange", 2))),
+        (uem.function_space(mesh, ("DG", 0), (2, 2)), uem.function_space(mesh, ["DG", 0, (2, 2)])),
+    ):
+        assert ours.ufl_element() == theirs.ufl_element()
+    for element in ("Lagrange", ("Lagrange",), (1, "Lagrange"), 1.5):
+        with pytest.raises(ValueError, match="expected a degree"):
+            uem.function_space(mesh, element)
+
+
+# -- surfaces ----------------------------------------------------------------------------------------------------------
+
+
+def named(b, tag, how):
+    """The same facets by another name."""
+    mesh, t = b.scene.mesh, tag.dim
+    half = tag.entities[dmesh.compute_midpoints(mesh, t, tag.entities)[:, 0] < 0.5] if hasattr(dmesh, "compute_midpoints") else []
+    other = np.setdiff1d(tag.entities, half)
+    values = np.where(np.isin(tag.entities, half), 3, 7)
+    n = mesh.topology.index_map(t).size_local + mesh.topology.index_map(t).num_ghosts
+    rest = np.setdiff1d(np.arange(n), tag.entities)
+    return {
+        "tag": tag,
+        "list of tags": [uem.Tag("a", 1, t, mesh, np.array(half, np.int32)), uem.Tag("b", 2, t, mesh, other.astype(np.int32))],
+        "MeshTags": (forms.mesh_tags(mesh, t, tag.entities, 5), 5),
+        "MeshTags, several values": (
+            forms.mesh_tags(mesh, t, np.concatenate([tag.entities, rest]), np.concatenate([values, 0 * rest])), [3, 7],
+        ),
+        "MeshTags without ghosts": (forms.mesh_tags(mesh, t, owned(mesh, tag), 5), 5),
+        "array": tag.entities,
+        "array without ghosts": owned(mesh, tag),
+        "list of numbers": owned(mesh, tag).tolist(),
+        "list of everything": [owned(mesh, tag).tolist(), (forms.mesh_tags(mesh, t, tag.entities, 5), 5), tag, tag.entities],
+    }[how]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["list of tags", "MeshTags", "MeshTags, several values", "MeshTags without ghosts", "array", "array without ghosts",
+     "list of numbers", "list of everything"],
+)  # fmt: skip
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_whatever_names_a_surface(cell, how):
+    b = blocks(COMM, cell, 2, 3)
+    mesh, g, u, v = b.scene.mesh, b.gdim, b.u, ufl.TestFunction(b.V)
+    found = []
+    for name in ("tag", how):
+        u.x.array[:] = 0.0
+        bottom, low, high, top = (named(b, tag, name) for tag in (b.bottom, b.low, b.high, b.top))
+        F = linear(u, modulus(b.scene, 1.0, 2.0)) + 0.1 * v[g - 1] * uem.ds(top, mesh)
+        bcs = [uem.dirichlet(b.V, bottom)] + [uem.dirichlet(b.V, top, i) for i in range(g - 1)]
+        contact = uem.Contact(high, low)
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+        problem.solve()
+        found.append((contact.resultant().force, problem.reaction(bottom), contact.max_pressure(), u.x.array.copy()))
+        assert contact.name and isinstance(contact.contactor, uem.Tag)
+    for ours, theirs in zip(*found):
+        np.testing.assert_array_equal(ours, theirs)
+    assert found[0][0][g - 1] == pytest.approx(0.1) and found[0][1][g - 1] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("how", ["tag", "MeshTags without ghosts", "array without ghosts"])
+def test_a_target_inside_a_body_is_refused_whatever_names_it(how):
+    """Its facets must be known to both ranks that have them, also where the user's array has owned ones only."""
+    b = blocks(COMM, "triangle", 4, 4)
+    inside = named(b, b.scene.tag("inside", 0, at(1, -0.5)), how)
+    with pytest.raises(uem.OrientationError, match="between two cells"):
+        uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, contacts=[uem.Contact(b.high, inside)])
+
+
+def test_cells_of_a_material():
+    b = blocks(COMM, "quadrilateral")
+    cells = np.flatnonzero(b.scene.body == 0)
+    n = b.scene.mesh.topology.index_map(2).size_local
+    law = [
+        uem.VonMises(b.u, 1.0, 0.3, 1.0, kind="plane_strain", cells=given)
+        for given in (
+            uem.Tag("lower", 1, 2, b.scene.mesh, cells),
+            cells[cells < n],
+            (forms.mesh_tags(b.scene.mesh, 2, cells, 4), 4),
+        )
+    ]
+    assert all(np.array_equal(law[0].cells, other.cells) for other in law[1:]) and COMM.allreduce(len(law[0].cells)) == 4
+
+
+def test_what_names_no_surface():
+    b, other = blocks(COMM, "triangle"), blocks(COMM, "triangle")
+    mesh = b.scene.mesh
+    tags = forms.mesh_tags(mesh, 1, b.low.entities, 5)
+    last = COMM.rank == COMM.size - 1
+    for error, match, part in (
+        (uem.TagError, "holds no facets", np.zeros(0, np.int32)),
+        (uem.TagError, "holds no facets", []),
+        (uem.TagError, "holds no facets", (tags, 6)),
+        (uem.TagError, "is 'low'.*expected a tag", "low"),
+        (uem.TagError, "is None.*expected a tag", None),
+        (uem.TagError, "expected a tag", np.ones(3)),
+        (uem.TagError, "expected a tag", b.low.entities if not last else np.zeros((2, 2), int)),
+        (uem.TagError, "indices.*expected local ones", b.low.entities if not last else [-1, 3]),
+        (uem.TagError, "indices.*expected local ones", b.low.entities if not last else [10**6]),
+        (uem.TagError, "dimension 2", (forms.mesh_tags(mesh, 2, np.arange(1), 1), 1)),
+        (uem.SpaceError, "another mesh", other.low),
+        (uem.SpaceError, "another mesh", (forms.mesh_tags(other.scene.mesh, 1, other.low.entities, 5), 5)),
+    ):
+        alike(error, match, lambda part=part: uem.ds(part, mesh))
+    point = uem.Tag("A", 1, 0, mesh, np.zeros(1, np.int32))
+    alike(uem.TagError, "'low and A' is of several dimensions", lambda: uem.dirichlet(b.V, [b.low, point]))
+    with pytest.raises(ValueError, match="needs the mesh"):
+        uem.ds((tags, 5))
+
+
+# -- measures and integrals --------------------------------------------------------------------------------------------
+
+
+def test_measures():
+    """Areas of overlapping surfaces, alone, together in one form, and beside measures over everything and of the user's."""
+    b = blocks(COMM, "triangle", 2, 4, gap=0.5)
+    mesh, one = b.scene.mesh, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))
+    both, low, high, left = [b.low, b.high], b.low, b.high, b.scene.tag("left", 0, at(0, 0.0))
+    everything, mine = (
+        ufl.ds(domain=mesh),
+        ufl.Measure("ds", domain=mesh, subdomain_data=forms.mesh_tags(mesh, 1, low.entities, 8)),
+    )
+    for form, exact in (
+        (one * uem.ds(low), 1.0),
+        (one * uem.ds(both) + one * uem.ds(low), 3.0),
+        (2 * one * uem.ds(both) + 10 * one * uem.ds(low) + 100 * one * uem.ds(left) + 1000 * one * uem.ds(high), 1114.0),
+        (
+            one * uem.ds(both) + 10 * one * everything + 100 * one * mine(8) + 1000 * one * mine(9) + 1000 * one * mine,
+            2 + 80 + 100 + 8000,
+        ),
+        (one * uem.ds(left) + one * uem.dx(np.flatnonzero(b.scene.body == 0), mesh) + one * ufl.dx(domain=mesh), 4.0),
+    ):
+        assert uem.integrate(form) == pytest.approx(exact, rel=1e-12)
+    x = ufl.SpatialCoordinate(mesh)
+    assert uem.integrate(fem.form(x[0] ** 2 * uem.ds(low, quadrature_degree=2))) == pytest.approx(1 / 3, rel=1e-12)
+    assert abs(uem.integrate(x[0] ** 2 * uem.ds(low, quadrature_degree=1)) - 1 / 3) > 1e-3
+
+
+def test_loads_on_several_surfaces():
+    """Each load of a residual acts on its own surface, whatever else the form holds."""
+    b = blocks(COMM, "triangle", 2, 2)
+    v, right = ufl.TestFunction(b.V), [b.scene.tag("right", k, at(0, 1.0)) for k in (0, 1)]
+    F = linear(b.u, modulus(b.scene, 1.0, 1.0)) - 0.025 * v[0] * uem.ds(right) + (0.25 + 0.5 * b.u[1]) * v[1] * uem.ds(b.top)
+    bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.high, 0)]
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[uem.Contact(b.high, b.low)])
+    problem.solve()
+    spring, held = uem.integrate(0.5 * b.u[1] * uem.ds(b.top)), problem.reaction(b.bottom)
+    assert held[1] == pytest.approx(0.25 + spring, rel=1e-6) and spring < -0.01
+    assert held[0] + problem.reaction(b.high)[0] == pytest.approx(-0.05, rel=1e-6)
+
+
+def test_interpolation_and_timing():
+    b = blocks(COMM, "triangle")
+    x, f = ufl.SpatialCoordinate(b.scene.mesh), fem.Function(uem.function_space(b.scene.mesh, 1))
+    before = uem.timing("compile forms")
+    uem.interpolate(f, x[0] + 2 * x[1])
+    assert uem.integrate(f * ufl.dx) == pytest.approx(1.0, abs=1e-12)
+    uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom) + clamp(b.V, b.top))
+    after = uem.timing("compile forms")
+    assert after[0] > before[0] and after[1] > before[1] and uem.timing("no such stage") == (0, 0.0)
+
+
+# -- Dirichlet conditions ----------------------------------------------------------------------------------------------
+
+
+def values(V, bcs):
+    """What conditions prescribe: the drawing's nodes that they hold, with values; NaN at free components ``(n, size)``."""
+    f = fem.Function(V)
+    f.x.array[:] = np.nan
+    compat.set_bc_values(f.x.array, bcs)
+    return f
+
+
+def held(b, bc, tag):
+    """Values of a condition at all nodes, and which nodes are on the tag (collective)."""
+    f = values(b.V, [bc])
+    on = values(b.V, clamp(b.V, tag))
+    return b.scene.gather(f), np.isfinite(b.scene.gather(on))
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_dirichlet(cell):
+    b = blocks(COMM, cell)
+    g, V, mesh = b.gdim, b.V, b.scene.mesh
+    up = np.arange(1.0, g + 1)
+    for component, value, expected in (
+        (None, 0.0, np.zeros(g)), (None, 2.0, np.full(g, 2.0)), (None, up, up), (None, tuple(up), up),
+        (0, 0.5, None), (g - 1, -1, None), (None, fem.Constant(mesh, up), up), (1, fem.Constant(mesh, PETSc.ScalarType(0.25)), None),
+    ):  # fmt: skip
+        found, on = held(b, uem.dirichlet(V, b.top, component, value), b.top)
+        if component is None:
+            expected = np.where(on, expected, np.nan)
+        else:
+            number = float(value.value) if isinstance(value, fem.Constant) else value
+            expected = np.where(on & (np.arange(g) == component), number, np.nan)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_dirichlet_values_that_change():
+    b = blocks(COMM, "triangle")
+    place, field, scalar = (
+        fem.Constant(b.scene.mesh, np.zeros(2)),
+        fem.Function(b.V),
+        fem.Function(uem.function_space(b.scene.mesh, 1)),
+    )
+    bcs = [uem.dirichlet(b.V, b.top, value=place), uem.dirichlet(b.V, b.top, value=field), uem.dirichlet(b.V, b.top, 1, scalar)]
+    place.value[:] = (1.0, 2.0)
+    field.interpolate(lambda x: x[:2])
+    scalar.interpolate(lambda x: 3 * x[0])
+    x = b.scene.drawing
+    for bc, components, wanted in zip(bcs, ([0, 1], [0, 1], [1]), (np.tile((1.0, 2.0), (len(x), 1)), x, 3 * x[:, [0, 0]])):
+        found, on = held(b, bc, b.top)
+        on[:, np.setdiff1d([0, 1], components)] = False
+        np.testing.assert_allclose(found, np.where(on, wanted, np.nan), atol=1e-15)
+
+
+def test_dirichlet_of_a_scalar_space_and_of_degree_2():
+    b = blocks(COMM, "triangle", degree=2)
+    S = uem.function_space(b.scene.mesh, 1)
+    for component in (None, 0):
+        f = values(S, [uem.dirichlet(S, b.top, component, 4.0)])
+        assert highest(COMM, np.nansum(f.x.array == 4.0)) > 0 and set(f.x.array[np.isfinite(f.x.array)]) <= {4.0}
+    dofs, n = compat.bc_dofs(uem.dirichlet(b.V, b.top, 1))
+    assert COMM.allreduce(n) == 9 and (dofs % 2 == 1).all()
+
+
+def test_dirichlet_of_what_cannot_be():
+    b, other = blocks(COMM, "triangle"), blocks(COMM, "triangle")
+    last = COMM.rank == COMM.size - 1
+    V, top = b.V, b.top
+    scalar = fem.Function(uem.function_space(b.scene.mesh, 1))
+    for error, match, given in (
+        (ValueError, "component = 2: expected one of 0 to 1", (V, top, 2)),
+        (ValueError, "component = -1", (V, top, -1)),
+        (ValueError, "component = 'x'", (V, top, "x")),
+        (ValueError, "not finite", (V, top, 0, np.nan if last else 0.0)),
+        (ValueError, "not finite", (V, top, None, (0.0, np.inf))),
+        (ValueError, "not finite", (V, top, 0, fem.Constant(b.scene.mesh, PETSc.ScalarType(np.nan)))),
+        (ValueError, "2 components.*shape \\(3,\\)", (V, top, None, (1.0, 2.0, 3.0))),
+        (ValueError, "1 components.*shape \\(2,\\)", (V, top, 0, (1.0, 2.0))),
+        (ValueError, "2 components.*shape \\(\\)", (V, top, None, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0)))),
+        (uem.SpaceError, "is no Function of", (V, top, None, fem.Function(other.V))),
+        (uem.SpaceError, "is no Function of", (V, top, None, scalar)),
+        (uem.SpaceError, "is no Function of a scalar Lagrange space of degree 1", (V, top, 0, b.u)),
+        (uem.SpaceError, "whole Lagrange space", (V.sub(0), top, None)),
+        (uem.SpaceError, "whole Lagrange space", (uem.function_space(b.scene.mesh, ("DG", 0), (2,)), top)),
+        (uem.SpaceError, "another mesh", (V, other.top)),
+        (uem.TagError, "holds no facets", (V, uem.Tag("none", 1, 1, b.scene.mesh, np.zeros(0, np.int32)))),
+        (uem.TagError, "expected a tag", (V, "top")),
+    ):  # fmt: skip
+        alike(error, match, lambda given=given: uem.dirichlet(*given))

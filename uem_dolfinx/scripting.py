@@ -1,0 +1,118 @@
+"""What a script needs beside DOLFINx, alike in all its versions: Dirichlet conditions and measures by tag, and integrals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.geometry.tags import Part, Tag, as_tag
+from uem_dolfinx.parallel import agree
+
+
+def dirichlet(
+    V: fem.FunctionSpace,
+    tag: Part,
+    component: int | None = None,
+    value: float | npt.ArrayLike | fem.Constant | fem.Function = 0.0,
+) -> fem.DirichletBC:
+    """Prescribe the displacement, or one component of it, at all nodes of a part of the mesh (collective).
+
+    Args:
+        V: a Lagrange space with ``size`` components.
+        tag: facets, or entities of any dimension: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
+        component: 0 is x; None prescribes all components.
+        value: a number, for all components a vector ``(size,)`` as well, or a Constant of one of these shapes, or a Function of ``V``
+            (of a scalar space of the same degree for one component), both of which may be changed between steps.
+
+    Returns:
+        DOLFINx's Dirichlet condition.
+
+    Raises:
+        SpaceError: ``V`` is no Lagrange space, or the tag or the Function does not belong to it.
+        TagError: the tag is empty, or cannot be read.
+        ValueError: no such component, or a value of another shape or not finite.
+    """
+    mesh, error = V.mesh, None
+    try:
+        value = _checked(V, component, value)
+    except ValueError as found:
+        error = found
+    agree(mesh.comm, error)
+    tdim = mesh.topology.dim
+    tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
+    mesh.topology.create_connectivity(tag.dim, tdim)
+    sub = V if component is None or V.dofmap.index_map_bs == 1 else V.sub(int(component))
+    if not isinstance(value, fem.Function):
+        return fem.dirichletbc(value, fem.locate_dofs_topological(sub, tag.dim, tag.entities), sub)
+    if sub is V:
+        return fem.dirichletbc(value, fem.locate_dofs_topological(V, tag.dim, tag.entities))
+    return fem.dirichletbc(value, fem.locate_dofs_topological((sub, value.function_space), tag.dim, tag.entities), sub)
+
+
+def _checked(V: Any, component: int | None, value: Any) -> Any:
+    """The value as ``fem.dirichletbc`` takes it, which fits the space and is finite."""
+    degree, size = compat.lagrange_degree(V), V.dofmap.index_map_bs
+    if degree is None or V.dofmap.bs != size:
+        raise SpaceError("a Dirichlet condition needs a whole Lagrange space: give that of the displacement, and a component")
+    if component is not None and component not in range(size):
+        raise ValueError(f"component = {component!r}: expected one of 0 to {size - 1}, or None for all")
+    n = size if component is None else 1
+    if isinstance(value, fem.Function):
+        given, array = value.function_space, value.x.array
+        scalar = given.dofmap.index_map_bs == 1 and compat.lagrange_degree(given) == degree and given.mesh is V.mesh
+        if not (given == V if n == size else scalar):
+            wanted = "the condition's space" if n == size else f"a scalar Lagrange space of degree {degree} on its mesh"
+            raise SpaceError(f"the value '{value.name}' of a Dirichlet condition is no Function of {wanted}")
+    else:
+        array = np.asarray(value.value if isinstance(value, fem.Constant) else value, dtype=PETSc.ScalarType)
+        if array.ndim == 0 and n > 1 and not isinstance(value, fem.Constant):
+            array = np.full(n, array)
+        if array.shape != ((n,) if n > 1 else ()):
+            raise ValueError(f"a Dirichlet condition for {n} components has a value of the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"the value {value} of a Dirichlet condition is not finite")
+    return value if isinstance(value, (fem.Function, fem.Constant)) else array if n > 1 else array[()]
+
+
+def ds(tag: Part, mesh: Any = None, **metadata: Any) -> ufl.Measure:
+    """Measure of the exterior facets of a part of the mesh, as in ``p * v[1] * uem.ds(tags["top"])`` (collective).
+
+    A form may hold any number of them where the package compiles it: in ``UnitedProblem`` and ``integrate``.
+
+    Args:
+        tag: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
+        mesh: needed where none of these is a tag of ``read_gmsh``, which knows its mesh.
+        metadata: for the form compiler, e.g. ``quadrature_degree=2``.
+    """
+    mesh = _mesh_of(tag, mesh)
+    return forms.surface_measure(mesh, as_tag(tag, mesh, (mesh.topology.dim - 1,), "the measure ds").entities, metadata)
+
+
+def dx(tag: Part, mesh: Any = None, **metadata: Any) -> ufl.Measure:
+    """Measure of the cells of a part of the mesh, with the arguments of ``ds`` (collective)."""
+    mesh = _mesh_of(tag, mesh)
+    return forms.cell_measure(mesh, as_tag(tag, mesh, (mesh.topology.dim,), "the measure dx").entities, metadata)
+
+
+def _mesh_of(part: Part, mesh: Any) -> Any:
+    known = [one.mesh for one in (part if isinstance(part, (list, tuple)) else [part]) if isinstance(one, Tag)]
+    if mesh is None and not known:
+        raise ValueError(f"a measure of {part!r:.60} needs the mesh as its second argument: only tags of read_gmsh know theirs")
+    return known[0] if mesh is None else mesh
+
+
+def integrate(integrals: ufl.Form | fem.Form) -> float:
+    """Value of a functional, as in ``uem.integrate(p * uem.ds(tags["top"]))``, summed over all ranks (collective).
+
+    Args:
+        integrals: in UFL, or compiled by ``fem.form``, which saves time where it is asked for again and again.
+    """
+    M = compat.form(integrals) if isinstance(integrals, ufl.Form) else integrals
+    return forms.assemble_scalar(M, M.mesh.comm)
