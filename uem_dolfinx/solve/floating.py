@@ -39,7 +39,7 @@ BARELY_LOADED = 1e-3
 #: [heuristic; the model's size; -]
 SHORT_WAY = 0.01
 #: A contactor comes nearer if it closes its gap by more than this part of the motion.
-#: [convention; size of the motion; test_floating.py::test_what_counts_as_coming_nearer]
+#: [heuristic; size of the motion; -]
 CLOSING = 1e-9
 #: A body that falls touches ground after so many stations at most.
 #: [bound; stations; -]

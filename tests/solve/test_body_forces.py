@@ -1,0 +1,49 @@
+"""Forces of the bodies without contact: what counts as rounding of a force and of a Dirichlet value."""
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from helpers import blocks, clamp, linear
+
+import uem_dolfinx as uem
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
+def test_rounding_of_forces(length):
+    """Displacements changed in their last bits change the forces by less than counts as rounding, though by no more than 20 times."""
+    b = blocks(COMM, "triangle", 4, 5, pose=lambda x: length * x)
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom))
+    forces, n = problem.forces, problem.config.n_owned * 2
+    u = length * np.sin(problem.config.X / length * 3 + 1).ravel()
+    eps = np.finfo(float).eps
+    changes = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed + 100 * COMM.rank)
+        F = []
+        for sign in (0.0, 1.0):
+            b.u.x.array[:] = u
+            b.u.x.array[:n] *= 1.0 + sign * 2 * eps * rng.choice([-1.0, 1.0], n)
+            b.u.x.scatter_forward()
+            forces.assemble()
+            F.append(forces.residual)
+        changes.append((F[1] - F[0]).norm())
+    forces.update_tangent()
+    told = forces.rounding(np.zeros(0, np.int32))
+    assert max(changes) < told < 20 * max(changes)
+
+
+@pytest.mark.parametrize("value", [1e-9, 1.0, -7.0e5])
+def test_dirichlet_values_are_met(value):
+    """To 2 units in the last place, not to 12."""
+    b = blocks(COMM, "triangle", 2, 2)
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=value)])
+    forces = problem.forces
+    forces.wanted[~forces.free] = 0.0
+    top = np.abs(problem.config.X[:, 1] - 1.0) < 1e-9
+    forces.wanted[top] = value
+    for units, met in ((0.0, True), (2.0, True), (12.0, False)):
+        problem.config.displacement[:] = forces.wanted * (1.0 + units * np.finfo(float).eps)
+        assert forces.dirichlet_met() == met

@@ -1,0 +1,89 @@
+"""The Newton loop on a system of one unknown: what its line search accepts, and when it gives up; no mesh."""
+
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import pytest
+from petsc4py import PETSc
+
+import uem_dolfinx as uem
+from uem_dolfinx.solve.newton import solve_united
+
+
+def vector(value):
+    v = PETSc.Vec().createSeq(1, comm=MPI.COMM_SELF)
+    v.array[:] = value
+    return v
+
+
+class OneUnknown:
+    """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
+
+    linear = in_contact = False
+
+    def __init__(self, left):
+        self.left, self.u, self.solves = left, 0.0, 0
+        self.lengths = []
+
+    def F(self):
+        if self.solves < 2:
+            # straight down to the part that is left, no less however short the step
+            return 1.0 - (1.0 - self.left) * self.u if self.left < 1.0 else 1.0 + 2.0 * self.u**2 - 0.5 * self.u
+        return 0.0
+
+    def place(self, returning):
+        pass
+
+    def assemble_residual(self):
+        return True
+
+    def unite(self, cautious):
+        R = vector(self.F())
+        return SimpleNamespace(
+            residual=R, norm=R.norm(), scale=1.0, rounding=0.0, strain_rounding=0.0, gap=0.0, active=0, changed=False, closed=True
+        )
+
+    def active_set(self):
+        return 0
+
+    def linearise(self, state, first):
+        self.solves += 1
+        return vector(-self.F())
+
+    def solve(self, rhs, accuracy):
+        return vector(1.0), 1
+
+    def move(self, state, dq):
+        return dq
+
+    def displacement(self):
+        return self.u
+
+    def displace(self, start, du, length):
+        self.u = start + length * du.array_r[0]
+        self.lengths.append(length)
+
+    def inverted(self):
+        return None
+
+    def reduced_residual(self, state):
+        return vector(self.F())
+
+
+@pytest.mark.parametrize(("left", "length"), [(0.3, 1.0), (0.85, 1.0), (0.95, 1.0 / 64)])
+def test_what_the_line_search_accepts(left, length):
+    """A step that leaves 0.85 of the residual is taken whole, one that leaves 0.95 is shortened until nothing is left to shorten."""
+    system = OneUnknown(left)
+    history = solve_united(system, rtol=1e-8, max_iterations=10, line_search=True, verbose=False)
+    assert history[1].step_length == length
+
+
+def test_no_convergence_is_an_error_with_its_history():
+    """Never a silent end of the loop."""
+    system = OneUnknown(0.5)
+    system.linearise = lambda state, first: vector(-1.0)
+    system.F = lambda: 1.0
+    with pytest.raises(uem.ConvergenceError, match="no convergence in 4 iterations") as found:
+        solve_united(system, rtol=1e-8, max_iterations=4, line_search=False, verbose=False)
+    assert [i.residual for i in found.value.history] == [1.0] * 5

@@ -1,0 +1,61 @@
+"""Rigid motions of bodies: which are open, which are loaded, against motions and forces of known size."""
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import box, linear, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.solve.rigid_motions import RigidMotions
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.fixture(params=[1e-9, 1.0, 1e3])
+def body(request):
+    """A square that nothing holds, in several units: its motions and its problem."""
+    size = request.param
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [size, size], [3, 3])])
+    u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+    problem = uem.UnitedProblem(linear(u, 1.0), u)
+    return RigidMotions(problem.config, problem.forces.free[: problem.config.n_owned], False), problem.config
+
+
+def corner_equation(config, direction):
+    """An equation at one corner, on the rank that owns it."""
+    size = config.size / 2**0.5
+    here = np.flatnonzero((np.abs(config.X[: config.n_owned]) < 1e-6 * size).all(axis=1)).astype(np.int32)
+    k = len(here)
+    none = np.zeros((k, 0))
+    return UnitingEquations.along(here, np.tile(direction, (k, 1)), none.astype(np.int64), none, np.zeros(k), np.ones(k, bool))
+
+
+def test_what_counts_as_open(body):
+    """A square has three motions; an equation that resists one by 3e-6 of its size leaves it open, by 3e-5 it does not."""
+    motions, config = body
+    assert motions.open_motions(None).shape[1] == 3
+    for resistance, left in ((3e-6, 3), (3e-5, 2)):
+        # a corner moves by 1.2 of a motion's size at most
+        equations = corner_equation(config, np.array([0.0, resistance]))
+        assert motions.open_motions(equations).shape[1] == left
+
+
+def test_what_counts_as_loaded(body):
+    """Of forces that cancel but for a part: 3e-7 of them drives nothing, 3e-6 moves the body along the rest."""
+    motions, config = body
+    X = config.X[: config.n_owned]
+    n = config.index_map.size_global
+    for part, driven in ((3e-7, False), (3e-6, True)):
+        # pairs of opposite forces on lines through the middle, and a small one in common
+        F = np.sign(X - 0.5 * config.size / 2**0.5)
+        total = COMM.allreduce(np.abs(F).sum())
+        F[:, 0] -= part * total / n
+        motion = motions.load(motions.open_motions(None), F)
+        assert motion.any() == driven
+        if driven:
+            assert np.argmax(np.abs(motion)) == 0 and motion[0] > 0
+        assert motions.share == pytest.approx(part, rel=0.05)
