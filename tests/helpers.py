@@ -103,11 +103,14 @@ def lawful(contact: uem.Contact, size: float = 1.0, force: float = 1.0) -> None:
     assert control == pytest.approx(nodal, rel=1e-9, abs=1e-12 * force)
     balance = contact.balance()
     if balance is not None:
-        assert balance.force <= 1e-12 and balance.moment <= 1e-11
+        assert balance.force <= 1e-12
         there, back = contact.resultant(), contact.resultant(on="target")
         largest = force + np.abs(there.force).max()
         assert np.abs(there.force + back.force).max() <= 1e-14 * largest
-        assert np.abs(there.moment + back.moment).max() <= 1e-11 * largest * size
+        # where the foot stays behind, the forces of a pair lie on two lines
+        if contact.sliding == "finite":
+            assert balance.moment <= 1e-11
+            assert np.abs(there.moment + back.moment).max() <= 1e-11 * largest * size
 
 
 def factors(history: Iterable[Any]) -> list[float]:

@@ -35,7 +35,7 @@ def vertical(b, settlement_low, settlement_high, gap=0.0):
 # -- closed forms ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cell,finer,ratio", product(CELLS, ("upper", "lower"), (1e-3, 1.0, 1e6)))
+@pytest.mark.parametrize("cell,finer,ratio", [*product(CELLS, ("upper", "lower"), (1e-3, 1.0, 1e6))])
 def test_patch(cell, finer, ratio):
     """Nested meshes, the finer side the contactor: force, pressure and every nodal displacement are the closed form's."""
     d = 0.01
@@ -48,10 +48,10 @@ def test_patch(cell, finer, ratio):
     low, high = d * ratio / (1 + ratio), d / (1 + ratio)
     force = M * low
     side = 1.0 if finer == "upper" else -1.0
-    assert contact.resultant().force[-1] == pytest.approx(side * force, rel=1e-9)
+    # forces are read from the contactor's own residual, whose rounding grows with its stiffness
+    assert contact.resultant().force[-1] == pytest.approx(side * force, rel=1e-9 if ratio <= 1 else 1e-8)
     assert np.abs(contact.resultant().force[:-1]).max() < 1e-11 * force
     pressures = contact.pressures
-    # read from the contactor's own residual, whose rounding grows with its stiffness
     assert highest(COMM, np.abs(pressures / force - 1)) < (1e-9 if ratio <= 1 else 1e-6)
     assert contact.n_active == (max(n_low, n_high) + 1) ** (b.gdim - 1)
     exact = vertical(b, low, high)

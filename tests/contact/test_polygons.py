@@ -126,7 +126,7 @@ def test_contactor_exactly_on_a_vertex(cell, normals):
     assert contact.resultant().force[-1] > 0
 
 
-@pytest.mark.parametrize("cell,ratio", product(("quadrilateral", "tetrahedron", "hexahedron"), (0.2, 5.0)))
+@pytest.mark.parametrize("cell,ratio", [*product(("quadrilateral", "tetrahedron", "hexahedron"), (0.2, 5.0))])
 def test_contactors_on_the_rim_of_the_target(cell, ratio):
     """Equal blocks with free sides: the softer bulges past the stiffer one's rim, where contactors sit from the start."""
     b = blocks(COMM, cell, 2, 4 if b_is_flat(cell) else 3)

@@ -69,7 +69,7 @@ def test_one_step_and_many_agree():
     assert answers[0][1] == answers[1][1]
 
 
-@pytest.mark.parametrize("cell,normals", product(("triangle", "hexahedron"), ("facet", "averaged")))
+@pytest.mark.parametrize("cell,normals", [*product(("triangle", "hexahedron"), ("facet", "averaged"))])
 def test_complementarity(cell, normals):
     """On every converged state: no tension, no penetration, force only where the gap is closed; action = reaction."""
     b, contact, problem = pressed(cell, normals=normals, rtol=1e-10, fine=2 if cell == "triangle" else 1)
