@@ -169,7 +169,7 @@ def test_whatever_names_a_surface(cell, how):
         found.append((contact.resultant().force, problem.reaction(bottom), contact.max_pressure(), u.x.array.copy()))
         assert contact.name and isinstance(contact.contactor, uem.Tag)
     for ours, theirs in zip(*found):
-        np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
     assert found[0][0][g - 1] == pytest.approx(0.1) and found[0][1][g - 1] == pytest.approx(0.1)
 
 
