@@ -7,16 +7,11 @@ between ``find_wrong`` and ``exchange``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from uem_dolfinx.contact.state import PairState
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.state import PairState
 
 #: Contactors whose gap is smaller, as part of the model's size, touch without force.
 #: [convention; the model's size; test_active_set.py::test_what_touches_at_the_start]

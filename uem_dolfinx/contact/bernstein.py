@@ -16,24 +16,18 @@ add up to the resultant.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.coupling import Placement
 from uem_dolfinx.contact.node_to_surface import Feet, NodeToSurface
-
-if TYPE_CHECKING:
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.contact.state import PairState
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection, Target
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
 
 #: Nodes share a quadratic gap if their normals agree up to this cosine,
 #: [heuristic; cosine; -]
@@ -60,7 +54,7 @@ class Family:
     """
 
     config: Configuration
-    nodes: npt.NDArray[np.int32]
+    nodes: Indices
     child: Ints
     parent: Ints
     weight: Array
@@ -193,7 +187,7 @@ class ControlFeet(Feet):
 class Bernstein(NodeToSurface):
     """Implements ``Coupling`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
 
-    def __init__(self, config: Configuration, nodes: npt.NDArray[np.int32], target: Target, **how: Any):
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.family = Family(config, nodes, *_family(config, nodes))
         # one in the middle of a facet follows those in the middles of edges
@@ -225,7 +219,7 @@ class Bernstein(NodeToSurface):
         return control.areas(areas)
 
 
-def _family(config: Configuration, nodes: npt.NDArray[np.int32]) -> tuple[Ints, Ints, Array, Bools]:
+def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:
     """Places of the children, local nodes of the parents, weights, and whether a term leads from facet to edge, ``(k,)`` each."""
     place = np.full(config.n_local, -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))

@@ -5,19 +5,15 @@ Every check speaks on all ranks or on none.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.contact.active_set import TOUCHING
+from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import ConflictError, PenetrationError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from uem_dolfinx.contact.pair import ContactPair
 
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 #: [heuristic; the model's size; -]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -14,23 +13,19 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
 from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.rigid import finite_point
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
 from uem_dolfinx.geometry.tags import Part, as_tag, name_of
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Target
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]

@@ -7,22 +7,15 @@ drawn to it belongs to both, and would flip between them for ever if it had to c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.projection import gap_hessians
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-    from uem_dolfinx.geometry.search import MeshTarget
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: Facets whose slopes differ by less are one plane.
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]

@@ -8,19 +8,12 @@ gaps of quadratic surfaces, or integrals over segments differ in nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.contact.state import PairState
-    from uem_dolfinx.geometry.projection import Projection, Target
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.projection import Projection, Target
 
 #: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
 NORMAL = 0
@@ -70,7 +63,7 @@ class Coupling(Protocol):
     target: Target
 
     @property
-    def followed(self) -> npt.NDArray[np.int32]:
+    def followed(self) -> Indices:
         """Local nodes that contactors may follow, repeated or not ``(k,)``."""
 
     @property

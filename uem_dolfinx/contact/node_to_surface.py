@@ -7,26 +7,19 @@ contactor.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
+from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.valleys import create_valleys
-
-if TYPE_CHECKING:
-    from uem_dolfinx.contact.corners import Corners
-    from uem_dolfinx.contact.state import PairState
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection, Target
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
 
 #: A contactor past an open end by more than this part of its facet has slid off.
 #: [heuristic; length of the facet; -]
@@ -72,7 +65,7 @@ class NodeToSurface:
     def __init__(
         self,
         config: Configuration,
-        nodes: npt.NDArray[np.int32],
+        nodes: Indices,
         target: Target,
         *,
         free: Bools,
@@ -103,7 +96,7 @@ class NodeToSurface:
         )
 
     @property
-    def followed(self) -> npt.NDArray[np.int32]:
+    def followed(self) -> Indices:
         """Local nodes of the target."""
         return self.target.dofs.ravel()
 

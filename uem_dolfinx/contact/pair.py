@@ -5,32 +5,25 @@ A pair keeps a trial state that changes with every iteration and a committed one
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import active_set
-from uem_dolfinx.contact.coupling import NORMAL
+from uem_dolfinx.contact.coupling import NORMAL, Coupling, LabelledEquations, Placement
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.contact.coupling import Coupling, LabelledEquations, Placement
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection, Target
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: A normal return may change nodal forces by this part of the largest contact force.
 #: [heuristic; largest contact force; -]
@@ -64,7 +57,7 @@ class ContactPair:
     def __init__(
         self,
         config: Configuration,
-        nodes: npt.NDArray[np.int32],
+        nodes: Indices,
         coupling: Coupling,
         *,
         name: str,

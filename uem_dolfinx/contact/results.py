@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-Array = npt.NDArray[np.float64]
+from uem_dolfinx.arrays import Array
 
 
 @dataclass(frozen=True)

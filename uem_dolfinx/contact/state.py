@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.arrays import Array, Bools, Ints
+
 Renumber = Callable[[Ints], Ints]
 
 #: Attributes that number facets.

@@ -6,23 +6,16 @@ States are handed in and out; only the geometry of the target is kept.
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.corners import Corners, find_corners
-from uem_dolfinx.geometry.projection import FacetProjection
-
-if TYPE_CHECKING:
-    from uem_dolfinx.contact.state import PairState
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.projection import Projection, Target
-    from uem_dolfinx.geometry.search import MeshTarget
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
 
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
 #: [heuristic; changes in a step; -]

@@ -5,31 +5,25 @@ They turn a static residual into a dynamic one: the solver adds these forces to 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from uem_dolfinx import compat
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import ufl
-    from ufl.core.expr import Expr
-
-    from uem_dolfinx.algebra.restriction import Restriction
-    from uem_dolfinx.dynamics.mass import Mass
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
@@ -147,7 +141,7 @@ class Dynamics:
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 
-    def make_contactors_massless(self, contactors: npt.NDArray[np.int32]) -> None:
+    def make_contactors_massless(self, contactors: Indices) -> None:
         """Hand the mass of the contactors on to the nodes around, or warn that they keep it (collective).
 
         Args:

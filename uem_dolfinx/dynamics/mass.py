@@ -5,10 +5,13 @@ A density or nodal masses become a matrix with the layout of K.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from mpi4py import MPI
 
 import basix
 import numpy as np
@@ -18,20 +21,12 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from mpi4py import MPI
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import ufl
-
-if TYPE_CHECKING:
-    from ufl.core.expr import Expr
+from ufl.core.expr import Expr
 
 KINDS = ("3d", "plane_strain", "plane_stress")
 

@@ -8,15 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.log import compiling
-
-Array = npt.NDArray[np.float64]
 
 #: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
 #: [convention; reference cell; test_thresholds_motion.py::test_points_beside_the_centre]
@@ -25,7 +23,7 @@ BESIDE_CENTRE = 1e-4
 DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]}
 
 
-def owned_cells(domain: Any, part: Part | None) -> npt.NDArray[np.int32]:
+def owned_cells(domain: Any, part: Part | None) -> Indices:
     """Cells of a part of the mesh, or all cells, that this rank owns (collective).
 
     Args:
@@ -62,10 +60,10 @@ class QuadraturePoints:
         volumes: that belong to the points, ``(n_cells, n_points)``.
     """
 
-    def __init__(self, domain: Any, cells: npt.NDArray[np.int32], degree: int):
+    def __init__(self, domain: Any, cells: Indices, degree: int):
         self.mesh, self.cells, self.degree = domain, cells, degree
         #: By the size of their values: the spaces made, and where the points are in them.
-        self._spaces: dict[int, tuple[fem.FunctionSpace, npt.NDArray[np.int32]]] = {}
+        self._spaces: dict[int, tuple[fem.FunctionSpace, Indices]] = {}
         metadata: dict[str, Any] = {"quadrature_degree": degree}
         self.points, weights = forms.quadrature_rule(domain, degree)
         if degree == 0:
@@ -97,7 +95,7 @@ class QuadraturePoints:
             self._spaces[size] = V, compat.cell_dofs(V)[self.cells].ravel()
         return fem.Function(self._spaces[size][0], name=name)
 
-    def _rows(self, f: fem.Function) -> tuple[Array, npt.NDArray[np.int32]]:
+    def _rows(self, f: fem.Function) -> tuple[Array, Indices]:
         """All local values of a Function ``(n, size)``, a view, and the rows of the points."""
         size = f.function_space.dofmap.index_map_bs
         return f.x.array.reshape(-1, size), self._spaces[size][1]

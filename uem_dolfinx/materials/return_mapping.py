@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from uem_dolfinx.arrays import Array
 
 #: A stress outside the yield surface by no more than this part of the yield stress is on it.
 #: [convention; yield stress; test_thresholds_motion.py::test_on_the_yield_surface]

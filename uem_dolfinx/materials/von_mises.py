@@ -6,27 +6,22 @@ Stress and tangent enter forms as Functions known at quadrature points.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import NotFiniteError, SpaceError, UEMError
+from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
 from uem_dolfinx.materials.elastic import KINDS, green_lagrange
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from ufl.core.expr import Expr
-
-    from uem_dolfinx.geometry.tags import Part
-
-Array = npt.NDArray[np.float64]
 
 STRAINS = ("small", "green_lagrange")
 #: Degrees of the quadrature of stress and of pressure, by the displacement's degree, on simplices and on tensor-product cells;

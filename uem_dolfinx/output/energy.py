@@ -6,26 +6,20 @@ It reads a solved problem and changes nothing.
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, fields
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import ufl
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import ufl
-
-    from uem_dolfinx.solve.problem import UnitedProblem
-    from uem_dolfinx.solve.time_steps import TimeStep
-
-Array = npt.NDArray[np.float64]
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.time_steps import TimeStep
 
 
 @dataclass(frozen=True)

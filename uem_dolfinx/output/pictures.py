@@ -5,30 +5,23 @@ They read a solved problem and change nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import MissingBackendError
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from mpi4py import MPI
-
-    from uem_dolfinx.contact.contact import Contact
-    from uem_dolfinx.solve.problem import UnitedProblem
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
 TRIANGLES = {"triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]]}

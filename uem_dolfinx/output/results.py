@@ -6,28 +6,19 @@ Writers read a solved problem and change nothing.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.log import timed
 from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.solve.load_steps import LoadStep
+from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from uem_dolfinx.contact.contact import Contact
-    from uem_dolfinx.solve.problem import UnitedProblem
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class HistoryWriter(Closing):

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import csv
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import IO, Any, Protocol, Self
+
+from mpi4py import MPI
 
 from uem_dolfinx.errors import CheckpointError
 from uem_dolfinx.log import timed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from typing import IO, Self
-
-    from mpi4py import MPI
 
 
 class Clock(Protocol):

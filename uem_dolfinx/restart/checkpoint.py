@@ -11,27 +11,22 @@ import os
 import re
 import signal
 import threading
+from collections.abc import Iterator
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType, TracebackType
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agree
 from uem_dolfinx.restart.numbering import DIGEST, as_bytes, fingerprint, hashes
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import FrameType, TracebackType
-
-    from uem_dolfinx.restart.state import State
-
-Array = npt.NDArray[Any]
+from uem_dolfinx.restart.state import State
 
 #: Version of the file's layout and of the names in it.
 #: [format; -; test_checkpoint_refused.py::test_another_format]
@@ -195,7 +190,7 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def _write(file: MPI.File, offset: int, array: Array) -> None:
+def _write(file: MPI.File, offset: int, array: AnyArray) -> None:
     """Write an array at an offset in bytes."""
     data = as_bytes(np.ascontiguousarray(array))
     for i in range(0, len(data), PIECE):
@@ -206,7 +201,7 @@ def _write(file: MPI.File, offset: int, array: Array) -> None:
             raise OSError(f"{status.Get_count(MPI.BYTE)} of {len(piece)} bytes written")
 
 
-def _parts(file: MPI.File, state: State, trouble: _Trouble) -> Iterator[Array]:
+def _parts(file: MPI.File, state: State, trouble: _Trouble) -> Iterator[AnyArray]:
     """This rank's parts of the tables, one after the other (collective)."""
     end = HEAD
     for entry in state.entries:

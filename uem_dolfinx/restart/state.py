@@ -5,27 +5,21 @@ Whoever leads a run collects its state here; checkpoints write and read it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
+
+from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
+from dolfinx import fem
 
 from uem_dolfinx import compat
+from uem_dolfinx.arrays import AnyArray
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from mpi4py import MPI
-
-    from dolfinx import fem
-
-    from uem_dolfinx.contact.contact import Contact
-
-Array = npt.NDArray[Any]
 
 #: Sides of a cell are fewer.
 #: [format; sides; -]
@@ -41,10 +35,10 @@ class Entry(Protocol):
     def describe(self) -> str:
         """What tells it from others (collective)."""
 
-    def to_checkpoint(self) -> Array:
+    def to_checkpoint(self) -> AnyArray:
         """Values at this rank's nodes ``(n, ...)`` (collective)."""
 
-    def from_checkpoint(self, kept: Array) -> None:
+    def from_checkpoint(self, kept: AnyArray) -> None:
         """Put values back (collective)."""
 
 
@@ -65,13 +59,13 @@ class FunctionEntry:
         family, degree = compat.element_family(self.u.function_space) or ("", 0)
         return f"{family} {degree}, {self.to_checkpoint().shape[1]} components at {self.numbering.total} nodes"
 
-    def to_checkpoint(self) -> Array:
+    def to_checkpoint(self) -> AnyArray:
         """A view of the owned part ``(n_owned, block size)``."""
         dofmap = self.u.function_space.dofmap
         rows = self.u.x.array.reshape(-1, dofmap.index_map_bs)
         return np.asarray(rows[: dofmap.index_map.size_local])
 
-    def from_checkpoint(self, kept: Array) -> None:
+    def from_checkpoint(self, kept: AnyArray) -> None:
         """Overwrite the Function."""
         self.to_checkpoint()[:] = kept
         self.u.x.scatter_forward()
@@ -102,7 +96,7 @@ class ContactEntry:
         """Size, the surfaces, and what is remembered of a contactor."""
         return f"{self.numbering.total} contactors, surfaces {self._surfaces}, each with {self._columns}"
 
-    def to_checkpoint(self) -> Array:
+    def to_checkpoint(self) -> AnyArray:
         """One record for each contactor ``(n,)``."""
         kept = self.contact.pair.to_checkpoint()
         rows = np.empty(len(self.contact.pair.nodes), dtype=[(name, a.dtype.str, a.shape[1:]) for name, a in kept.items()])
@@ -110,7 +104,7 @@ class ContactEntry:
             rows[name] = a
         return rows
 
-    def from_checkpoint(self, kept: Array) -> None:
+    def from_checkpoint(self, kept: AnyArray) -> None:
         """Hand the records to the pair."""
         self.contact.pair.from_checkpoint({name: kept[name] for name in kept.dtype.names or ()})
 

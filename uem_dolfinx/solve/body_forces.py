@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from mpi4py import MPI
 
@@ -13,19 +13,13 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.solve.tangent import Inversions, Tangent
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.materials.elastic import HistoryMaterial
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Multiple of the rounding of K u that the residual may be left with.
 #: [derived; rounding of K u; test_body_forces.py::test_rounding_of_forces]

@@ -7,25 +7,18 @@ statically determinate way, where the reaction is zero.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.log import logger
+from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions, find_open_motions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uem_dolfinx.contact.pair import ContactPair
-    from uem_dolfinx.solve.body_forces import BodyForces
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Until contact has developed, motions that it resists with less than this part are held as well: a body that has touched ground
 #: with one or two nodes would else swing about them.

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx.errors import UEMError
+from uem_dolfinx.solve.newton import Iteration
+from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uem_dolfinx.solve.newton import Iteration
-    from uem_dolfinx.solve.problem import UnitedProblem
 
 
 @dataclass(frozen=True)

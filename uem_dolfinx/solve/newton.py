@@ -6,20 +6,14 @@ The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics al
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
+from petsc4py import PETSc
 
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
 from uem_dolfinx.log import logger, say
-
-if TYPE_CHECKING:
-    from petsc4py import PETSc
-
-    from uem_dolfinx.algebra.restriction import Restriction
-
-Array = npt.NDArray[np.float64]
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; -]

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
+from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import agree_on_call
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.newton import Iteration, solve_united
+from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.system import BodySystem
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    import ufl
-
-    from uem_dolfinx.contact.contact import Contact
-    from uem_dolfinx.contact.pair import ContactPair
-    from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.materials.elastic import HistoryMaterial
-    from uem_dolfinx.solve.newton import UnitedSystem
 
 #: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
 #: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.

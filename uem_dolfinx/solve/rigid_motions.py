@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import rotation_matrix
-
-if TYPE_CHECKING:
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: A motion is open if conditions and contacts resist it with less than this part of its size.
 #: [convention; size of the motion; test_rigid_motions.py::test_what_counts_as_open]

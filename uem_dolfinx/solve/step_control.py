@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from uem_dolfinx import errors
 from uem_dolfinx.log import logger
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 #: A step may be cut to this part of its nominal length.
 #: [convention; nominal length; test_thresholds_motion.py::test_steps_are_cut_ten_times]

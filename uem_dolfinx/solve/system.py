@@ -6,35 +6,28 @@ It implements ``newton.UnitedSystem`` by elimination, and leaves load steps and 
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.dependent import Resolution
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
+from uem_dolfinx.contact.coupling import LabelledEquations
+from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.log import timed
+from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState
 from uem_dolfinx.solve.tangent import contact_curvature
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.contact.coupling import LabelledEquations
-    from uem_dolfinx.contact.pair import ContactPair
-    from uem_dolfinx.solve.body_forces import BodyForces
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Residual relative to the forces at work below which contact forces can be trusted to release a contactor for good.
 #: [heuristic; norm of the forces; -]

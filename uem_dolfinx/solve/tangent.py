@@ -5,27 +5,20 @@ A part of the seventh step on the data's way; K is assembled only when something
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.materials.elastic import HistoryMaterial
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from uem_dolfinx.materials.elastic import HistoryMaterial
 
 
 class Tangent:

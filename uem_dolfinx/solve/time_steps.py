@@ -5,27 +5,21 @@ Every step that converges is committed, so that a run that fails keeps its last 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError, UEMError
 from uem_dolfinx.geometry.rigid import RigidSurface
 from uem_dolfinx.log import progress
+from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.solve.newton import Iteration
+from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH, EnergyGivenError
 from uem_dolfinx.solve.tunnelling import check_tunnelling
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uem_dolfinx.dynamics.inertia import Dynamics
-    from uem_dolfinx.restart.checkpoint import Checkpoint
-    from uem_dolfinx.solve.newton import Iteration
-    from uem_dolfinx.solve.problem import UnitedProblem
-
-Array = npt.NDArray[np.float64]
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import TunnellingError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from uem_dolfinx.contact.pair import ContactPair
-    from uem_dolfinx.geometry.configuration import Configuration
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
 #: [convention; the target's stride; test_thresholds_motion.py::test_depth_of_a_passage]
