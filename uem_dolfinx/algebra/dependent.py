@@ -187,7 +187,7 @@ def _with_neighbours(config: Configuration, equations: UnitingEquations, contest
     while True:
         rows = contested[equations.row]
         touched = np.unique(np.concatenate([equations.followed[rows], config.to_global(equations.node[contested])]))
-        here[config.tell_owners(touched)] = True
+        here[config.gather_owned(touched)] = True
         more = equations.active & ~contested & here[equations.node]
         contested |= more
         if not config.comm.allreduce(int(more.any())):
