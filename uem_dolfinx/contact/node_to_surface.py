@@ -166,7 +166,9 @@ class NodeToSurface:
         """Which targets can move along the normal (collective)."""
         if not p.nodes.shape[1]:
             return None
-        free = self.config.ask_owners(p.nodes.ravel(), self._free_of_owned.astype(float)).reshape(*p.nodes.shape, -1)
+        free = self.config.ask_owners(p.nodes.ravel(), self._free_of_owned.astype(float)).reshape(
+            *p.nodes.shape, self.config.gdim
+        )
         return np.abs(p.weights[:, :, None] * p.normal[:, None] * free).max(axis=(1, 2)) > MOSTLY_PRESCRIBED
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
