@@ -84,7 +84,10 @@ def test_trial_rows_apart_from_test_rows():
     used = gathered_vector(scattered_like(state, n, b.gdim))
     wanted = Q.T @ Kd @ P + np.diag(np.where(used > 0, 0.0, np.diag(Kd)))
     rhs = scattered(np.where(used > 0, np.sin(np.arange(len(used))), 0.0), state.residual)
-    for options in ({"ksp_type": "preonly", "pc_type": "cholesky"}, {"ksp_type": "cg", "pc_type": "jacobi", "ksp_rtol": 1e-12, "ksp_gmres_restart": 200}):
+    for options in (
+        {"ksp_type": "preonly", "pc_type": "cholesky"},
+        {"ksp_type": "cg", "pc_type": "jacobi", "ksp_rtol": 1e-12, "ksp_gmres_restart": 200},
+    ):
         if COMM.size > 1 and options["pc_type"] == "cholesky":
             options |= {"pc_factor_mat_solver_type": "mumps"}
         solver = UnitedSolver(problem.config, "chords_", options)

@@ -118,10 +118,14 @@ class IndependentEquations:
 def _send(comm: MPI.Comm, equations: UnitingEquations, rank: Ints) -> tuple[UnitingEquations, Exchange]:
     """The equations of global nodes that all ranks send here, each to one ``rank (m,)``, with their terms (collective)."""
     exchange, order = Exchange.to(comm, rank), np.argsort(equations.row, kind="stable")
-    n_terms = np.bincount(equations.row, minlength=len(equations))
-    *own, n_terms = exchange.send(equations.node.astype(np.int64), equations.direction, equations.gap, equations.active, n_terms)
-    terms = Exchange.to(comm, rank[equations.row[order]]).send(equations.followed[order], equations.coefficients[order])
-    return UnitingEquations(*own, np.repeat(np.arange(len(n_terms)), n_terms), *terms), exchange
+    node, direction, gap, active, n_terms = exchange.send(
+        equations.node.astype(np.int64), equations.direction, equations.gap, equations.active,
+        np.bincount(equations.row, minlength=len(equations)),
+    )  # fmt: skip
+    terms = Exchange.to(comm, rank[equations.row[order]])
+    followed, coefficients = terms.send(equations.followed[order], equations.coefficients[order])
+    row = np.repeat(np.arange(len(node)), n_terms)
+    return UnitingEquations(node, direction, gap, active, row, followed, coefficients), exchange
 
 
 def _solve(config: Configuration, rows: UnitingEquations, free: Bools) -> list[Group]:

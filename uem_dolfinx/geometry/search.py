@@ -1,7 +1,7 @@
 """Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
 
-Third step on the data's way. A point travels only to the ranks whose part of the target can be nearest, and only its answer
-travels back, so no rank ever sees a whole surface.
+A point is sent only to the ranks whose part of the target can be nearest, and only its answer comes back, so that no rank ever
+holds a whole surface.
 """
 
 from __future__ import annotations
@@ -26,10 +26,15 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-#: An averaged normal that leans further from the facet's (its cosine) no longer tells where the facet is.
+#: An averaged normal that leans further from the facet's no longer tells where the facet is.
+#: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
 LEAST_LEAN = 0.1
-#: Reference distance from a facet's side below which a foot counts as lying on it.
+#: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
+#: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
+#: Facets whose distances or heights differ by less are equally near.
+#: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
+EQUALLY_NEAR = 1e-9
 
 
 class MeshTarget:
@@ -62,7 +67,7 @@ class MeshTarget:
         near, far = self._bounds(points, data)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
         found = self._ask(Exchange.to(self.comm, first), data, points)
-        bound = np.linalg.norm(points - found.foot, axis=1) * (1 + 1e-9) + ON_SIDE * self.stride
+        bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
         others = (near <= bound) & (first != np.arange(size)[:, None])
         return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=found)
 
@@ -142,11 +147,11 @@ class MeshTarget:
         self.comm.Allgather(box, boxes)
         near, far = np.full((2, size, len(points)), np.inf)
         for r in np.flatnonzero(boxes[:, 0, 0] <= boxes[:, 1, 0]):
-            low, high = boxes[r]
-            slack = 0.0 if self.shape.degree == 1 else 0.25 * np.linalg.norm(high - low)
-            outside = np.maximum(np.maximum(low - points, points - high), 0.0)
-            near[r] = np.linalg.norm(outside, axis=1) - slack
-            far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1) + slack
+            # curved facets reach out of the box of their nodes
+            out = 0.5 * (self.shape.lebesgue - 1) * (boxes[r, 1] - boxes[r, 0])
+            low, high = boxes[r, 0] - out, boxes[r, 1] + out
+            near[r] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+            far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1)
         return near, far
 
     def _ask(
@@ -249,8 +254,9 @@ def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints
     """
     closest = np.full(points.max(initial=-1) + 1, np.inf)
     np.minimum.at(closest, points, distance)
-    farther = distance > closest[points] * (1 + 1e-9) + np.finfo(float).tiny
-    order = np.lexsort((number, -np.round(height / np.where(closest > 0, closest, 1.0)[points], 9), farther, points))
+    farther = distance > closest[points] * (1 + EQUALLY_NEAR) + np.finfo(float).tiny
+    steps = np.rint(height / (EQUALLY_NEAR * np.where(closest > 0, closest, 1.0)[points]))
+    order = np.lexsort((number, -steps, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
 
@@ -280,18 +286,18 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
 
     tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
     middle = np.einsum("na,nag->ng", tab.N, x)
-    arm, stretch = x - middle[:, None], 1.0 if shape.degree == 1 else 1.5
-    radius = stretch * np.linalg.norm(arm, axis=2).max(axis=1)
+    arm = x - middle[:, None]
+    radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
     normal = unit_normals(tab, x)
-    bulge = stretch * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
+    bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     bound, _ = cKDTree(middle).query(points)
-    bound = bound * (1 + 1e-12)
+    bound = bound * (1 + EQUALLY_NEAR)
     size_class = np.floor(np.log2(radius / radius.max()))
     pairs, facets = [], []
     for c in np.unique(size_class):
         members = np.flatnonzero(size_class == c)
-        reach = bound + radius[members].max()
-        hits = cKDTree(middle[members]).query_ball_point(points, reach, return_sorted=False)
+        within = bound + radius[members].max()
+        hits = cKDTree(middle[members]).query_ball_point(points, within, return_sorted=False)
         counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
         pairs.append(np.repeat(np.arange(len(points)), counts))
         facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])

@@ -1,7 +1,4 @@
-"""The order of a mesh's input: where rows that live on some rank belong in a table over all ranks, whatever the partition.
-
-A part of the last step on the data's way: checkpoints are written and read in this order, since partitions differ from run to run.
-"""
+"""The order of a mesh's input, in which checkpoints are written and read, since partitions differ from run to run."""
 
 from __future__ import annotations
 
@@ -22,8 +19,10 @@ Array = npt.NDArray[Any]
 Ints = npt.NDArray[np.int64]
 
 #: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
+#: [format; rows; -]
 CHUNK = 1024
-#: Bytes of a hash.
+#: Length of a hash.
+#: [format; bytes; -]
 DIGEST = 16
 
 
