@@ -1,7 +1,6 @@
 """The one place that knows DOLFINx versions: 0.5 (Debian 12), 0.9 (Debian 13) and 0.11 (PyPI wheel, Debian sid).
 
-Everything later on the way, from the mesh to the files, speaks to DOLFINx through these functions wherever the versions differ,
-or a call that is the same in all of them needs arguments that every caller would have to repeat.
+The package, its demos and its tests call DOLFINx, UFL and Gmsh through these functions wherever versions differ.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from petsc4py import PETSc
 from uem_dolfinx.errors import MissingBackendError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -315,26 +314,6 @@ def form(integrals: Any) -> Any:
         The DOLFINx form.
     """
     return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
-
-
-@contextmanager
-def on_compilation(tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` once if FFCx compiles something meanwhile, at the beginning; what it finds in its cache does not count."""
-    ffcx = logging.getLogger("ffcx")
-    told = False
-
-    def info(message: object, *_: object) -> None:
-        nonlocal told
-        if not told and str(message).startswith("Compiler stage"):
-            told = True
-            tell()
-
-    # FFCx reports the stages of a compilation to its logger, whose level it sets itself
-    ffcx.info = info  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        del ffcx.info
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:

@@ -1,7 +1,4 @@
-"""Named exceptions.
-
-First on the data's way because every later step may have to refuse its input.
-"""
+"""Errors that the package raises on purpose, by name."""
 
 from __future__ import annotations
 

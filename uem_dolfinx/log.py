@@ -1,7 +1,6 @@
 """The one logger of the package, its timers and its progress bar.
 
-Every later step reports through it: on rank 0 only, silent until the application configures logging, and with
-timings under ``~UEM:`` in DOLFINx's own table.
+It logs on rank 0 only, silent until the application configures logging; timings are in DOLFINx's own table, under ``~UEM:``.
 """
 
 from __future__ import annotations
@@ -62,11 +61,22 @@ def compiling(what: str) -> Iterator[None]:
     Args:
         what: is compiled, e.g. ``"the residual"``.
     """
-    with (
-        timed("compile forms"),
-        compat.on_compilation(lambda: logger.warning("compiling %s: later runs find it in the cache", what)),
-    ):
-        yield
+    ffcx = logging.getLogger("ffcx")
+    told = False
+
+    def info(message: object, *_: object) -> None:
+        nonlocal told
+        if not told and str(message).startswith("Compiler stage"):
+            told = True
+            logger.warning("compiling %s: later runs find it in the cache", what)
+
+    # FFCx reports the stages of a compilation to its logger, whose level it sets itself; what it finds in its cache has none
+    ffcx.info = info  # type: ignore[assignment]
+    try:
+        with timed("compile forms"):
+            yield
+    finally:
+        del ffcx.info
 
 
 def progress(items: Iterable[T], description: str = "", total: int | None = None) -> Iterable[T]:

@@ -1,18 +1,20 @@
-"""What ranks tell each other: one error for all."""
+"""What ranks send each other: rows of arrays, their answers, and one error for all."""
 
 from __future__ import annotations
 
 import pickle
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 
 import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
-    from mpi4py import MPI
-
+Array = npt.NDArray[Any]
 Ints = npt.NDArray[np.int64]
 
 
@@ -60,14 +62,69 @@ def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
     agree(comm, found)
 
 
+class Exchange:
+    """Rows of arrays sent to other ranks, and answers to them sent back (making one is collective).
+
+    Arrays may have any type but objects, and rows of any shape, both the same on all ranks. All arrays of a call travel in one
+    message of plain bytes for each pair of ranks; on one rank nothing travels and what is all sent in order is not copied either.
+
+    Args:
+        comm: communicator.
+        rows: for each rank the indices of this rank's rows that go there; a row may go to several ranks, or to none.
+
+    Attributes:
+        rows: indices of the rows sent, rank by rank ``(n_sent,)``; a row occurs as often as it is sent.
+    """
+
+    def __init__(self, comm: MPI.Comm, rows: Sequence[Ints]):
+        self.comm, self.rows = comm, np.concatenate(rows)
+        self._sent = np.array([len(r) for r in rows], dtype=np.int32)
+        self._received = self._sent.copy()
+        if comm.size > 1:
+            comm.Alltoall(self._sent, self._received)
+        in_order = comm.size == 1 and np.array_equal(self.rows, np.arange(len(self.rows)))
+        self._picked: Any = slice(len(self.rows)) if in_order else self.rows
+
+    @classmethod
+    def to(cls, comm: MPI.Comm, rank: Ints) -> Exchange:
+        """Exchange of rows that go to one rank each.
+
+        Args:
+            comm: communicator.
+            rank: where each row goes ``(n,)``, -1 for nowhere.
+        """
+        order = np.argsort(rank, kind="stable")
+        ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
+        return cls(comm, [order[a:b] for a, b in pairwise(ends)])
+
+    def send(self, *arrays: Array) -> list[Array]:
+        """Rows of ``arrays (n, ...)`` that other ranks and this one send here ``(n_received, ...)``, in their order (collective)."""
+        return self._exchange([a[self._picked] for a in arrays], self._sent, self._received)
+
+    def back(self, *arrays: Array) -> list[Array]:
+        """Answers ``(n_sent, ...)`` to ``rows``, from ``arrays (n_received, ...)`` that answer what was received (collective)."""
+        return self._exchange(list(arrays), self._received, self._sent)
+
+    def _exchange(self, arrays: list[Array], sent: Array, received: Array) -> list[Array]:
+        if self.comm.size == 1:
+            return arrays
+        row = np.dtype([(str(i), a.dtype, a.shape[1:]) for i, a in enumerate(arrays)])
+        out, into = np.empty(sent.sum(), row), np.empty(received.sum(), row)
+        for i, a in enumerate(arrays):
+            out[str(i)] = a
+        if row.itemsize:
+            starts = [np.concatenate([[0], np.cumsum(counts)[:-1]]) for counts in (sent, received)]
+            unit = MPI.BYTE.Create_contiguous(row.itemsize).Commit()
+            self.comm.Alltoallv([out.view(np.uint8), (sent, starts[0]), unit], [into.view(np.uint8), (received, starts[1]), unit])
+            unit.Free()
+        return [into[str(i)].copy() for i in range(len(arrays))]
+
+
 def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
-    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective; rows meet on a home rank)."""
-    home = keys[:, 0] % comm.size
-    received = comm.alltoall([keys[home == r] for r in range(comm.size)])
-    _, inverse, counts = np.unique(np.concatenate(received), axis=0, return_inverse=True, return_counts=True)
-    ends = np.cumsum([len(k) for k in received])[:-1]
-    answers = comm.alltoall(np.split(counts[inverse.ravel()], ends))
+    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective; equal rows meet on one rank)."""
+    meeting = Exchange.to(comm, keys[:, 0] % comm.size)
+    (met,) = meeting.send(keys)
+    _, inverse, counts = np.unique(met, axis=0, return_inverse=True, return_counts=True)
     total = np.empty(len(keys), dtype=np.int64)
-    for r in range(comm.size):
-        total[home == r] = answers[r]
+    (total[meeting.rows],) = meeting.back(counts[inverse.ravel()])
     return total

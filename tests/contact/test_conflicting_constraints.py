@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.algebra.dependent import Resolution
+from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
@@ -71,7 +71,7 @@ def test_independent_equations_say_the_same(seed, prescribed, both):
         -np.array([A[mine[k], a] for k, a in terms]).reshape(-1, g),
     )  # fmt: skip
     here = slice(first, first + n)
-    resolution = Resolution(config, equations, free[here], np.ones(len(mine), bool))
+    resolution = IndependentEquations(config, equations, free[here], np.ones(len(mine), bool))
     r = Restriction(config, resolution.equations, free[here], bound[here], True)
     C = A.reshape(5, -1)
     q = r.P.createVecRight()

@@ -1,6 +1,6 @@
-"""Uniting equations as data: what contact hands to the algebra.
+"""Uniting equations as data: all that the algebra knows of contact.
 
-Between the fourth and the fifth step on the data's way, so that neither side knows the other.
+[UEM] is Farahani, Mofid, Vafai (2001).
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
+#: [convention; part of the direction's length; test_thresholds_algebra.py::test_what_a_condition_leaves_of_a_normal]
 MOSTLY_PRESCRIBED = 1e-6
-#: Coefficients below it are rounding.
-ROUNDING = 1e-12
+#: Coefficients below it are rounding: nothing follows by them, and changes below it make no new P.
+#: [convention; directions of length one; test_thresholds_algebra.py::test_coefficients_that_are_rounding]
+NEGLIGIBLE = 1e-12
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The linear solve of the united system: ``P'KP`` with its pattern reused, near-null space carried to q, KSP and PC by size.
 
-Sixth step on the data's way; any KSP and PC can be chosen through ``petsc_options``.
+Any KSP and PC can be chosen through ``petsc_options``.
 """
 
 from __future__ import annotations
@@ -26,16 +26,22 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
+#: [convention; bodies; test_thresholds_algebra.py::test_few_bodies_have_modes_of_their_own]
 MODES_OF_THEIR_OWN = 4
 #: A mode of which less than this part is new adds nothing to the near-null space.
+#: [convention; part of its norm; test_thresholds_algebra.py::test_modes_that_are_nearly_alike]
 INDEPENDENT = 1e-6
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
+#: [convention; ratio of norms; test_thresholds_algebra.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
-#: A preconditioner is kept for matrices that differ from its own in less than this part of the equations,
+#: A preconditioner is kept for matrices that differ from its own in no more than this part of the equations.
+#: [convention; part of the equations; test_thresholds_algebra.py::test_preconditioner_is_kept]
 KEPT_CHANGES = 0.1
-#: and while it takes less than this times as many iterations for each digit as at first.
+#: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
+#: [convention; ratio of iterations; test_thresholds_algebra.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
+#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 
 

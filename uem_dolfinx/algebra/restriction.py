@@ -1,6 +1,6 @@
-"""From uniting equations to the restriction matrix P and the united system ``P'KP``.
+"""The restriction matrix P of uniting equations of any origin, and the united system ``P'KP`` [UEM, 6].
 
-Fifth step on the data's way, pure algebra that knows nothing of contact. With the free unknowns q,
+With the free unknowns q,
 
     du = P dq + c                        P: n x n with idle columns, m = n - (number of equations) of them in use
     P'KP dq = P'(r - K c)                [UEM, 6.6]
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, ROUNDING
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-
-#: Stacks of bodies higher than this are taken for a cycle.
-LONGEST_CHAIN = 16
 
 
 class Restriction:
@@ -153,15 +150,15 @@ class Restriction:
         path = self.M.matMult(self._eliminated)
         indptr, columns, values = path.getValuesCSR()
         # an equation may follow what is left free of an eliminated node
-        path.setValuesCSR(indptr, columns, (np.abs(values) > ROUNDING).astype(float))
+        path.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
         path.assemble()
         at = self._vector(np.ones((self.config.n_owned, self.config.gdim)))
-        for length in range(1, LONGEST_CHAIN + 1):
-            at = path * at
-            if at.norm(PETSc.NormType.INFINITY) == 0.0:
-                return length
-            # only whether a path exists matters
+        length, left, before = 0, at.sum(), np.inf
+        # components from which a path of so many equations leads; if none of them drops out, it has no end
+        while 0.0 < left < before:
+            at, length, before = path * at, length + 1, left
             at.array[:] = at.array_r > 0
+            left = at.sum()
         rows = np.flatnonzero(at.array_r)
         error = None
         if len(rows):
@@ -170,7 +167,7 @@ class Restriction:
                 "two surfaces are contactor and target of each other; drop one of the two contacts"
             )
         agree(self.comm, error)
-        return LONGEST_CHAIN
+        return length
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
@@ -263,10 +260,10 @@ class Restriction:
     def fingerprint(self, *, values: bool) -> int:
         """Hash of this rank's part of P: of its sparsity, or of its values too, but for rounding."""
         eq = self.equations
-        parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), bytes([self.chain])]
+        parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), str(self.chain).encode()]
         if values:
             # feet that have moved by rounding make no new P
-            rounded = (np.rint(v / ROUNDING).astype(np.int64) for v in (eq.direction, eq.coefficients))
+            rounded = (np.rint(v / NEGLIGIBLE).astype(np.int64) for v in (eq.direction, eq.coefficients))
             parts += [*(v.tobytes() for v in rounded), eq.active.tobytes()]
         return zlib.crc32(b"".join(parts))
 

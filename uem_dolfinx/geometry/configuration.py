@@ -1,9 +1,10 @@
-"""Nodes of a displacement and where they are: the configuration that every later step looks at."""
+"""Nodes of a displacement and where they are, and what ranks tell each other about nodes."""
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +12,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.errors import SpaceError
-
-if TYPE_CHECKING:
-    pass
+from uem_dolfinx.parallel import Exchange
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -73,27 +72,28 @@ class Configuration:
         return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
 
     @cached_property
-    def _courier(self) -> fem.Function:
+    def _work(self) -> fem.Function:
+        """Holds what is sent between owners and ghosts."""
         return fem.Function(self.V)
 
     def from_owners(self, nodes: npt.NDArray[np.integer], values: Array, wanted: npt.NDArray[np.integer]) -> Array:
         """Values that owners have at their ``nodes (n, k)``, at local nodes ``wanted (m, k)``, ghosts or not (collective)."""
         out = np.empty((len(wanted), values.shape[1]))
-        carried = self._courier.x.array.reshape(-1, self.gdim)
+        sent = self._work.x.array.reshape(-1, self.gdim)
         for first in range(0, values.shape[1], self.gdim):
             part = values[:, first : first + self.gdim]
-            carried[nodes, : part.shape[1]] = part
-            self._courier.x.scatter_forward()
-            out[:, first : first + self.gdim] = carried[wanted, : part.shape[1]]
+            sent[nodes, : part.shape[1]] = part
+            self._work.x.scatter_forward()
+            out[:, first : first + self.gdim] = sent[wanted, : part.shape[1]]
         return out
 
     def to_owners(self, nodes: npt.NDArray[np.integer], values: Array) -> Array:
         """Sums of values at local ``nodes (m,)``, ghosts or not, at every local node ``(n_local,)`` (collective)."""
-        carried = self._courier.x.array.reshape(-1, self.gdim)
-        carried[:] = 0.0
-        np.add.at(carried[:, 0], nodes, values)
-        forms.sum_ghosts(self._courier)
-        return np.array(carried[:, 0])
+        sent = self._work.x.array.reshape(-1, self.gdim)
+        sent[:] = 0.0
+        np.add.at(sent[:, 0], nodes, values)
+        forms.sum_ghosts(self._work)
+        return np.array(sent[:, 0])
 
     @cached_property
     def _first_nodes(self) -> Ints:
@@ -104,28 +104,24 @@ class Configuration:
         """Ranks that own global nodes."""
         return np.searchsorted(self._first_nodes, nodes, side="right") - 1
 
-    def tell_owners(self, nodes: Ints) -> Ints:
-        """Owned local nodes that any rank names by their global number (collective)."""
-        owner = self.owner_of(nodes)
-        told = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
-        return np.unique(np.concatenate(told)) - self._first_nodes[self.comm.rank]
+    def gather_owned(self, nodes: Ints) -> Ints:
+        """Owned local nodes among the global ``nodes (m,)`` of all ranks, each once, sorted (collective)."""
+        (owned,) = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes)
+        return np.unique(owned) - self._first_nodes[self.comm.rank]
 
     def ask_owners(self, nodes: Ints, values: Array) -> Array:
         """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
-        owner = self.owner_of(nodes)
-        asked = self.comm.alltoall([nodes[owner == r] for r in range(self.comm.size)])
-        answers = self.comm.alltoall([values[a - self._first_nodes[self.comm.rank]] for a in asked])
+        exchange = Exchange.to(self.comm, self.owner_of(nodes))
+        (asked,) = exchange.send(nodes)
         out = np.empty((len(nodes), values.shape[1]))
-        for r, answer in enumerate(answers):
-            out[owner == r] = answer
+        (out[exchange.rows],) = exchange.back(values[asked - self._first_nodes[self.comm.rank]])
         return out
 
     @cached_property
     def size(self) -> float:
-        """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with."""
-        lo = -np.max(-self.X, axis=0, initial=-np.inf)
-        hi = np.max(self.X, axis=0, initial=-np.inf)
-        bounds = np.max(self.comm.allgather(np.concatenate([-lo, hi])), axis=0)
+        """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with (first call: collective)."""
+        bounds = np.concatenate([np.max(sign * self.X, axis=0, initial=-np.inf) for sign in (-1.0, 1.0)])
+        self.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
         return float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
 
     def describe(self, node: int) -> str:

@@ -43,7 +43,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class RigidProjection:
-    """Projection onto a rigid surface; fields as in ``search.Projection``, without nodes.
+    """Projection onto a rigid surface; fields as in ``projection.Projection``, without nodes.
 
     Attributes:
         points: where it was taken ``(n, gdim)``.

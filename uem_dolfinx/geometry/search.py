@@ -1,14 +1,15 @@
 """Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
 
-Third step on the data's way. A point travels only to the ranks whose part of the target can be nearest, and only its answer
-travels back, so no rank ever sees a whole surface.
+A point is sent only to the ranks whose part of the target can be nearest, and only its answer comes back, so that no rank ever
+holds a whole surface.
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -16,20 +17,24 @@ import numpy.typing as npt
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-#: An averaged normal that leans further from the facet's (its cosine) no longer tells where the facet is.
+#: An averaged normal that leans further from the facet's no longer tells where the facet is.
+#: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
 LEAST_LEAN = 0.1
-#: Reference distance from a facet's side below which a foot counts as lying on it.
+#: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
+#: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
+#: Facets whose distances or heights differ by less are equally near.
+#: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
+EQUALLY_NEAR = 1e-9
 
 
 class MeshTarget:
@@ -45,33 +50,34 @@ class MeshTarget:
         self.shape: FacetShape = facets.shape
         self.comm: MPI.Comm = facets.config.comm
         self.n_nodes = facets.dofs.shape[1]
-        counts = self.comm.allgather(len(facets.dofs))
         corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
         # half of what the thinnest body of one cell, or its shortest facet, measures
-        self.stride = 0.5 * float(min(self.comm.allgather(min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf)))))
-        self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.stride = 0.5 * self.comm.allreduce(
+            float(min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))), op=MPI.MIN
+        )
+        self.first: Ints = np.cumsum([0, *self.comm.allgather(len(facets.dofs))])
 
     def project(self, points: Array) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
         data, size = self.facets.current(), self.comm.size
         if size == 1:
-            return self._ask(points, [np.arange(len(points))], data)
+            return self._project_here(points, data)
         # the answer of the rank that seems nearest tells who else can be as near
         near, far = self._bounds(points, data)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
-        found = self._ask(points, [np.flatnonzero(first == r) for r in range(size)], data)
-        reach = np.linalg.norm(points - found.foot, axis=1) * (1 + 1e-9) + ON_SIDE * self.stride
-        others = (near <= reach) & (first != np.arange(size)[:, None])
-        return self._ask(points, [np.flatnonzero(o) for o in others], data, found=found)
+        found = self._ask(Exchange.to(self.comm, first), data, points)
+        bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
+        others = (near <= bound) & (first != np.arange(size)[:, None])
+        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=found)
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
-        return self._ask(points, self._owners(facet), self.facets.current(), facet)
+        return self._ask(self._to_owners(facet), self.facets.current(), points, facet)
 
     def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
         """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
-        new = self._ask(points, self._owners(old.facet), self.facets.current(), old.facet, old.xi)
+        new = self._ask(self._to_owners(old.facet), self.facets.current(), points, old.facet, old.xi)
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
 
@@ -109,80 +115,69 @@ class MeshTarget:
 
     def keys_of(self, facet: Ints) -> Ints:
         """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
-        owners = self._owners(facet)
-        asked = self.comm.alltoall([facet[i] for i in owners])
-        answers = self.comm.alltoall([self.facets.keys[a - self.first[self.comm.rank]] for a in asked])
+        exchange = self._to_owners(facet)
+        (asked,) = exchange.send(facet)
         keys = np.full(len(facet), -1, dtype=np.int64)
-        for i, answer in zip(owners, answers):
-            keys[i] = answer
+        (keys[exchange.rows],) = exchange.back(self.facets.keys[asked - self.first[self.comm.rank]])
         return keys
 
     def facets_of(self, keys: Ints) -> Ints:
         """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""
         size, mine = self.comm.size, self.facets.keys
-        number = self.first[self.comm.rank] + np.arange(len(mine))
-        # keys and numbers meet on a home rank
-        told = self.comm.alltoall([(mine[mine % size == r], number[mine % size == r]) for r in range(size)])
-        known, numbers = (np.concatenate(part) for part in zip(*told))
+        # the keys of facets and those asked for meet on the same rank
+        known, number = Exchange.to(self.comm, mine % size).send(mine, self.first[self.comm.rank] + np.arange(len(mine)))
         order = np.argsort(known)
-        known, numbers = np.append(known[order], -1), np.append(numbers[order], -1)
-        homes = [np.flatnonzero((keys >= 0) & (keys % size == r)) for r in range(size)]
-        found = []
-        for wanted in self.comm.alltoall([keys[i] for i in homes]):
-            at = np.searchsorted(known[:-1], wanted)
-            found.append(np.where(known[at] == wanted, numbers[at], -1))
+        known, number = known[order], np.append(number[order], -1)
+        exchange = Exchange.to(self.comm, np.where(keys >= 0, keys % size, -1))
+        (wanted,) = exchange.send(keys)
+        at = np.searchsorted(known, wanted)
         facet = np.full(len(keys), -1, dtype=np.int64)
-        for i, answer in zip(homes, self.comm.alltoall(found)):
-            facet[i] = answer
+        (facet[exchange.rows],) = exchange.back(np.where(np.append(known, -1)[at] == wanted, number[at], -1))
         return facet
 
-    def _owners(self, facet: Ints) -> list[Ints]:
-        """Per rank, which of the facets it holds."""
-        owner = np.searchsorted(self.first, facet, side="right") - 1
-        return [np.flatnonzero(owner == r) for r in range(self.comm.size)]
+    def _to_owners(self, facet: Ints) -> Exchange:
+        """Exchange with the ranks that hold the facets; facet -1 is nobody's."""
+        return Exchange.to(self.comm, np.searchsorted(self.first, facet, side="right") - 1)
 
     def _bounds(self, points: Array, data: FacetData) -> tuple[Array, Array]:
         """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective)."""
-        nodes = data.x.reshape(-1, points.shape[1])
-        box = np.stack([nodes.min(axis=0), nodes.max(axis=0)]) if len(nodes) else None
-        near, far = np.full((2, self.comm.size, len(points)), np.inf)
-        for r, b in enumerate(self.comm.allgather(box)):
-            if b is not None:
-                slack = 0.0 if self.shape.degree == 1 else 0.25 * np.linalg.norm(b[1] - b[0])
-                outside = np.maximum(np.maximum(b[0] - points, points - b[1]), 0.0)
-                near[r] = np.linalg.norm(outside, axis=1) - slack
-                far[r] = np.linalg.norm(np.maximum(np.abs(points - b[0]), np.abs(points - b[1])), axis=1) + slack
+        nodes, size = data.x.reshape(-1, points.shape[1]), self.comm.size
+        box = np.stack([nodes.min(axis=0, initial=np.inf), nodes.max(axis=0, initial=-np.inf)])
+        boxes = np.empty((size, *box.shape))
+        self.comm.Allgather(box, boxes)
+        near, far = np.full((2, size, len(points)), np.inf)
+        for r in np.flatnonzero(boxes[:, 0, 0] <= boxes[:, 1, 0]):
+            # curved facets reach out of the box of their nodes
+            out = 0.5 * (self.shape.lebesgue - 1) * (boxes[r, 1] - boxes[r, 0])
+            low, high = boxes[r, 0] - out, boxes[r, 1] + out
+            near[r] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+            far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1)
         return near, far
 
     def _ask(
         self,
-        points: Array,
-        requests: list[Ints],
+        exchange: Exchange,
         data: FacetData,
+        points: Array,
         facet: Ints | None = None,
         xi: Array | None = None,
         found: FacetProjection | None = None,
     ) -> FacetProjection:
-        """Send each rank its points (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
-        comm = self.comm
-        known = [a for a in (points, facet, xi) if a is not None]
-        local = [[a[i] for a in known] for i in requests]
-        asked = comm.alltoall(local) if comm.size > 1 else local
-        p, *rest = (np.concatenate(a) for a in zip(*asked))
+        """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
+        p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
         if rest:
-            rest[0] = rest[0] - self.first[comm.rank]
+            rest[0] = rest[0] - self.first[self.comm.rank]
         answer = self._project_here(p, data, *rest)
-        if comm.size == 1:
+        if self.comm.size == 1:
             return answer
         # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
-        ends = np.cumsum([0, *(len(a[0]) for a in asked)])
-        columns = self._judged(p, answer)
-        parts = comm.alltoall([[column[a:b] for column in columns] for a, b in pairwise(ends)])
+        rows, columns = exchange.rows, exchange.back(*self._judged(p, answer))
         if found is not None:
-            requests, parts = [*requests, np.arange(len(points))], [*parts, self._judged(points, found)]
-        d, h, *columns = (np.concatenate(column) for column in zip(*parts))
+            rows = np.append(rows, np.arange(len(points)))
+            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, found))]
+        distance, height, *columns = columns
         answers = FacetProjection(*columns)
-        best = _nearest(np.concatenate(requests), d, h, answers.facet)
+        best = _nearest(rows, distance, height, answers.facet)
         return FacetProjection(*(column[best] for column in columns))
 
     def _judged(self, points: Array, answer: FacetProjection) -> list[npt.NDArray[Any]]:
@@ -259,8 +254,9 @@ def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints
     """
     closest = np.full(points.max(initial=-1) + 1, np.inf)
     np.minimum.at(closest, points, distance)
-    farther = distance > closest[points] * (1 + 1e-9) + np.finfo(float).tiny
-    order = np.lexsort((number, -np.round(height / np.where(closest > 0, closest, 1.0)[points], 9), farther, points))
+    farther = distance > closest[points] * (1 + EQUALLY_NEAR) + np.finfo(float).tiny
+    steps = np.rint(height / (EQUALLY_NEAR * np.where(closest > 0, closest, 1.0)[points]))
+    order = np.lexsort((number, -steps, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
 
@@ -290,18 +286,18 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
 
     tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
     middle = np.einsum("na,nag->ng", tab.N, x)
-    arm, stretch = x - middle[:, None], 1.0 if shape.degree == 1 else 1.5
-    radius = stretch * np.linalg.norm(arm, axis=2).max(axis=1)
+    arm = x - middle[:, None]
+    radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
     normal = unit_normals(tab, x)
-    bulge = stretch * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
+    bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     bound, _ = cKDTree(middle).query(points)
-    bound = bound * (1 + 1e-12)
+    bound = bound * (1 + EQUALLY_NEAR)
     size_class = np.floor(np.log2(radius / radius.max()))
     pairs, facets = [], []
     for c in np.unique(size_class):
         members = np.flatnonzero(size_class == c)
-        reach = bound + radius[members].max()
-        hits = cKDTree(middle[members]).query_ball_point(points, reach, return_sorted=False)
+        within = bound + radius[members].max()
+        hits = cKDTree(middle[members]).query_ball_point(points, within, return_sorted=False)
         counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
         pairs.append(np.repeat(np.arange(len(points)), counts))
         facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])

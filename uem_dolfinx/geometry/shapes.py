@@ -45,6 +45,10 @@ class FacetShape:
         self.dim = {"point": 0, "interval": 1, "triangle": 2, "quadrilateral": 2}[cell]
         self.topology = reference_topology(cell) if self.dim else [[[0]]]
         self._element = create_lagrange_element(cell, degree) if self.dim else None
+        #: Bound of ``|sum_a N_a v_a|`` on the facet for values ``|v_a| <= 1`` at its nodes, their Lebesgue constant.
+        self.lebesgue = (
+            1.0 if degree == 1 else {"point": 1.0, "interval": 5 / 4, "triangle": 5 / 3, "quadrilateral": 25 / 16}[cell]
+        )
         # Newton is exact at once where the map is affine
         self.affine = degree == 1 and cell in ("point", "interval", "triangle")
 
@@ -181,7 +185,7 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
         m = np.einsum("nfg,neg->nfe", t, t)
         if not shape.affine:
             curved = m - np.einsum("ng,nag,nafe->nfe", r, x[todo], tab.ddN)
-            convex = np.linalg.eigvalsh(curved)[:, 0] > 0.1 * np.linalg.eigvalsh(m)[:, 0]
+            convex = np.linalg.eigvalsh(curved)[:, 0] > 0.0
             m = np.where(convex[:, None, None], curved, m)
         step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
         xi[todo] += step if shape.affine else _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))

@@ -1,7 +1,4 @@
-"""Contact surfaces of a function space: the contactor's nodes and the target's facets, in the current configuration.
-
-Second step on the data's way: tags become nodes, facets, outward normals and tributary areas, each rank for its own part.
-"""
+"""Contact surfaces of a function space: contactors' nodes and their tributary areas, each rank for its own part."""
 
 from __future__ import annotations
 

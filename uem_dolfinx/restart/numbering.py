@@ -1,7 +1,4 @@
-"""The order of a mesh's input: where rows that live on some rank belong in a table over all ranks, whatever the partition.
-
-A part of the last step on the data's way: checkpoints are written and read in this order, since partitions differ from run to run.
-"""
+"""The order of a mesh's input, in which checkpoints are written and read, since partitions differ from run to run."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.errors import CheckpointError
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import Exchange, agree
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -22,8 +19,10 @@ Array = npt.NDArray[Any]
 Ints = npt.NDArray[np.int64]
 
 #: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
+#: [format; rows; -]
 CHUNK = 1024
-#: Bytes of a hash.
+#: Length of a hash.
+#: [format; bytes; -]
 DIGEST = 16
 
 
@@ -47,10 +46,9 @@ class Numbering:
 
     def __init__(self, comm: MPI.Comm, keys: Ints, bound: int):
         self.comm, size, rank = comm, comm.size, comm.rank
-        home = keys * size // max(bound, 1)
-        asking = [np.flatnonzero(home == r) for r in range(size)]
-        told = comm.alltoall([keys[i] for i in asking])
-        distinct, order = np.unique(np.concatenate(told), return_inverse=True)
+        meeting = Exchange.to(comm, keys * size // max(bound, 1))
+        (met,) = meeting.send(keys)
+        distinct, order = np.unique(met, return_inverse=True)
         error = None
         if len(distinct) < len(order):
             error = CheckpointError(
@@ -59,30 +57,26 @@ class Numbering:
             )
         agree(comm, error)
         first = np.cumsum([0, *comm.allgather(len(distinct))])
-        answers = comm.alltoall(np.split(first[rank] + order.ravel(), np.cumsum([len(k) for k in told])[:-1]))
         self.place: Ints = np.empty(len(keys), dtype=np.int64)
-        for i, answer in zip(asking, answers):
-            self.place[i] = answer
+        (self.place[meeting.rows],) = meeting.back(first[rank] + order.ravel())
         self.total = int(first[-1])
         chunks = -(-self.total // CHUNK)
         bounds = np.minimum(CHUNK * (chunks * np.arange(size + 1) // size), self.total)
         self.first, self.count = int(bounds[rank]), int(bounds[rank + 1] - bounds[rank])
         holder = np.searchsorted(bounds, self.place, side="right") - 1
-        self._sent = [np.flatnonzero(holder == r) for r in range(size)]
-        self._received = comm.alltoall([self.place[i] - bounds[r] for r, i in enumerate(self._sent)])
+        self._exchange = Exchange.to(comm, holder)
+        (self._received,) = self._exchange.send(self.place - bounds[holder])
 
     def to_table(self, rows: Array) -> Array:
         """This rank's part of the table ``(count, ...)`` from everybody's rows ``(n, ...)`` (collective)."""
         part = np.empty((self.count, *rows.shape[1:]), dtype=rows.dtype)
-        for at, values in zip(self._received, self.comm.alltoall([rows[i] for i in self._sent])):
-            part[at] = values
+        (part[self._received],) = self._exchange.send(rows)
         return part
 
     def from_table(self, part: Array) -> Array:
         """This rank's rows ``(n, ...)`` from everybody's parts of the table ``(count, ...)`` (collective)."""
         rows = np.empty((len(self.place), *part.shape[1:]), dtype=part.dtype)
-        for i, values in zip(self._sent, self.comm.alltoall([part[at] for at in self._received])):
-            rows[i] = values
+        (rows[self._exchange.rows],) = self._exchange.back(part[self._received])
         return rows
 
 
@@ -118,9 +112,8 @@ def node_numbering(V: Any) -> Numbering:
     starts = np.array(comm.allgather(index_map.local_range[0]))
     ghosts = index_map.local_to_global(np.arange(owned, len(keys), dtype=np.int32)).astype(np.int64)
     owner = np.searchsorted(starts, ghosts, side="right") - 1
-    theirs = [(ghosts[owner == r] - starts[r], keys[owned:][owner == r]) for r in range(comm.size)]
-    for nodes, key in comm.alltoall(theirs):
-        np.minimum.at(keys, nodes, key)
+    nodes, key = Exchange.to(comm, owner).send(ghosts - starts[owner], keys[owned:])
+    np.minimum.at(keys, nodes, key)
     return Numbering(comm, keys[:owned], k * n_cells(V.mesh))
 
 

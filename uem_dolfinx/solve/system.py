@@ -14,7 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.dependent import Resolution
+from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
@@ -183,18 +183,18 @@ class BodySystem:
         """Q of the present equations (collective)."""
         return self._restrict([pair.equations().test for pair in self.pairs])[0]
 
-    def _restrict(self, parts: list[UnitingEquations]) -> tuple[Restriction, Resolution | None]:
+    def _restrict(self, parts: list[UnitingEquations]) -> tuple[Restriction, IndependentEquations | None]:
         """P and c of the equations of all pairs, and how those that got in each other's way were resolved."""
         equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
         free = self.floating.hold(self.forces.free[: self.config.n_owned], equations)
         if self.contestable:
             mutual = np.repeat(self.mutual, [len(part) for part in parts])
-            resolution = Resolution(self.config, equations, free, mutual)
+            resolution = IndependentEquations(self.config, equations, free, mutual)
             equations = resolution.equations
         stacked = self.stacked or (resolution is not None and resolution.found)
         return Restriction(self.config, equations, free, self.forces.prescribed, stacked), resolution
 
-    def _read_forces(self, equations: list[LabelledEquations], resolution: Resolution | None, lam: Array) -> None:
+    def _read_forces(self, equations: list[LabelledEquations], resolution: IndependentEquations | None, lam: Array) -> None:
         """Hand the contact forces to the pairs (collective)."""
         redundant = np.zeros(len(lam), dtype=bool)
         if resolution is not None:

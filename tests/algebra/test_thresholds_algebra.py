@@ -1,0 +1,150 @@
+"""Thresholds of the algebra from both sides, and chains of equations, which have none: long ones end, circles never do."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import blocks, gathered_matrix, gathered_vector
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.linear_solver import UnitedSolver, default_options
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.geometry.configuration import Configuration
+
+ITERATIVE = {"ksp_type": "cg", "pc_type": "jacobi"}
+
+
+def triangles(n, away=0.0):
+    """Configuration of so many bodies of one triangle with legs of length 1, far away on the x axis, on this rank alone."""
+    x = np.concatenate([np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) + [away, 2.0 * i] for i in range(n)])
+    mesh = compat.create_mesh(MPI.COMM_SELF, np.arange(3 * n).reshape(n, 3), x, "triangle", 1)
+    return Configuration(fem.Function(compat.function_space(mesh, 1, (2,))))
+
+
+def mass(config):
+    u, v = ufl.TrialFunction(config.V), ufl.TestFunction(config.V)
+    a = compat.form(ufl.inner(u, v) * ufl.dx)
+    K = forms.create_matrix(a)
+    forms.assemble_matrix(K, a)
+    return K
+
+
+def united(config, rows, fixed=(), coefficient=1.0):
+    """Restriction of equations ``(node, direction, node followed)`` of global nodes, with ``fixed`` local components."""
+    first, g = config.index_map.local_range[0], config.gdim
+    mine = [row for row in rows if first <= row[0] < first + config.n_owned]
+    d = np.array([row[1] for row in mine], dtype=float).reshape(-1, g)
+    equations = UnitingEquations(
+        np.array([row[0] - first for row in mine], np.int32), d, np.zeros(len(mine)), np.ones(len(mine), bool),
+        np.arange(len(mine)), np.array([row[2] for row in mine], np.int64), coefficient * d,
+    )  # fmt: skip
+    free = np.ones((config.n_owned, g), bool)
+    for node, component in fixed:
+        free[node, component] = False
+    return Restriction(config, equations, free, np.zeros(free.shape))
+
+
+@pytest.mark.parametrize("part, enough", [(3e-7, False), (3e-6, True)])
+def test_what_a_condition_leaves_of_a_normal(part, enough):
+    """An equation can eliminate the free component of its node if its direction has some of it."""
+    rows = [(0, [np.sqrt(1 - part**2), part], 3)]
+    if enough:
+        assert united(triangles(2), rows, fixed=[(0, 0)]).chain == 1
+    else:
+        with pytest.raises(uem.ConflictError, match="nothing is left to eliminate"):
+            united(triangles(2), rows, fixed=[(0, 0)])
+
+
+@pytest.mark.parametrize("size, rounding", [(3e-13, True), (3e-12, False)])
+def test_coefficients_that_are_rounding(size, rounding):
+    """They neither close a circle of equations nor make a new P."""
+    circle = [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)]
+    if rounding:
+        assert united(triangles(2), circle, coefficient=size).chain == 1
+    else:
+        with pytest.raises(uem.ConflictError, match="follows itself"):
+            united(triangles(2), circle, coefficient=size)
+    prints = {united(triangles(2), circle[:1], coefficient=c).fingerprint(values=True) for c in (0.5, 0.5 + size)}
+    assert len(prints) == (1 if rounding else 2)
+
+
+@pytest.mark.parametrize("length", [1, 17, 40])
+def test_chains_of_any_length(comm, length):
+    """What the last node of a chain does, all do; closed to a circle it is refused."""
+    config = Configuration(blocks(comm, "triangle", 5, 5, gap=0.5).u)
+    order = np.random.default_rng(0).permutation(config.index_map.size_global)[: length + 1]
+    rows = [(a, [0.0, 1.0], b) for a, b in zip(order, order[1:])]
+    r = united(config, rows)
+    assert r.chain == length
+    first = config.index_map.local_range[0]
+    q = r.P.createVecRight()
+    q.array.reshape(-1, 2)[np.arange(config.n_owned) + first == order[-1]] = [0.2, 0.7]
+    moved = gathered_vector(r.expand(q)).reshape(-1, 2)
+    assert np.abs(moved[order[:-1]] - [0.0, 0.7]).max() < 1e-15 and np.abs(moved[order[-1]] - [0.2, 0.7]).max() < 1e-15
+    assert np.abs(moved).sum() == pytest.approx(0.7 * (length + 1) + 0.2)
+    assert np.abs(gathered_matrix(r.P) @ gathered_vector(q) - moved.ravel()).max() < 1e-15
+    with pytest.raises(uem.ConflictError, match="follows itself"):
+        united(config, [*rows, (order[-1], [0.0, 1.0], order[0])])
+
+
+# -- linear solver ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size, gdim, direct", [(100_000, 2, True), (900_000, 2, False), (10_000, 3, True), (90_000, 3, False)])
+def test_direct_solvers_up_to(size, gdim, direct):
+    assert default_options(size, gdim)["ksp_type"] == ("preonly" if direct else "cg")
+
+
+def near_null_space(config):
+    solver = UnitedSolver(config, "thresholds_", ITERATIVE)
+    solver.A = mass(config)
+    return len(solver._near_null_space(united(config, [])).getVecs())
+
+
+@pytest.mark.parametrize("bodies, modes", [(2, 6), (12, 3)])
+def test_few_bodies_have_modes_of_their_own(bodies, modes):
+    """Two bodies have three modes each, a dozen have them together."""
+    assert near_null_space(triangles(bodies)) == modes
+
+
+@pytest.mark.parametrize("away, modes", [(2.2e5, 3), (2.2e6, 2)])
+def test_modes_that_are_nearly_alike(away, modes):
+    """Far from the origin a rotation about it is nearly a translation: the rest is as the body's radius 2/3 to its distance."""
+    assert near_null_space(triangles(1, away)) == modes
+
+
+@pytest.mark.parametrize("asked, given", [(3e-10, True), (3e-11, False)])
+def test_accuracy_of_an_iterative_solve(asked, given):
+    """A Newton iteration gets the accuracy that it asks for, unless it is near rounding."""
+    config = triangles(1)
+    solver, K = UnitedSolver(config, "thresholds_", ITERATIVE), mass(config)
+    solver.set_operator(united(config, []), K, None)
+    rhs = K.createVecLeft()
+    rhs.set(1.0)
+    solver.solve(rhs, accuracy=asked)
+    rtol = solver.ksp.getTolerances()[0]
+    assert rtol == asked if given else rtol > 1.5 * asked
+
+
+@pytest.mark.parametrize(
+    "changes, slower, kept", [(0, 1.0, True), (3, 1.0, True), (30, 1.0, False), (0, 2 / 3, True), (0, 6.0, False)]
+)
+def test_preconditioner_is_kept(changes, slower, kept):
+    """While few of a hundred equations have changed and it takes not many more iterations than at first."""
+    active = np.ones(100, bool)
+    made, now = (
+        UnitingEquations.along(
+            np.arange(100, dtype=np.int32), np.ones((100, 2)), np.zeros((100, 0), np.int64), np.zeros((100, 0)), np.zeros(100), a
+        )
+        for a in (active, active & (np.arange(100) >= changes))
+    )
+    solver = UnitedSolver(triangles(1), "thresholds_", ITERATIVE)
+    solver._made_with, solver._first_pace, solver._pace = made, 1.0, slower
+    solver._keep_preconditioner(now)
+    assert solver._new != kept
