@@ -17,7 +17,7 @@ REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
     ("errors", "compat", "log", "parallel", "forms"), ("geometry",), ("algebra",), ("contact",), ("materials", "dynamics"),
-    ("restart",), ("solve",), ("output",),
+    ("restart",), ("solve",), ("output",), ("scripting",),
 ]  # fmt: skip
 LONGEST = 450
 #: Names of modules whose versions differ.

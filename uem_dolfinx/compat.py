@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
@@ -134,19 +133,6 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
     if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
         raise ValueError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
     return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
-
-
-def dg0_space(domain: Any, shape: Sequence[int] = ()) -> Any:
-    """Space of functions constant in every cell.
-
-    Args:
-        domain: the mesh.
-        shape: shape of the value.
-
-    Returns:
-        The function space.
-    """
-    return _space(domain, "DG", 0, tuple(shape))
 
 
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
@@ -304,55 +290,6 @@ def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
 # ---------------------------------------------------------------------------------------------- forms, matrices, vectors
 
 
-def form(integrals: Any) -> Any:
-    """Compile a UFL form, or a nested sequence of them, for real arithmetic.
-
-    Args:
-        integrals: the UFL form.
-
-    Returns:
-        The DOLFINx form.
-    """
-    return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
-
-
-def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
-    """The form with the same tags at all integrals of a kind, as UFL wants it, whatever each of them came with (collective).
-
-    Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
-    """
-    integrals = []
-    for kind in dict.fromkeys(i.integral_type() for i in F.integrals()):
-        own = F.integrals_by_type(kind)
-        data = list({id(d): d for i in own if (d := i.subdomain_data()) is not None}.values())
-        if len(data) > 1 and all(hasattr(d, "indices") for d in data):
-            own, data = _of_common_tags(F, own)
-        integrals += [i.reconstruct(subdomain_data=data[0]) if i.subdomain_data() is None and data else i for i in own]
-    return ufl.Form(integrals)
-
-
-def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-    """Integrals of one kind with MeshTags that number every overlap of those they came with, and these MeshTags (collective)."""
-    of = [[(i.subdomain_data(), n) for n in np.ravel(i.subdomain_id()) if n != "everywhere"] for i in integrals]
-    pairs = list({(id(d), int(n)): (d, int(n)) for own in of for d, n in own}.values())
-    entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
-    within = np.stack([np.isin(entities, d.indices[d.values == n]) for d, n in pairs], axis=1)
-    rows, which = np.unique(within, axis=0, return_inverse=True)
-    cpp_mesh = F.ufl_domain().ufl_cargo()
-    known = sorted({tuple(row) for part in cpp_mesh.comm.allgather(rows.tolist()) for row in part})
-    numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
-    # what DOLFINx 0.5 and what newer ones take from the mesh
-    domain = SimpleNamespace(_mesh=cpp_mesh, topology=SimpleNamespace(_cpp_object=cpp_mesh.topology))
-    tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
-    column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
-    out = []
-    for integral, own in zip(integrals, of):
-        columns = [column[id(d), int(n)] for d, n in own]
-        ids = tuple(j for j, row in enumerate(known, 1) if any(row[k] for k in columns)) or (len(known) + 1,)
-        out.append(integral.reconstruct(subdomain_data=tags, subdomain_id=ids if own else "everywhere"))
-    return out, [tags]
-
-
 def petsc_forms() -> Any:
     """``dolfinx.fem.petsc``, which is heavy on some versions."""
     import dolfinx.fem.petsc
@@ -434,35 +371,17 @@ def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
 # ---------------------------------------------------------------------------------------------- timers
 
 
-def timing(task: str) -> float:
-    """Wall time that DOLFINx's timers have counted for a task on this rank so far.
+def timing(task: str) -> tuple[int, float]:
+    """How often DOLFINx's timers have counted a task on this rank so far, and its wall time in seconds.
 
     Args:
         task: name of the timer.
-
-    Returns:
-        Seconds, 0 for a task that was never timed.
     """
     try:
-        elapsed = dolfinx.common.timing(task)[1]
+        calls, elapsed = dolfinx.common.timing(task)[:2]
     except RuntimeError:
-        return 0.0
-    return float(elapsed.total_seconds() if hasattr(elapsed, "total_seconds") else elapsed)
-
-
-def timing_calls(task: str) -> int:
-    """How often DOLFINx's timers have counted a task on this rank so far.
-
-    Args:
-        task: name of the timer.
-
-    Returns:
-        The number, 0 for a task that was never timed.
-    """
-    try:
-        return int(dolfinx.common.timing(task)[0])
-    except RuntimeError:
-        return 0
+        return 0, 0.0
+    return int(calls), float(elapsed.total_seconds() if hasattr(elapsed, "total_seconds") else elapsed)
 
 
 # ---------------------------------------------------------------------------------------------- Gmsh

@@ -5,6 +5,7 @@ Calls that are alike in all versions of DOLFINx but would have to be repeated by
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
@@ -18,7 +19,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -151,6 +152,55 @@ def sum_ghosts(u: Any) -> None:
     vector = compat.petsc_vector(u)
     vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
     vector.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+
+
+def form(integrals: Any) -> Any:
+    """Compile a UFL form, or a nested sequence of them, for real arithmetic.
+
+    Args:
+        integrals: the UFL form.
+
+    Returns:
+        The DOLFINx form.
+    """
+    return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
+
+
+def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
+    """The form with the same tags at all integrals of a kind, as UFL wants it, whatever each of them came with (collective).
+
+    Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
+    """
+    integrals = []
+    for kind in dict.fromkeys(i.integral_type() for i in F.integrals()):
+        own = F.integrals_by_type(kind)
+        data = list({id(d): d for i in own if (d := i.subdomain_data()) is not None}.values())
+        if len(data) > 1 and all(hasattr(d, "indices") for d in data):
+            own, data = _of_common_tags(F, own)
+        integrals += [i.reconstruct(subdomain_data=data[0]) if i.subdomain_data() is None and data else i for i in own]
+    return ufl.Form(integrals)
+
+
+def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Integrals of one kind with MeshTags that number every overlap of those they came with, and these MeshTags (collective)."""
+    of = [[(i.subdomain_data(), n) for n in np.ravel(i.subdomain_id()) if n != "everywhere"] for i in integrals]
+    pairs = list({(id(d), int(n)): (d, int(n)) for own in of for d, n in own}.values())
+    entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
+    within = np.stack([np.isin(entities, d.indices[d.values == n]) for d, n in pairs], axis=1)
+    rows, which = np.unique(within, axis=0, return_inverse=True)
+    cpp_mesh = F.ufl_domain().ufl_cargo()
+    known = sorted({tuple(row) for part in cpp_mesh.comm.allgather(rows.tolist()) for row in part})
+    numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
+    # what DOLFINx 0.5 and what newer ones take from the mesh
+    domain = SimpleNamespace(_mesh=cpp_mesh, topology=SimpleNamespace(_cpp_object=cpp_mesh.topology))
+    tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
+    column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
+    out = []
+    for integral, own in zip(integrals, of):
+        columns = [column[id(d), int(n)] for d, n in own]
+        ids = tuple(j for j, row in enumerate(known, 1) if any(row[k] for k in columns)) or (len(known) + 1,)
+        out.append(integral.reconstruct(subdomain_data=tags, subdomain_id=ids if own else "everywhere"))
+    return out, [tags]
 
 
 def create_matrix(a: Any) -> PETSc.Mat:

@@ -51,7 +51,7 @@ def timed(stage: str) -> Iterator[None]:
 
 def timing(stage: str) -> tuple[int, float]:
     """How often a stage has been timed on this rank so far, and its wall time in seconds; names as in ``timed``."""
-    return compat.timing_calls(f"~UEM: {stage}"), compat.timing(f"~UEM: {stage}")
+    return compat.timing(f"~UEM: {stage}")
 
 
 @contextmanager

@@ -114,5 +114,5 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
     Args:
         integrals: in UFL, or compiled by ``fem.form``, which saves time where it is asked for again and again.
     """
-    M = compat.form(integrals) if isinstance(integrals, ufl.Form) else integrals
+    M = forms.form(integrals) if isinstance(integrals, ufl.Form) else integrals
     return forms.assemble_scalar(M, M.mesh.comm)

@@ -242,7 +242,7 @@ class BoxScene(Scene):
         super().__init__(made.mesh, made.drawing, made.body)
         self.V = compat.function_space(self.mesh, 1, (self.g,))
         self.u = fem.Function(self.V, name="displacement")
-        self.E = fem.Function(compat.dg0_space(self.mesh), name="E")
+        self.E = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="E")
         self.E.x.array[compat.cell_dofs(self.E.function_space)[:, 0]] = np.array([box.E for box in boxes])[self.body]
         self.material = law(self.E, nu, kind="plane_strain" if self.g == 2 else "3d")
         self.F = self.material.residual(self.u, ufl.TestFunction(self.V)) * ufl.dx(degree=2)
@@ -291,7 +291,7 @@ class BoxScene(Scene):
 
     def volume(self, body: int) -> float:
         """Reference volume of a body (collective)."""
-        return forms.assemble_scalar(compat.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
+        return forms.assemble_scalar(forms.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
 
     def _volume(self, body: int) -> Any:
         return forms.cell_measure(self.mesh, np.flatnonzero(self.body == body).astype(np.int32))
@@ -321,7 +321,7 @@ class BoxScene(Scene):
     def residual(self) -> Array:
         """Internal minus external forces of the owned nodes ``(n_owned, gdim)`` (collective)."""
         b = compat.create_vector(self.V)
-        forms.assemble_vector(b, compat.form(self.F))
+        forms.assemble_vector(b, forms.form(self.F))
         return np.array(b.array_r).reshape(-1, self.g)
 
     def reaction(self, tag: uem.Tag) -> Array:

@@ -14,7 +14,7 @@ from dolfinx import fem
 import uem_dolfinx as uem
 from evidence.cases import COMM, FORCE, OVERLAP, Box, BoxScene, Case, Trial
 from evidence.cases_laws import overlap
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 
 RHO, V0 = 1.0, 1.0
 #: Fronts of waves spread over a few elements, and steps beyond the Courant limit do not resolve them.
@@ -36,7 +36,7 @@ class Motion:
     def __init__(self, problem: uem.UnitedProblem, scene: BoxScene):
         assert problem.dynamics is not None
         self._dynamics = problem.dynamics
-        self._stored = compat.form(scene.material.energy(scene.u) * ufl.dx)
+        self._stored = forms.form(scene.material.energy(scene.u) * ufl.dx)
         self._start_energy, self._start_momentum = self._energy(), self._dynamics.momentum()
 
     def _energy(self) -> float:

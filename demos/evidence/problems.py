@@ -86,7 +86,7 @@ def hertz_cylinder(h: float, degree: int, answer: HertzAnswer | None = None) -> 
         uem.dirichlet(V, tags["block_bottom"], 1),
         uem.dirichlet(V, tags["disc_top"], 1, -d),
     ]
-    energy = compat.form(material.energy(u) * ufl.dx)
+    energy = forms.form(material.energy(u) * ufl.dx)
 
     def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:
         if answer is None:
@@ -118,7 +118,7 @@ def hertz_answer(h: float) -> HertzAnswer:
         for _ in scene.run(problem):
             pass
         (v,) = scene.F.arguments()
-        stored = forms.assemble_scalar(compat.form(0.5 * ufl.replace(scene.F, {v: scene.u})), comm)
+        stored = forms.assemble_scalar(forms.form(0.5 * ufl.replace(scene.F, {v: scene.u})), comm)
         X, p, _, _ = gathered(contact)
         order = np.argsort(X[:, 0])
         answers.append(HertzAnswer(stored, float(contact.resultant().force[1]), X[order, 0], p[order]))
@@ -162,8 +162,8 @@ def indenter(N: int) -> Scene:
     _, pressure, areas, _ = gathered(known)
     force = float(known.resultant().force[2])
     pairs = {
-        "error_energy": [compat.form(material.energy(w) * ufl.dx) for w in (u - exact, exact)],
-        "error_l2": [compat.form(ufl.inner(w, w) * ufl.dx) for w in (u - exact, exact)],
+        "error_energy": [forms.form(material.energy(w) * ufl.dx) for w in (u - exact, exact)],
+        "error_l2": [forms.form(ufl.inner(w, w) * ufl.dx) for w in (u - exact, exact)],
     }
 
     def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:
@@ -208,8 +208,8 @@ def bar_impact(n: int, cfl: float, *, scheme: str = "trapezoidal", contactors: s
     there = fem.Constant(mesh, np.array([0.0, v0 * (end - leave) - gap]))
     rebound = fem.Constant(mesh, np.array([0.0, v0]))
     velocity = fem.Function(V)
-    differs = compat.form((material.energy(u) + rho / 2 * ufl.inner(velocity - rebound, velocity - rebound)) * ufl.dx)
-    misplaced = compat.form(ufl.inner(u - there, u - there) * ufl.dx)
+    differs = forms.form((material.energy(u) + rho / 2 * ufl.inner(velocity - rebound, velocity - rebound)) * ufl.dx)
+    misplaced = forms.form(ufl.inner(u - there, u - there) * ufl.dx)
     history: list[tuple[float, float, float, float]] = []
 
     def options(method: str) -> dict[str, Any]:

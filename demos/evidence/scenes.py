@@ -186,7 +186,7 @@ def clamp(V: Any, tag: uem.Tag, *components: int, value: float | Sequence[float]
 
 def modulus(s: Scene, *E: float) -> fem.Function:
     """Young's modulus of each body as a DG0 field."""
-    f = fem.Function(compat.dg0_space(s.mesh), name="E")
+    f = fem.Function(compat.function_space(s.mesh, ("DG", 0)), name="E")
     f.x.array[compat.cell_dofs(f.function_space)[:, 0]] = np.array(E, dtype=float)[s.body]
     return f
 

@@ -112,7 +112,7 @@ def signorini(
     nodes = mesh.geometry.x
     nodes[:] = np.sign(nodes) * np.abs(nodes) ** graded
     exact = Exact(c=0.1)
-    E, side = (fem.Function(compat.dg0_space(mesh)) for _ in range(2))
+    E, side = (fem.Function(compat.function_space(mesh, ("DG", 0))) for _ in range(2))
     for body, modulus, sign in ((contactor, 1.0, 1.0), (target, ratio, -1.0)):
         E.x.array[tags[body].entities] = modulus
         side.x.array[tags[body].entities] = sign if contactor == "upper" else -sign
@@ -154,7 +154,7 @@ def signorini(
         "error_l2": (ufl.inner(u - u_exact, u - u_exact) * dx, ufl.inner(u_exact, u_exact) * dx),
         "error_pressure": ((pressure - p_exact) ** 2 * dC, p_exact**2 * dC),
     }
-    compiled = {name: tuple(map(compat.form, pair)) for name, pair in parts.items()}
+    compiled = {name: tuple(map(forms.form, pair)) for name, pair in parts.items()}
     largest = fem.Function(V)
     compat.interpolate_expression(largest, u_exact)
     size = float(max(comm.allgather(np.abs(largest.x.array).max(initial=0.0))))

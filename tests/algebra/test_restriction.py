@@ -19,7 +19,7 @@ from helpers import blocks, clamp, gathered_matrix, gathered_vector, linear, sca
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver, rigid_body_modes
 from uem_dolfinx.algebra.restriction import Restriction
@@ -102,7 +102,7 @@ class Case:
         u, v = ufl.TrialFunction(self.blocks.V), ufl.TestFunction(self.blocks.V)
         one = fem.Constant(self.blocks.scene.mesh, PETSc.ScalarType(1.0))
         a = ufl.derivative(linear(self.blocks.u, one), self.blocks.u) + 0.1 * ufl.inner(u, v) * ufl.dx
-        form = compat.form(a)
+        form = forms.form(a)
         K = forms.create_matrix(form)
         forms.assemble_matrix(K, form)
         return K

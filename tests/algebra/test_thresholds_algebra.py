@@ -29,7 +29,7 @@ def triangles(n, away=0.0):
 
 def mass(config):
     u, v = ufl.TrialFunction(config.V), ufl.TestFunction(config.V)
-    a = compat.form(ufl.inner(u, v) * ufl.dx)
+    a = forms.form(ufl.inner(u, v) * ufl.dx)
     K = forms.create_matrix(a)
     forms.assemble_matrix(K, a)
     return K

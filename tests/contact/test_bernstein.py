@@ -116,7 +116,7 @@ class Top:
         x, c = ufl.SpatialCoordinate(s.mesh), self.wave
         wave = sum(c[i] * ufl.sin(c[2 + i] * x[i] + c[4 + i]) for i in range(g - 1)) + c[6]
         measure = forms.surface_measure(s.mesh, self.tag.entities, {"quadrature_degree": 6})
-        self.push = compat.form(ufl.conditional(ufl.gt(wave, 0.0), wave, 0.0) * ufl.TestFunction(self.S) * measure)
+        self.push = forms.form(ufl.conditional(ufl.gt(wave, 0.0), wave, 0.0) * ufl.TestFunction(self.S) * measure)
 
     def open(self, gap, active=False):
         """Give the local nodes these gaps ``(n_local,)`` and project."""

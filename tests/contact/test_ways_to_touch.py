@@ -135,7 +135,7 @@ def test_force_turns_with_the_scene_in_3d(angle, cell):
 def saddle_point(cell, n_low, n_high, ratio, d):
     """Force between two blocks in an oedometer by dense multipliers, the contactors that pull left out one after the other."""
     b = blocks(MPI.COMM_SELF, cell, n_low, n_high)
-    compiled = compat.form(ufl.derivative(linear(b.u, modulus(b.scene, 1.0, ratio)), b.u))
+    compiled = forms.form(ufl.derivative(linear(b.u, modulus(b.scene, 1.0, ratio)), b.u))
     A = forms.create_matrix(compiled)
     forms.assemble_matrix(A, compiled)
     number = b.scene.numbering(b.V)

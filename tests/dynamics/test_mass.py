@@ -58,7 +58,7 @@ def test_consistent_mass_is_the_integral(cell, degree):
     v.x.array[:] = np.stack([np.sin(3 * x[:, i] + i) + x.sum(axis=1) for i in range(x.shape[1])], axis=1).ravel()
     y = mass.M.createVecLeft()
     mass.M.mult(compat.petsc_vector(v), y)
-    exact = forms.assemble_scalar(compat.form((1 + X[0]) * ufl.inner(v, v) * ufl.dx), COMM)
+    exact = forms.assemble_scalar(forms.form((1 + X[0]) * ufl.inner(v, v) * ufl.dx), COMM)
     assert y.dot(compat.petsc_vector(v)) == pytest.approx(exact, rel=1e-13)
 
 
@@ -122,7 +122,7 @@ def test_graded_triangles_keep_their_centre(degree):
 def test_density_of_any_kind():
     """Number, Constant, Function and expression weigh the same."""
     V = block("triangle", 3)
-    f = fem.Function(compat.dg0_space(V.mesh))
+    f = fem.Function(compat.function_space(V.mesh, ("DG", 0)))
     f.x.array[:] = 2.0
     for rho in (2, np.float32(2.0), np.int64(2), fem.Constant(V.mesh, 2.0), f, 0.5 * f + 1.0, ufl.as_ufl(2.0)):
         for build in BUILD.values():
@@ -135,7 +135,7 @@ def test_density_of_any_kind():
 def test_layout_is_that_of_the_tangent():
     V = block("tetrahedron", 2)
     u = fem.Function(V)
-    K = forms.create_matrix(compat.form(ufl.derivative(linear(u, 1.0), u)))
+    K = forms.create_matrix(forms.form(ufl.derivative(linear(u, 1.0), u)))
     for kind in KINDS:
         M = make(kind, V).M
         assert M.getSizes() == K.getSizes() and M.getBlockSizes() == K.getBlockSizes() and M.type == K.type
@@ -159,7 +159,7 @@ def test_nodal_mass():
 
 def test_refused_densities():
     V = block("triangle", 2)
-    f = fem.Function(compat.dg0_space(V.mesh))
+    f = fem.Function(compat.function_space(V.mesh, ("DG", 0)))
     f.x.array[:] = 1.0
     f.x.array[f.x.array.size // 2 :] = -1.0
     for build in BUILD.values():
@@ -174,7 +174,7 @@ def test_refused_densities():
             with pytest.raises(uem.MassError, match=message):
                 build(V, rho)
         with pytest.raises(uem.SpaceError, match="another mesh"):
-            build(V, fem.Function(compat.dg0_space(block("triangle", 1).mesh)))
+            build(V, fem.Function(compat.function_space(block("triangle", 1).mesh, ("DG", 0))))
         with pytest.raises(uem.SpaceError, match="use a vector Lagrange space"):
             build(compat.function_space(V.mesh, 1), 1.0)
 

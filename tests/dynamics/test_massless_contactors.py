@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import fsolve, linprog
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 
 
 def gathered(mass, values):
@@ -257,7 +257,7 @@ def test_bar_hits_wall(kind, courant):
     n = 100
     V = block("quadrilateral", [n, 1], size=[10.0, 10.0 / n], comm=MPI.COMM_SELF)
     u = fem.Function(V)
-    form = compat.form(ufl.derivative(linear(u, 900.0, 0.0), u))
+    form = forms.form(ufl.derivative(linear(u, 900.0, 0.0), u))
     K = forms.create_matrix(form)
     forms.assemble_matrix(K, form)
     heavy = BUILD[kind](V, 1.0)

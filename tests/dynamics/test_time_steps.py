@@ -375,8 +375,8 @@ def test_a_body_without_mass_is_held_by_others():
     s = scene(COMM, "quadrilateral", [low, high])
     V = compat.function_space(s.mesh, 1, (2,))
     u, w = fem.Function(V), ufl.TestFunction(V)
-    density, E = (fem.Function(compat.dg0_space(s.mesh)) for _ in range(2))
-    middle = compat.dg0_space(s.mesh).tabulate_dof_coordinates()[:, 1]
+    density, E = (fem.Function(compat.function_space(s.mesh, ("DG", 0))) for _ in range(2))
+    middle = compat.function_space(s.mesh, ("DG", 0)).tabulate_dof_coordinates()[:, 1]
     density.x.array[:] = np.where(middle[: len(density.x.array)] > 1, 1.0, 0.0)
     E.x.array[:] = np.where(middle[: len(density.x.array)] > 1, 1e6, 100.0)
     contact = uem.Contact(s.tag("tip", 0, at(1, 1.0)), s.tag("bottom", 1, at(1, 1.0)))

@@ -92,7 +92,7 @@ def size(mesh, tag: Tag) -> float:
     else:
         cells = forms.mesh_tags(mesh, tag.dim, tag.entities, 1)
         measure = ufl.Measure("dx", domain=mesh, subdomain_data=cells)(1)
-    return forms.assemble_scalar(compat.form(one * measure), mesh.comm)
+    return forms.assemble_scalar(forms.form(one * measure), mesh.comm)
 
 
 def n_owned(mesh, tag: Tag) -> int:
@@ -190,7 +190,7 @@ def test_without_groups_all_cells_are_taken(write, comm):
     mesh, tags = read_gmsh(write("plain.geo", "h = 0.5; w = 2;" + BODIES), comm)
     assert len(tags) == 0
     one = fem.Constant(mesh, 1.0)
-    assert forms.assemble_scalar(compat.form(one * ufl.dx(domain=mesh)), comm) == pytest.approx(6)
+    assert forms.assemble_scalar(forms.form(one * ufl.dx(domain=mesh)), comm) == pytest.approx(6)
     with pytest.raises(uem.TagError, match="no physical group"):
         tags["body"]
 
@@ -277,6 +277,15 @@ def test_refusals(write, folder, comm, name, text, options, error, message):
         read_gmsh(str(path), comm, **options)
     mesh, _ = read_gmsh(write("good.geo", "h = 1; w = 2;" + BODIES), comm)
     assert mesh.topology.index_map(2).size_global > 0
+
+
+def test_how_plane_a_body_must_be(write, comm):
+    """Two bodies, 3 high: a corner may be off their plane by rounding, not by three times 1e-10 of that."""
+    warped = "h = 1; w = 2;" + BODIES.replace("{w, 1, 0, h}; Point(4)", "{w, 1, %s, h}; Point(4)")
+    mesh, _ = read_gmsh(write("plane.geo", warped % "1e-10"), comm)
+    assert mesh.geometry.dim == 2
+    with pytest.raises(uem.MeshError, match="leaves the plane"):
+        read_gmsh(write("warped.geo", warped % "9e-10"), comm)
 
 
 def test_nothing_to_read(comm):

@@ -31,7 +31,7 @@ def displacement(gradient: np.ndarray) -> fem.Function:
 
 
 def value(expression, u: fem.Function) -> float:
-    return forms.assemble_scalar(compat.form(expression * ufl.dx(domain=u.function_space.mesh)), MPI.COMM_SELF)
+    return forms.assemble_scalar(forms.form(expression * ufl.dx(domain=u.function_space.mesh)), MPI.COMM_SELF)
 
 
 def matrix(expression, u: fem.Function) -> np.ndarray:

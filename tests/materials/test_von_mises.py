@@ -44,13 +44,13 @@ def wiggle(u: fem.Function, size: float) -> None:
 def vector(form: ufl.Form, V: Any) -> np.ndarray:
     """Assembled owned entries."""
     b = compat.create_vector(V)
-    forms.assemble_vector(b, compat.form(form))
+    forms.assemble_vector(b, forms.form(form))
     return np.array(b.array_r)
 
 
 def matrix(form: ufl.Form) -> PETSc.Mat:
     """Assembled."""
-    compiled = compat.form(form)
+    compiled = forms.form(form)
     A = forms.create_matrix(compiled)
     forms.assemble_matrix(A, compiled)
     return A
@@ -177,7 +177,7 @@ def test_without_yield_it_is_the_elastic_law(comm, cell, degree, kind, strain, l
         pressed = E / (3 * (1 - 2 * NU)) / 2 * ufl.tr(elastic.strain(u)) ** 2
         parts += [-pressed * dx, pressed * dx_pressure]
     rounding = 1e-7 if tables[degree][1] == 0 else 1e-13
-    wanted = sum(forms.assemble_scalar(compat.form(part), comm) for part in parts)
+    wanted = sum(forms.assemble_scalar(forms.form(part), comm) for part in parts)
     assert material.energy() == pytest.approx(wanted, rel=10 * rounding)
     forces = sum(vector(ufl.derivative(part, u, v), V) for part in parts)
     scale = highest(comm, np.abs(forces))
@@ -353,7 +353,7 @@ def test_cell_averages_are_tensors_of_the_cells(comm):
 
 def test_parameters_differ_from_cell_to_cell(comm):
     s, u = block(comm, "quadrilateral")
-    V = compat.dg0_space(s.mesh)
+    V = compat.function_space(s.mesh, ("DG", 0))
     fy = fem.Function(V)
     middle = s.mesh.geometry.x[compat.geometry_dofs(s.mesh)].mean(axis=1)[:, 0]
     fy.x.array[compat.cell_dofs(V)[:, 0]] = np.where(middle < 0.5, FY, 2 * FY)
@@ -382,7 +382,7 @@ def test_bad_input_is_refused(comm, given, says):
 
 def test_bad_parameters_of_one_cell_are_told_by_all_ranks(comm):
     s, u = block(comm, "quadrilateral", 4)
-    modulus = fem.Function(compat.dg0_space(s.mesh))
+    modulus = fem.Function(compat.function_space(s.mesh, ("DG", 0)))
     modulus.x.array[:] = E
     if comm.rank == comm.size - 1:
         modulus.x.array[0] = -1.0

@@ -33,7 +33,7 @@ def spaces(mesh):
     g = mesh.geometry.dim
     middle = np.full((1, g), 0.5 if compat.cell_name(mesh) in ("quadrilateral", "hexahedron") else 1 / (g + 1))
     found = {f"P{k}{shape}": (compat.function_space(mesh, k, shape), None) for k, shape in product((1, 2), ((), (g,), (g, g)))}
-    found |= {f"DG0{shape}": (compat.dg0_space(mesh, shape), middle) for shape in ((), (g,))}
+    found |= {f"DG0{shape}": (compat.function_space(mesh, ("DG", 0), shape), middle) for shape in ((), (g,))}
     for k, shape in ((2, ()), (3, (4,))):
         found[f"Q{k}{shape}"] = compat.quadrature_space(mesh, k, shape), forms.quadrature_rule(mesh, k)[0]
     return found

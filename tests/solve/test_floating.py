@@ -194,7 +194,7 @@ def test_half_disc_rights_itself(tilt):
     contact = uem.Contact(f.s.tag("arc", 0, arc()), uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
     f.problem((), [contact], rtol=1e-10).solve()
     lawful(contact)
-    area = forms.assemble_scalar(compat.form(fem.Constant(f.s.mesh, 1.0) * ufl.dx), COMM)
+    area = forms.assemble_scalar(forms.form(fem.Constant(f.s.mesh, 1.0) * ufl.dx), COMM)
     assert contact.resultant().force[1] == pytest.approx(weight * area, rel=1e-8)
     flat = np.abs(f.s.drawing[:, 1] - 1.0) < 1e-9
     x = ((f.s.drawing - [0, 1]) @ R.T + [0.0, 1.02] + f.moved())[flat]
@@ -235,7 +235,7 @@ def test_two_fall_on_a_third():
         uem.Contact(f.s.tag("small arc", 2, arc((0.0, 2.2), 0.5)), f.s.tag("1", 1, in_groove(bottom=1.0))),
     ]
     f.problem(clamp(f.V, f.s.tag("base", 0, at(1, -1.5))), contacts, rtol=1e-11).solve()
-    areas = (forms.assemble_scalar(compat.form(modulus(f.s, *d) * ufl.dx), COMM) for d in ((0.0, 1e-3, 2e-3), (0.0, 0.0, 2e-3)))
+    areas = (forms.assemble_scalar(forms.form(modulus(f.s, *d) * ufl.dx), COMM) for d in ((0.0, 1e-3, 2e-3), (0.0, 0.0, 2e-3)))
     for contact, weight in zip(contacts, areas):
         lawful(contact)
         force = contact.resultant().force

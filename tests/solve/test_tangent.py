@@ -219,5 +219,5 @@ def test_one_ufl_residual_for_any_number_of_loads():
     assert max(orders(history)) >= 1.8
     # global equilibrium: what the pressure pushes on the current top arrives at the contact
     J = ufl.det(F) * ufl.dot(ufl.inv(F).T * n, ufl.as_vector([0.0, 1.0]))
-    pushed = forms.assemble_scalar(compat.form(p * J * forms.surface_measure(b.scene.mesh, b.top.entities)), COMM)
+    pushed = forms.assemble_scalar(forms.form(p * J * forms.surface_measure(b.scene.mesh, b.top.entities)), COMM)
     assert contact.resultant().force[1] == pytest.approx(pushed, rel=1e-9)

@@ -16,6 +16,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import Projection, Target
 
 #: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
+#: [format; number of a kind; -]
 NORMAL = 0
 
 

@@ -297,7 +297,7 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     with timed("assemble mass"):
         density = _density(config, rho)
         _cell_masses(config, density)
-        a = compat.form(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx)
+        a = forms.form(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx)
         M = forms.create_matrix(a)
         forms.assemble_matrix(M, a)
     return Mass(M, config, diagonal=False)
@@ -321,7 +321,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     with timed("assemble mass"):
         density = _density(config, rho)
         b = compat.create_vector(V)
-        forms.assemble_vector(b, compat.form(density * sum(ufl.TestFunction(V)) * ufl.dx))
+        forms.assemble_vector(b, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx))
         rows = np.array(b.array_r).reshape(-1, config.gdim)[:, 0]
         b.destroy()
         of_cells = _cell_masses(config, density)
@@ -380,9 +380,9 @@ def _density(config: Configuration, rho: Any) -> Any:
 
 def _cell_masses(config: Configuration, density: Any) -> Array:
     """Masses of the owned cells ``(n_cells,)``, refused if they cannot be (collective)."""
-    S = compat.dg0_space(config.mesh)
+    S = compat.function_space(config.mesh, ("DG", 0))
     b = compat.create_vector(S)
-    forms.assemble_vector(b, compat.form(density * ufl.TestFunction(S) * ufl.dx))
+    forms.assemble_vector(b, forms.form(density * ufl.TestFunction(S) * ufl.dx))
     n_cells = config.mesh.topology.index_map(config.tdim).size_local
     masses = np.array(b.array_r)[compat.cell_dofs(S)[:n_cells, 0]]
     b.destroy()

@@ -38,6 +38,10 @@ CELLS = {
 N_VERTICES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 8: 2, 9: 3, 10: 4, 11: 4, 12: 8, 15: 1}
 """Vertices of Gmsh's element types, which always come first among an element's nodes."""
 
+#: A 2D body whose z varies by less than this is plane.
+#: [convention; size of the model; test_gmsh.py::test_how_plane_a_body_must_be]
+FLAT = 1e-10
+
 
 def read_gmsh(
     source: Any, comm: MPI.Comm, gdim: int | None = None, parameters: Mapping[str, float] | None = None
@@ -295,7 +299,7 @@ def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str)
     points = np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)]
     if tdim == 2:
         size = np.ptp(points[:, :2], axis=0).max()
-        if np.ptp(points[:, 2]) > 1e-10 * size:
+        if np.ptp(points[:, 2]) > FLAT * size:
             raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
     return np.ascontiguousarray(points[:, :tdim])
 

@@ -36,7 +36,7 @@ def tributary_areas(config: Configuration, tag: Tag) -> Array:
     S = compat.function_space(config.mesh, config.degree)
     v = ufl.TestFunction(S)
     b = compat.create_vector(S)
-    forms.assemble_vector(b, compat.form(v * forms.surface_measure(config.mesh, tag.entities)))
+    forms.assemble_vector(b, forms.form(v * forms.surface_measure(config.mesh, tag.entities)))
     areas = np.array(b.array_r)
     b.destroy()
     return areas

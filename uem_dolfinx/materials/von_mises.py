@@ -195,7 +195,7 @@ class VonMises:
         # what the forms hold: the deviator where the pressure goes its own way, and the tangent
         self._s = self.stress if self.kind == "plane_stress" else at.create_function("deviator", size)
         self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
-        self._kappa = fem.Function(compat.dg0_space(self.mesh), name="bulk_modulus")
+        self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
         self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
 
     # -- forms -------------------------------------------------------------------------------------------------------
@@ -353,6 +353,6 @@ class VonMises:
 
     @cached_property
     def _averages(self) -> dict[str, fem.Function]:
-        scalars, tensors = compat.dg0_space(self.mesh), compat.dg0_space(self.mesh, (3, 3))
+        scalars, tensors = compat.function_space(self.mesh, ("DG", 0)), compat.function_space(self.mesh, ("DG", 0), (3, 3))
         spaces = {"stress": tensors, "plastic_strain": tensors, "peeq": scalars, "von_mises": scalars}
         return {name: fem.Function(space, name=name) for name, space in spaces.items()}

@@ -77,10 +77,10 @@ class EnergyBook(Closing):
         if problem.dynamics is None:
             raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
         self.problem, self.dynamics = problem, problem.dynamics
-        self._stored = compat.form(stored) if stored is not None else None
-        self._external = compat.form(external) if external is not None else None
+        self._stored = forms.form(stored) if stored is not None else None
+        self._external = forms.form(external) if external is not None else None
         damping = self.dynamics.damping_form
-        self._damping = compat.form(damping) if damping is not None else None
+        self._damping = forms.form(damping) if damping is not None else None
         #: Rows written, in order.
         self.rows: list[Energies] = []
         #: Momenta ``(gdim,)`` and impulses on the contactors' bodies ``(n_contacts, gdim)`` of the rows.

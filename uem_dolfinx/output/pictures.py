@@ -278,12 +278,12 @@ def nodal_average(expression: Any, mesh: Any) -> Array:
     """
     S = compat.function_space(mesh, 1)
     v, total = ufl.TestFunction(S), fem.Function(S)
-    cells = fem.Function(compat.dg0_space(mesh))
+    cells = fem.Function(compat.function_space(mesh, ("DG", 0)))
     compat.interpolate_expression(cells, expression)
     sums = []
     for weight in (cells, fem.Constant(mesh, 1.0)):
         b = compat.create_vector(S)
-        forms.assemble_vector(b, compat.form(weight * v * ufl.dx))
+        forms.assemble_vector(b, forms.form(weight * v * ufl.dx))
         total.x.array[: len(b.array_r)] = b.array_r
         total.x.scatter_forward()
         sums.append(np.array(total.x.array))

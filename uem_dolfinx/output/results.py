@@ -102,7 +102,7 @@ class ResultsWriter(Closing):
                     self._vtx.append(compat.open_vtx(comm, stem.with_name(f"{stem.name}_{kind}.bp"), functions))
 
     def _cell_field(self, name: str, expression: Any) -> fem.Function:
-        return fem.Function(compat.dg0_space(self.problem.config.mesh, expression.ufl_shape), name=name)
+        return fem.Function(compat.function_space(self.problem.config.mesh, ("DG", 0), expression.ufl_shape), name=name)
 
     def _sources(self) -> dict[str, fem.Function]:
         """Functions of the problem by name, up to date (collective)."""

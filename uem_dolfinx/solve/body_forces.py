@@ -61,7 +61,7 @@ class BodyForces:
         self.materials, self.dynamics = list(materials), dynamics
         self.tangent = Tangent(F, self.u, self.materials, dynamics)
         with compiling("the residual"):
-            self._F = compat.form(F)
+            self._F = forms.form(F)
         self._b = compat.create_vector(config.V)
         self._u = compat.petsc_vector(self.u)
         free = np.ones(config.n_local * config.gdim, dtype=bool)

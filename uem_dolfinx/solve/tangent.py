@@ -47,7 +47,7 @@ class Tangent:
         self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
         with compiling("the tangent"):
-            self._form = compat.form(J)
+            self._form = forms.form(J)
         self.K: PETSc.Mat = forms.create_matrix(self._form)
         #: Grows with every assembly.
         self.number = 0
@@ -117,14 +117,14 @@ class Inversions:
         self._J = ufl.det(ufl.Identity(config.gdim) + ufl.grad(config.u))
         one = fem.Constant(config.mesh, 1.0)
         with compiling("the search for cells turned inside out"):
-            self._volume = compat.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
+            self._volume = forms.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
 
     def find(self) -> str | None:
         """Where the worst of them is, if there are any (collective)."""
         config = self.config
         if forms.assemble_scalar(self._volume, config.comm) == 0.0:
             return None
-        determinant = fem.Function(compat.dg0_space(config.mesh))
+        determinant = fem.Function(compat.function_space(config.mesh, ("DG", 0)))
         compat.interpolate_expression(determinant, self._J)
         values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
         dofs = compat.cell_dofs(config.V)
