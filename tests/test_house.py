@@ -16,7 +16,7 @@ import thresholds
 REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
-    ("errors", "compat", "log", "parallel", "forms"), ("geometry",), ("algebra",), ("contact",), ("materials", "dynamics"),
+    ("arrays", "errors", "compat", "log", "parallel", "forms"), ("geometry",), ("algebra",), ("contact",), ("materials", "dynamics"),
     ("restart",), ("solve",), ("output",), ("scripting",),
 ]  # fmt: skip
 LONGEST = 450

@@ -5,24 +5,22 @@ Calls that are alike in all versions of DOLFINx but would have to be repeated by
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 
 import basix
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem, io, mesh
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    import numpy.typing as npt
+from uem_dolfinx.arrays import Indices
 
 
 def original_cells(domain: Any) -> npt.NDArray[np.int64]:
@@ -37,7 +35,7 @@ def original_cells(domain: Any) -> npt.NDArray[np.int64]:
     return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
 
 
-def vertex_nodes(domain: Any) -> npt.NDArray[np.int32]:
+def vertex_nodes(domain: Any) -> Indices:
     """Geometry node of every vertex.
 
     Args:

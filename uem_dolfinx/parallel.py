@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 
 import numpy as np
-import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-Array = npt.NDArray[Any]
-Ints = npt.NDArray[np.int64]
+from uem_dolfinx.arrays import AnyArray, Ints
 
 
 def agree(comm: MPI.Comm, error: Exception | None) -> None:
@@ -97,15 +93,15 @@ class Exchange:
         ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
         return cls(comm, [order[a:b] for a, b in pairwise(ends)])
 
-    def send(self, *arrays: Array) -> list[Array]:
+    def send(self, *arrays: AnyArray) -> list[AnyArray]:
         """Rows of ``arrays (n, ...)`` that other ranks and this one send here ``(n_received, ...)``, in their order (collective)."""
         return self._exchange([a[self._picked] for a in arrays], self._sent, self._received)
 
-    def back(self, *arrays: Array) -> list[Array]:
+    def back(self, *arrays: AnyArray) -> list[AnyArray]:
         """Answers ``(n_sent, ...)`` to ``rows``, from ``arrays (n_received, ...)`` that answer what was received (collective)."""
         return self._exchange(list(arrays), self._received, self._sent)
 
-    def _exchange(self, arrays: list[Array], sent: Array, received: Array) -> list[Array]:
+    def _exchange(self, arrays: list[AnyArray], sent: AnyArray, received: AnyArray) -> list[AnyArray]:
         if self.comm.size == 1:
             return arrays
         row = np.dtype([(str(i), a.dtype, a.shape[1:]) for i, a in enumerate(arrays)])

@@ -13,22 +13,15 @@ Rows that depend on others end as zeros and are left out: what they ask for hold
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import Exchange
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: A row that has lost all but this part of its length depends on the others; the rows of surfaces that bend under load do so
 #: only to the first order of their strain.

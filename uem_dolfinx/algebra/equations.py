@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
 #: [convention; part of the direction's length; test_thresholds_algebra.py::test_what_a_condition_leaves_of_a_normal]
@@ -49,9 +47,7 @@ class UnitingEquations:
         return len(self.node)
 
     @staticmethod
-    def along(
-        node: npt.NDArray[np.int32], direction: Array, targets: Ints, weights: Array, gap: Array, active: Bools
-    ) -> UnitingEquations:
+    def along(node: Indices, direction: Array, targets: Ints, weights: Array, gap: Array, active: Bools) -> UnitingEquations:
         """Equations whose terms all have one direction: ``direction . (du_node - sum_a weights_a du_a) = -gap``.
 
         Args:

@@ -5,25 +5,20 @@ Any KSP and PC can be chosen through ``petsc_options``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import LinearSolveError, MissingBackendError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import timed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.algebra.restriction import Restriction
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
 
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
 #: [convention; bodies; test_thresholds_algebra.py::test_few_bodies_have_modes_of_their_own]

@@ -17,24 +17,18 @@ from __future__ import annotations
 
 import zlib
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from uem_dolfinx.algebra.equations import UnitingEquations
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 
 class Restriction:
@@ -59,7 +53,7 @@ class Restriction:
         self._first = g * int(config.index_map.local_range[0])
         self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and those that only hold their place in the sparsity of P.
-        self.nodes: npt.NDArray[np.int32] = np.unique(equations.node)
+        self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift = self._eliminate()
         #: Columns of P that are in use ``(n_owned, gdim)``.
         self.used: Bools = free.copy()
@@ -101,7 +95,7 @@ class Restriction:
         agree(self.comm, error)
         return frames, lift
 
-    def _conflict(self, nodes: npt.NDArray[np.int32], A: Array) -> ConflictError:
+    def _conflict(self, nodes: Indices, A: Array) -> ConflictError:
         bad = 0 if A.shape[1] > A.shape[2] else int(np.argmin(np.linalg.svd(A, compute_uv=False)[:, -1]))
         fixed = [c for c, f in zip("xyz", self.free[nodes[bad]]) if not f]
         return ConflictError(

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.configuration import Configuration
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.configuration import Configuration
 
 
 def rigid_velocities(arm: Array) -> Array:

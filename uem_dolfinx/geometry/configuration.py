@@ -11,11 +11,9 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.parallel import Exchange
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Configuration:

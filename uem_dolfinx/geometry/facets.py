@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import OrientationError
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, unit_normals
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import agree, count_keys
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.tags import Tag
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
 
@@ -77,7 +72,7 @@ class TargetFacets:
         n_sides = len(forms.reference_topology(compat.cell_name(self.config.mesh))[self.config.tdim - 1])
         return forms.original_cells(self.config.mesh)[self.cells] * n_sides + self.sides
 
-    def _orient(self, cell_dofs: npt.NDArray[np.int32]) -> None:
+    def _orient(self, cell_dofs: Indices) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
         X = self.config.X
         middle = np.tile(self.shape.middle, (len(self.dofs), 1))
@@ -150,7 +145,7 @@ class TargetFacets:
         return self.sign[:, None] * n
 
 
-def _facet_closure(config: Configuration, shape: FacetShape) -> npt.NDArray[np.int32]:
+def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
     """Cell dofs of each local facet, in the numbering of the facet's own element ``(n_facets, nn)``."""
     layout = config.V.dofmap.dof_layout
     topology = forms.reference_topology(compat.cell_name(config.mesh))

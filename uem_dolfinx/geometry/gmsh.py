@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
+import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError, UEMError
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from mpi4py import MPI
-
-    import numpy.typing as npt
 
 CELLS = {
     2: ("triangle", 1),
@@ -307,7 +305,7 @@ def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str)
 # ---------------------------------------------------------------------------------------------- on every rank
 
 
-def _local_entities(mesh: Any, group: _Group) -> npt.NDArray[np.int32]:
+def _local_entities(mesh: Any, group: _Group) -> Indices:
     """Local index of a group's entities on this rank, ghosts included, ascending."""
     topology = mesh.topology
     if group.dim == topology.dim:

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.geometry.shapes import FacetShape
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 
 class Projection(Protocol):
@@ -82,7 +75,7 @@ class Target(Protocol):
         """See above."""
 
     @property
-    def dofs(self) -> npt.NDArray[np.int32]:
+    def dofs(self) -> Indices:
         """See above."""
 
     @property

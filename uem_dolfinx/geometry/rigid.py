@@ -5,17 +5,13 @@ Anything with ``project(points) -> Projection`` is a target; these need no mesh 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from uem_dolfinx.arrays import Array, Indices, Ints
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,7 @@ class RigidSurface:
 
     n_nodes = 0
     averaged = faceted = False
-    dofs: npt.NDArray[np.int32] = np.zeros((0, 0), np.int32)
+    dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
 
     def __init__(

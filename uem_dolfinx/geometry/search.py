@@ -7,24 +7,19 @@ holds a whole surface.
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.facets import FacetData, TargetFacets
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 #: An averaged normal that leans further from the facet's no longer tells where the facet is.
 #: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
@@ -87,7 +82,7 @@ class MeshTarget:
         return not self.averaged
 
     @property
-    def dofs(self) -> npt.NDArray[np.int32]:
+    def dofs(self) -> Indices:
         """Local nodes of this rank's facets ``(m, nn)``."""
         return self.facets.dofs
 

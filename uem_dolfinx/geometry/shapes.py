@@ -12,9 +12,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.forms import create_lagrange_element, reference_topology
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class FacetShape:
             return np.column_stack([1 - xi.sum(axis=1), xi])
         return np.column_stack([xi[:, 1], xi[:, 0], 1 - xi[:, 0], 1 - xi[:, 1]])
 
-    def edges(self) -> list[tuple[FacetShape, npt.NDArray[np.int32], Array, Array]]:
+    def edges(self) -> list[tuple[FacetShape, Indices, Array, Array]]:
         """Boundary of the facet: per side its shape, its nodes in the facet, and the map ``xi = o + s @ D``."""
         if self.dim == 0:
             return []

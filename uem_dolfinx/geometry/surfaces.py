@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import agree
 
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.configuration import Configuration
-    from uem_dolfinx.geometry.facets import TargetFacets
-    from uem_dolfinx.geometry.tags import Tag
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-
-
-def surface_nodes(config: Configuration, tag: Tag) -> npt.NDArray[np.int32]:
+def surface_nodes(config: Configuration, tag: Tag) -> Indices:
     """Owned nodes on the closure of a tag's facets, or at its points, sorted (collective)."""
     config.mesh.topology.create_connectivity(tag.dim, config.tdim)
     nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
@@ -42,7 +36,7 @@ def tributary_areas(config: Configuration, tag: Tag) -> Array:
     return areas
 
 
-def followed_nodes(config: Configuration, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+def followed_nodes(config: Configuration, dofs: Indices) -> npt.NDArray[np.bool_]:
     """Which local nodes ``(n_local,)`` any rank names among its local nodes ``dofs``, of any shape (collective)."""
     mark = fem.Function(config.V)
     mark.x.array.reshape(-1, config.gdim)[dofs.ravel()] = 1.0
@@ -50,7 +44,7 @@ def followed_nodes(config: Configuration, dofs: npt.NDArray[np.int32]) -> npt.ND
     return mark.x.array.reshape(-1, config.gdim)[:, 0] > 0
 
 
-def check_distinct(config: Configuration, contactor: npt.NDArray[np.int32], target: TargetFacets, names: tuple[str, str]) -> None:
+def check_distinct(config: Configuration, contactor: Indices, target: TargetFacets, names: tuple[str, str]) -> None:
     """Refuse a contactor that is part of its own target (collective).
 
     Raises:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from uem_dolfinx import compat
+from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import SpaceError, TagError
 from uem_dolfinx.parallel import agree
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    import numpy.typing as npt
 
 Key: TypeAlias = "str | int | tuple[int, str | int]"
 
@@ -41,7 +38,7 @@ class Tag:
     number: int
     dim: int
     mesh: Any = field(repr=False, compare=False)
-    entities: npt.NDArray[np.int32] = field(repr=False, compare=False)
+    entities: Indices = field(repr=False, compare=False)
 
     def __str__(self) -> str:
         """Name where there is one, else number."""

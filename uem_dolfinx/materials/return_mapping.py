@@ -139,6 +139,7 @@ def plane_stress_return(
 
 
 #: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.
+#: [format; components; -]
 _MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
 
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import AnyArray, Ints
 from uem_dolfinx.errors import CheckpointError
 from uem_dolfinx.parallel import Exchange, agree
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-Array = npt.NDArray[Any]
-Ints = npt.NDArray[np.int64]
 
 #: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
 #: [format; rows; -]
@@ -67,13 +64,13 @@ class Numbering:
         self._exchange = Exchange.to(comm, holder)
         (self._received,) = self._exchange.send(self.place - bounds[holder])
 
-    def to_table(self, rows: Array) -> Array:
+    def to_table(self, rows: AnyArray) -> AnyArray:
         """This rank's part of the table ``(count, ...)`` from everybody's rows ``(n, ...)`` (collective)."""
         part = np.empty((self.count, *rows.shape[1:]), dtype=rows.dtype)
         (part[self._received],) = self._exchange.send(rows)
         return part
 
-    def from_table(self, part: Array) -> Array:
+    def from_table(self, part: AnyArray) -> AnyArray:
         """This rank's rows ``(n, ...)`` from everybody's parts of the table ``(count, ...)`` (collective)."""
         rows = np.empty((len(self.place), *part.shape[1:]), dtype=part.dtype)
         (rows[self._exchange.rows],) = self._exchange.back(part[self._received])
@@ -126,12 +123,12 @@ def mesh_fingerprint(mesh: Any) -> str:
     return fingerprint(mesh.comm, [hashes(cells.to_table(values[nodes])) for values in (given, mesh.geometry.x)])
 
 
-def as_bytes(array: Array) -> npt.NDArray[np.uint8]:
+def as_bytes(array: AnyArray) -> npt.NDArray[np.uint8]:
     """The bytes of a contiguous array, in place."""
     return array.reshape(-1).view(np.uint8)
 
 
-def hashes(part: Array) -> list[bytes]:
+def hashes(part: AnyArray) -> list[bytes]:
     """Hash of every chunk in this rank's part of a table."""
     chunks = range(0, len(part), CHUNK)
     return [blake2b(as_bytes(part[i : i + CHUNK]).data, digest_size=DIGEST).digest() for i in chunks]
