@@ -45,18 +45,7 @@ def has_vtx() -> bool:
 
 
 def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.float64], cell: str, degree: int) -> Any:
-    """Distribute cells in Gmsh's node order over the ranks (collective).
-
-    Args:
-        comm: communicator of the mesh.
-        cells: nodes of this rank's cells in Gmsh's order, shape ``(n_cells, n_nodes_per_cell)``, global input index.
-        x: coordinates of this rank's part of the input nodes, shape ``(n_nodes, gdim)``.
-        cell: name of the cell, e.g. ``"tetrahedron"``.
-        degree: degree of the geometry.
-
-    Returns:
-        The mesh, of geometric dimension ``x.shape[1]``.
-    """
+    """Mesh of this rank's ``cells (n, n_nodes)``, numbers of nodes in Gmsh's order, and of its part ``x (k, gdim)`` of the nodes."""
     gdim = x.shape[1]
     order = cpp.io.perm_gmsh(getattr(mesh.CellType, cell), cells.shape[1])
     cells = np.ascontiguousarray(cells[:, order], dtype=np.int64)
@@ -71,27 +60,13 @@ def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.
 
 
 def cell_name(domain: Any) -> str:
-    """Name of the cells, e.g. ``"triangle"``.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        UFL's name of the cell.
-    """
+    """UFL's name of the cells, e.g. ``"triangle"``."""
     name = domain.ufl_cell().cellname
     return str(name() if callable(name) else name)
 
 
 def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
-    """Geometry nodes of every cell.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        Local node indices in DOLFINx's order (vertices first), shape ``(n_cells incl. ghosts, n_nodes_per_cell)``.
-    """
+    """Local geometry nodes of every cell in DOLFINx's order, vertices first ``(n_cells incl. ghosts, n_nodes)``."""
     geometry = domain.geometry
     dofmap = geometry.dofmaps[0] if DOLFINX_VERSION >= (0, 11) else geometry.dofmap
     return cell_table(domain, dofmap)
@@ -146,16 +121,7 @@ def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any
 
 
 def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
-    """Space of functions known at quadrature points only, for forms integrated with the same degree.
-
-    Args:
-        domain: the mesh.
-        degree: of the quadrature, see :func:`quadrature_rule`.
-        shape: shape of the value: ``()`` scalar, ``(n,)`` vector.
-
-    Returns:
-        The function space; the d.o.f. of a cell are in the order of the rule's points.
-    """
+    """Space of functions known at the points of :func:`forms.quadrature_rule`, in their order; ``shape`` is ``()`` or ``(n,)``."""
     if DOLFINX_VERSION >= (0, 7):
         from basix.ufl import quadrature_element
 
@@ -169,29 +135,13 @@ def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any
 
 
 def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-    """Values of a compiled scalar or vector expression at its points of the given cells.
-
-    Args:
-        compiled: ``fem.Expression`` of rank 0 or 1.
-        domain: the mesh.
-        cells: local indices, shape ``(n,)``.
-
-    Returns:
-        Shape ``(n, n_points, size)``.
-    """
+    """Values of a compiled scalar or vector expression at its points of local ``cells (n,)``: ``(n, n_points, size)``."""
     values = compiled.eval(cells) if DOLFINX_VERSION < (0, 7) else compiled.eval(domain, cells)
     return values.reshape(len(cells), len(compiled.X()), int(np.prod(compiled.ufl_expression.ufl_shape)))
 
 
 def cell_dofs(V: Any) -> npt.NDArray[np.int32]:
-    """Blocked d.o.f. of every cell.
-
-    Args:
-        V: the function space.
-
-    Returns:
-        Local blocked indices, shape ``(n_cells incl. ghosts, n_block_dofs_per_cell)``.
-    """
+    """Local blocked d.o.f. of every cell ``(n_cells incl. ghosts, n_blocks)``."""
     return cell_table(V.mesh, V.dofmap.list)
 
 
@@ -206,36 +156,16 @@ def cell_table(domain: Any, rows: Any) -> npt.NDArray[np.int32]:
 
 
 def lagrange_degree(V: Any) -> int | None:
-    """Degree of a continuous Lagrange space.
-
-    Args:
-        V: a scalar, vector or tensor function space.
-
-    Returns:
-        The polynomial degree, or None if the space is anything else.
-    """
-    element = V.ufl_element()
-    if callable(getattr(element, "family", None)):
-        return int(element.degree()) if element.family() in ("Lagrange", "CG", "Q", "P") else None
-    try:
-        lagrange = element.element_family == basix.ElementFamily.P and not element.discontinuous
-    except (AttributeError, NotImplementedError):
-        return None
-    return int(element.degree) if lagrange else None
+    """Degree of a continuous Lagrange space, None for any other."""
+    family, degree = element_family(V) or ("", 0)
+    return degree if family == "Lagrange" else None
 
 
 def element_family(V: Any) -> tuple[str, int] | None:
-    """Which nodes or points a space has in a cell, for the spaces whose values are values at points.
-
-    Args:
-        V: a scalar, vector or tensor function space.
-
-    Returns:
-        ``"Lagrange"``, ``"Discontinuous Lagrange"`` or ``"Quadrature"``, and the degree; None if the space is anything else.
-    """
+    """``"Lagrange"``, ``"Discontinuous Lagrange"`` or ``"Quadrature"``, and the degree; None for any other space."""
     element = V.ufl_element()
     if callable(getattr(element, "family", None)):
-        family = "Lagrange" if element.family() == "Q" else str(element.family())
+        family = "Lagrange" if element.family() in ("CG", "Q", "P") else str(element.family())
         family = "Discontinuous Lagrange" if family == "DQ" else family
         return (family, int(element.degree())) if family in ("Lagrange", "Discontinuous Lagrange", "Quadrature") else None
     try:
@@ -249,24 +179,12 @@ def element_family(V: Any) -> tuple[str, int] | None:
 
 
 def petsc_vector(u: Any) -> PETSc.Vec:
-    """PETSc vector of a Function.
-
-    Args:
-        u: the Function.
-
-    Returns:
-        A ghosted vector that shares its memory with ``u.x.array``.
-    """
+    """Ghosted PETSc vector that shares its memory with ``u.x.array``."""
     return u.x.petsc_vec if hasattr(u.x, "petsc_vec") else u.vector
 
 
 def interpolate_expression(u: Any, expression: Any) -> None:
-    """Interpolate a UFL expression into a Function and update its ghosts (collective).
-
-    Args:
-        u: Function of a Lagrange or DG0 space; overwritten.
-        expression: UFL expression of the same shape.
-    """
+    """Interpolate a UFL expression into a Function of a Lagrange or DG0 space, ghosts included (collective)."""
     V = u.function_space
     one = fem.Constant(V.mesh, 1.0)
     if not ufl.domain.extract_domains(expression):
@@ -298,14 +216,7 @@ def petsc_forms() -> Any:
 
 
 def create_vector(V: Any) -> PETSc.Vec:
-    """Ghosted zero vector with the layout of a function space.
-
-    Args:
-        V: the function space.
-
-    Returns:
-        The vector.
-    """
+    """Ghosted zero vector with the layout of a function space."""
     if DOLFINX_VERSION >= (0, 10):
         b = petsc_forms().create_vector(V)
     else:
@@ -316,14 +227,7 @@ def create_vector(V: Any) -> PETSc.Vec:
 
 
 def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
-    """D.o.f. that a Dirichlet condition constrains.
-
-    Args:
-        bc: from ``dolfinx.fem.dirichletbc``, on a blocked space, a sub-space or a collapsed one.
-
-    Returns:
-        Local unrolled indices in the parent space, ascending, ghosts last, shape ``(n,)``, and the number owned.
-    """
+    """Local unrolled d.o.f. in the parent space that a Dirichlet condition constrains, ascending, ghosts last, and the number owned."""
     dofs = np.sort(np.array(bc.dof_indices()[0], dtype=np.int32))
     dofmap = bc.function_space.dofmap
     # counted here: the number that DOLFINx up to 0.9 returns takes blocked ghosts for owned
@@ -331,12 +235,7 @@ def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:
 
 
 def set_bc_values(x: npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
-    """Write the values of Dirichlet conditions at their d.o.f., ghosts included, and nowhere else.
-
-    Args:
-        x: local array with ghosts, shape ``(n_local incl. ghosts,)``.
-        bcs: the conditions.
-    """
+    """Write Dirichlet values into a local array with ghosts at their d.o.f., ghosts included, and nowhere else."""
     if DOLFINX_VERSION < (0, 9):
         cpp.fem.set_bc(x, list(bcs), 1.0)
     else:
@@ -348,19 +247,7 @@ def set_bc_values(x: npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
 
 
 def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
-    """Open a VTX writer (collective).
-
-    Args:
-        comm: communicator of the mesh.
-        path: name of the ``.bp`` folder.
-        functions: Functions of one element.
-
-    Returns:
-        The writer, a context manager with ``write(t)``.
-
-    Raises:
-        MissingBackendError: this DOLFINx was built without ADIOS2.
-    """
+    """VTX writer with ``write(t)``, a context manager, for Functions of one element; refused without ADIOS2 (collective)."""
     if not has_vtx():
         raise MissingBackendError(
             f"VTX output of {path} needs ADIOS2, which DOLFINx {dolfinx.__version__} was built without; write XDMF instead."
@@ -372,11 +259,7 @@ def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
 
 
 def timing(task: str) -> tuple[int, float]:
-    """How often DOLFINx's timers have counted a task on this rank so far, and its wall time in seconds.
-
-    Args:
-        task: name of the timer.
-    """
+    """How often DOLFINx's timers have counted a task on this rank so far, and its wall time in seconds."""
     try:
         calls, elapsed = dolfinx.common.timing(task)[:2]
     except RuntimeError:
@@ -390,12 +273,8 @@ def timing(task: str) -> tuple[int, float]:
 def gmsh_is_initialized(gmsh: Any) -> bool:
     """Whether ``gmsh.initialize`` was called and not yet finalised.
 
-    Args:
-        gmsh: the module.
-
-    Returns:
-        The answer. Gmsh 4.8 has no function for it: initialised, it has at least one model; otherwise it lists none
-        or raises, and complains, which is kept off the terminal.
+    Gmsh 4.8 has no function for it: initialised, it has at least one model; otherwise it lists none or raises, and complains, which
+    is kept off the terminal.
     """
     if hasattr(gmsh, "isInitialized"):
         return bool(gmsh.isInitialized())

@@ -24,26 +24,12 @@ from uem_dolfinx.arrays import Indices
 
 
 def original_cells(domain: Any) -> npt.NDArray[np.int64]:
-    """Number of every cell in the mesh's input.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        Global input index, shape ``(n_cells incl. ghosts,)``; empty for a mesh that was made from another one.
-    """
+    """Number of every cell in the mesh's input ``(n_cells incl. ghosts,)``; empty for a mesh made from another one."""
     return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
 
 
 def vertex_nodes(domain: Any) -> Indices:
-    """Geometry node of every vertex.
-
-    Args:
-        domain: the mesh.
-
-    Returns:
-        Local node index, shape ``(n_vertices incl. ghosts,)``.
-    """
+    """Local geometry node of every vertex ``(n_vertices incl. ghosts,)``."""
     topology = domain.topology
     vertex_map = topology.index_map(0)
     topology.create_connectivity(topology.dim, 0)
@@ -54,17 +40,7 @@ def vertex_nodes(domain: Any) -> Indices:
 
 
 def mesh_tags(domain: Any, dim: int, entities: npt.ArrayLike, values: npt.ArrayLike) -> Any:
-    """Create MeshTags from entities in any order.
-
-    Args:
-        domain: the mesh.
-        dim: dimension of the entities.
-        entities: local indices, shape ``(n,)``; of equal ones the first counts.
-        values: one integer for all, or one for each, shape ``(n,)``.
-
-    Returns:
-        The MeshTags.
-    """
+    """MeshTags of local entities in any order ``(n,)``, of equal ones the first, with one integer for all or for each ``(n,)``."""
     indices = np.asarray(entities, dtype=np.int32).reshape(-1)
     numbers = np.broadcast_to(np.asarray(values, dtype=np.int32), indices.shape)
     unique, first = np.unique(indices, return_index=True)
@@ -103,64 +79,30 @@ def cell_measure(domain: Any, cells: npt.ArrayLike, metadata: Mapping[str, Any] 
 
 
 def quadrature_rule(domain: Any, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Quadrature on the reference cell that forms use by default.
-
-    Args:
-        domain: the mesh.
-        degree: of the polynomials integrated exactly.
-
-    Returns:
-        Points ``(n_points, tdim)`` and weights ``(n_points,)``.
-    """
+    """Points ``(n, tdim)`` and weights ``(n,)`` on the reference cell that forms use by default for polynomials of a degree."""
     points, weights = basix.make_quadrature(getattr(basix.CellType, compat.cell_name(domain)), degree)
     return np.asarray(points), np.asarray(weights)
 
 
 def create_lagrange_element(cell: str, degree: int) -> Any:
-    """Scalar Lagrange element of Basix, with the nodes that :func:`function_space` uses.
-
-    Args:
-        cell: ``"interval"``, ``"triangle"``, ...
-        degree: polynomial degree.
-
-    Returns:
-        The Basix element; ``tabulate(n, points)`` has shape ``(n_derivatives, n_points, n_nodes, 1)``.
-    """
+    """Basix's scalar Lagrange element with the nodes of function spaces; ``tabulate(n, points)`` is ``(n_derivatives, n, nn, 1)``."""
     return basix.create_element(basix.ElementFamily.P, getattr(basix.CellType, cell), degree, basix.LagrangeVariant.gll_warped)
 
 
 def reference_topology(cell: str) -> list[list[list[int]]]:
-    """Vertices of every sub-entity of a reference cell.
-
-    Args:
-        cell: ``"interval"``, ``"triangle"``, ...
-
-    Returns:
-        ``topology[dim][i]``: the vertices of sub-entity ``i`` of dimension ``dim``.
-    """
+    """Vertices of every sub-entity of a reference cell: ``topology[dim][i]``."""
     return [[list(entity) for entity in entities] for entities in basix.topology(getattr(basix.CellType, cell))]
 
 
 def sum_ghosts(u: Any) -> None:
-    """Add the ghost entries of a Function to their owners and send the sums back (collective).
-
-    Args:
-        u: the Function.
-    """
+    """Add the ghost entries of a Function to their owners and send the sums back (collective)."""
     vector = compat.petsc_vector(u)
     vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
     vector.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
 
 
 def form(integrals: Any) -> Any:
-    """Compile a UFL form, or a nested sequence of them, for real arithmetic.
-
-    Args:
-        integrals: the UFL form.
-
-    Returns:
-        The DOLFINx form.
-    """
+    """Compile a UFL form, or a nested sequence of them, for real arithmetic."""
     return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
 
 
@@ -202,36 +144,21 @@ def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], l
 
 
 def create_matrix(a: Any) -> PETSc.Mat:
-    """Matrix with the layout, the block size and the sparsity of a compiled bilinear form.
-
-    Args:
-        a: the compiled form.
-
-    Returns:
-        A matrix without values.
-    """
+    """Matrix without values, with the layout, block size and sparsity of a compiled bilinear form."""
     return compat.petsc_forms().create_matrix(a)
 
 
 def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
-    """Assemble a compiled bilinear form into a matrix, without boundary conditions (collective).
-
-    Args:
-        A: from :func:`create_matrix`; zeroed first, fully assembled afterwards.
-        a: the compiled form.
-    """
+    """Assemble a compiled bilinear form into a matrix, zeroed first, without boundary conditions (collective)."""
     A.zeroEntries()
     compat.petsc_forms().assemble_matrix(A, a, [])
     A.assemble()
 
 
 def assemble_vector(b: PETSc.Vec, L: Any) -> None:
-    """Assemble a compiled linear form into a vector (collective).
+    """Assemble a compiled linear form into a ghosted vector, zeroed first (collective).
 
-    Args:
-        b: ghosted vector; zeroed first. Ghost contributions are added to their owners; the ghost entries themselves
-            are left unspecified.
-        L: the compiled form.
+    Ghost contributions are added to their owners; the ghost entries themselves are left unspecified.
     """
     with b.localForm() as local:
         local.set(0.0)
@@ -240,38 +167,19 @@ def assemble_vector(b: PETSc.Vec, L: Any) -> None:
 
 
 def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
-    """Value of a compiled functional (collective).
-
-    Args:
-        M: the compiled form.
-        comm: communicator of the mesh.
-
-    Returns:
-        The sum over all ranks, known to all of them.
-    """
+    """Sum of a compiled functional over all ranks of a communicator, known to all of them (collective)."""
     return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))
 
 
 def free_petsc_garbage(comm: MPI.Comm) -> None:
-    """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective).
-
-    Args:
-        comm: their communicator.
-    """
+    """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective)."""
     PETSc.garbage_cleanup(comm)
 
 
 def open_xdmf(comm: MPI.Comm, path: str | Path, domain: Any) -> Any:
-    """Open an XDMF file and write the mesh (collective).
+    """XDMF file with the mesh in it, a context manager; its folder exists (collective).
 
-    Args:
-        comm: communicator of the mesh.
-        path: name of the file; its folder exists.
-        domain: the mesh.
-
-    Returns:
-        The file, a context manager; ``write_function(u, t)`` takes P1 (geometry degree) and DG0 Functions, each
-        with a ``name`` of its own.
+    ``write_function(u, t)`` takes Functions of the geometry's degree and DG0 ones, each with a ``name`` of its own.
     """
     file = io.XDMFFile(comm, str(path), "w")
     file.write_mesh(domain)
