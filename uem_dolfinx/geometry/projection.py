@@ -148,7 +148,7 @@ class FacetProjection:
             updates[name][which] = value
         return replace(self, **updates)
 
-    def reaching_out(self, which: Ints, shape: FacetShape) -> FacetProjection:
+    def continued(self, which: Ints, shape: FacetShape) -> FacetProjection:
         """Copy in which some facets are continued past the target's open end, as far as their points lie beyond it."""
         t = np.einsum("kaf,kag->kfg", self.dN[which], self.x[which])
         m = np.einsum("kfg,keg->kfe", t, t)

@@ -93,7 +93,7 @@ class MeshTarget:
 
     def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
         """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
-        return projection.reaching_out(which, self.shape)
+        return projection.continued(which, self.shape)
 
     def chords(self, projection: FacetProjection) -> Array:
         """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
