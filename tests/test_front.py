@@ -6,9 +6,11 @@ Worth reading first: ``test_readme`` and ``test_whatever_names_a_surface``.
 from __future__ import annotations
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from mpi4py import MPI
@@ -66,6 +68,15 @@ def test_readme_is_short_and_needs_no_inner_module():
                 assert not str(node.module).startswith("uem_dolfinx"), f"{name} imports from {node.module}"
             elif isinstance(node, ast.Import):
                 assert all(a.name == "uem_dolfinx" for a in node.names if "uem_dolfinx" in a.name), name
+
+
+def test_links_of_the_readmes():
+    """Files that READMEs link to are there, and modules that the package's docstring names."""
+    for path in [REPO / "README.md", *(REPO / "uem_dolfinx").glob("README.md")]:
+        for link in re.findall(r"\]\(([\w/.-]+)", path.read_text(encoding="utf-8")):
+            assert link.startswith("http") or (path.parent / link).exists(), f"{path.name}: {link}"
+    for module in re.findall(r"``([a-z_.]+)``", uem.__doc__):
+        assert find_spec(f"uem_dolfinx.{module}"), module
 
 
 def test_reference():
