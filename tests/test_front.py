@@ -94,7 +94,7 @@ def first_run(folder, ranks, **environment):
         README.replace('"h": 0.01', '"h": 0.1').partition("contact =")[0] + "uem.integrate(u[0] * uem.ds(tags['disc_top']))"
     )
     (folder / "meshes").symlink_to(REPO / "meshes")
-    env = outside_mpi() | {"XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"} | environment
+    env = outside_mpi() | {"XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPO)} | environment
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
     command = [sys.executable, str(script)]
     command = command if ranks == 1 else [str(mpiexec), "-n", str(ranks), *command]
