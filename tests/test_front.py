@@ -6,9 +6,11 @@ Worth reading first: ``test_readme`` and ``test_whatever_names_a_surface``.
 from __future__ import annotations
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from mpi4py import MPI
@@ -68,6 +70,15 @@ def test_readme_is_short_and_needs_no_inner_module():
                 assert all(a.name == "uem_dolfinx" for a in node.names if "uem_dolfinx" in a.name), name
 
 
+def test_links_of_the_readmes():
+    """Files that READMEs link to are there, and modules that the package's docstring names."""
+    for path in [REPO / "README.md", *(REPO / "uem_dolfinx").glob("README.md")]:
+        for link in re.findall(r"\]\(([\w/.-]+)", path.read_text(encoding="utf-8")):
+            assert link.startswith("http") or (path.parent / link).exists(), f"{path.name}: {link}"
+    for module in re.findall(r"``([a-z_.]+)``", uem.__doc__):
+        assert find_spec(f"uem_dolfinx.{module}"), module
+
+
 def test_reference():
     assert sorted(uem.__all__, key=str.lower) == sorted(set(uem.__all__), key=str.lower)
     assert all(getattr(uem, name).__doc__ for name in uem.__all__)
@@ -83,7 +94,7 @@ def first_run(folder, ranks, **environment):
         README.replace('"h": 0.01', '"h": 0.1').partition("contact =")[0] + "uem.integrate(u[0] * uem.ds(tags['disc_top']))"
     )
     (folder / "meshes").symlink_to(REPO / "meshes")
-    env = outside_mpi() | {"XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"} | environment
+    env = outside_mpi() | {"XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPO)} | environment
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
     command = [sys.executable, str(script)]
     command = command if ranks == 1 else [str(mpiexec), "-n", str(ranks), *command]

@@ -4,11 +4,12 @@
 
 The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
 
-1. Unite: the normal displacement of each active contactor follows the target: ``contact``, ``algebra.restriction``.
-2. Solve the united system, then return each contactor along the normal onto the moved target: ``algebra.linear_solver``,
-   ``contact``, with gaps and normals from ``geometry``.
-3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.newton``.
-4. Activate contactors that have gone through, release those that pull, iterate: ``solve.system``, ``solve.newton``.
+1. Unite: the normal displacement of each active contactor follows the target: ``contact.node_to_surface`` and
+   ``contact.bernstein`` write the equations, ``algebra.restriction`` builds P and c from them.
+2. Solve the united system (``algebra.linear_solver``), then return each contactor along the normal onto the moved target
+   (``contact.pair``, with projections from ``geometry``).
+3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.system``.
+4. Activate contactors that have gone through, release those that pull (``contact.active_set``), iterate (``solve.newton``).
 
 [UEM]: K. Farahani, M. Mofid, A. Vafai: United elements method for general contact-impact problems. Computer Methods in Applied
 Mechanics and Engineering 191 (2001) 843-860.
