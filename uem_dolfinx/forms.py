@@ -166,6 +166,15 @@ def assemble_vector(b: PETSc.Vec, L: Any) -> None:
     b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
+def assemble_array(V: Any, L: Any) -> npt.NDArray[np.float64]:
+    """Owned entries ``(n_owned * block size,)`` of a compiled linear form in a space (collective)."""
+    b = compat.create_vector(V)
+    assemble_vector(b, L)
+    values = np.array(b.array_r)
+    b.destroy()
+    return values
+
+
 def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     """Sum of a compiled functional over all ranks of a communicator, known to all of them (collective)."""
     return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))

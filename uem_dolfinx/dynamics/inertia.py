@@ -17,7 +17,7 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
@@ -57,10 +57,6 @@ class Dynamics:
         resumed: how often a checkpoint has been read into them.
     """
 
-    velocity: fem.Function
-    acceleration: fem.Function
-    massy: Bools
-
     def __init__(
         self,
         mass: Mass,
@@ -79,30 +75,19 @@ class Dynamics:
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
-        self.resumed, self.accelerated, self._attached = 0, False, False
-        self.moving = False
+        self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
         #: Factor of M in the tangent.
         self.factor = 0.0
         #: Virtual work of the damping forces.
         self.damping_form: ufl.Form | None = None
 
-    # -- set-up ------------------------------------------------------------------------------------------------------
-
     def attach(self, config: Configuration) -> ufl.Form | None:
-        """Take in the problem's displacement; returns the damping form (collective).
-
-        Raises:
-            SpaceError: if mass or velocity belong to another space, or these dynamics to another problem.
-            NotFiniteError: if the velocity or gravity is not finite.
-            ValueError: if they have the wrong shape.
-        """
+        """Take in the problem's displacement, refuse what does not fit it, and return the damping form (collective)."""
         if self._attached:
             raise SpaceError("these dynamics belong to another problem: make new ones for every problem")
-        self._attached = True
-        self.config, g = config, config.gdim
-        self._n = g * config.n_owned
+        self._attached, self.config, g = True, config, config.gdim
+        self._n, error = g * config.n_owned, None
         wanted = self._n, g * config.index_map.size_global
-        error = None
         if tuple(self.mass.M.getSizes()[0]) != wanted:
             error = SpaceError(
                 f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
@@ -113,10 +98,9 @@ class Dynamics:
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
         self._set_velocity()
-        down = np.zeros(g) if self.gravity is None else np.asarray(self.gravity, dtype=float)
-        if down.shape != (g,) or not np.isfinite(down).all():
+        self._down = np.zeros(g) if self.gravity is None else np.asarray(self.gravity, dtype=float)
+        if self._down.shape != (g,) or not np.isfinite(self._down).all():
             raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
-        self._down = down
         self._copy_committed()
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
@@ -129,10 +113,9 @@ class Dynamics:
     def _set_velocity(self) -> None:
         v, g = self.start_velocity, self.config.gdim
         if isinstance(v, fem.Function):
-            error = None
-            if v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array):
-                error = SpaceError("the velocity belongs to another space: make it with the function space of the displacement")
-            agree(self.config.comm, error)
+            other = v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array)
+            words = "the velocity belongs to another space: make it with the function space of the displacement"
+            agree(self.config.comm, SpaceError(words) if other else None)
             self.velocity.x.array[:] = v.x.array
         elif v is not None:
             if np.shape(v) != (g,):
@@ -142,14 +125,7 @@ class Dynamics:
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 
     def make_contactors_massless(self, contactors: Indices) -> None:
-        """Hand the mass of the contactors on to the nodes around, or warn that they keep it (collective).
-
-        Args:
-            contactors: owned local nodes ``(n,)`` of all contacts.
-
-        Raises:
-            MassError: if the nodes around cannot carry it.
-        """
+        """Hand the mass of ``contactors (n,)``, owned local nodes, on as ``Mass.without`` does, or warn that they keep it (collective)."""
         massy = int(self.config.comm.allreduce(int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
         if massy and self.contactors == "massless":
             self.mass = self.mass.without(contactors)
@@ -167,12 +143,9 @@ class Dynamics:
         vector.array[:] = np.ravel(values)
         return vector
 
-    # -- what the residual and the tangent get -----------------------------------------------------------------------
-
     def begin(self, dt: float) -> None:
         """Begin a step of length ``dt`` from the committed state."""
-        s = self.scheme
-        u, v, a = self._u, self._velocity, self._acceleration
+        s, u, v, a = self.scheme, self._u, self._velocity, self._acceleration
         self._until, self.moving = self.time + dt, True
         # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
         self._a_rate = 1.0 / (s.beta * dt**2)
@@ -195,29 +168,19 @@ class Dynamics:
         load.axpy(-1.0, self._weight)
         return load
 
-    @property
-    def _increment(self) -> Array:
-        """How far the step has come ``(n_local incl. ghosts,)``."""
-        return np.asarray(self.config.u.x.array - self._u)
-
     def _inertia(self) -> PETSc.Vec:
         """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
         s, n = self.scheme, self._n
-        a = (1.0 - s.alpha_m) * (self._a_rate * self._increment + self._a_past) + s.alpha_m * self._acceleration
+        du = self.config.u.x.array - self._u
+        a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
         inertia = self.mass.M * self._like(a[:n])
         if s.alpha_f:
             inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
         inertia.scale(1.0 / (1.0 - s.alpha_f))
         return inertia
 
-    # -- state -------------------------------------------------------------------------------------------------------
-
     def accelerate(self, restriction: Restriction, F: PETSc.Vec) -> None:
-        """Acceleration at the start, of united bodies under the forces ``-F``: ``P'MP a = -P'F`` (collective).
-
-        Args:
-            restriction: of the contactors that touch at the start; c is not used.
-            F: static residual minus weight.
+        """Acceleration at the start, of bodies united by P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
 
         Raises:
             NotFiniteError: if the forces are not finite.
@@ -227,17 +190,14 @@ class Dynamics:
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
+        M = self.mass.M.copy() if restriction.M is None else self.mass.M.PtAP(restriction.P)
         if restriction.M is None:
-            M = self.mass.M.copy()
             restriction.cross_out(M)
-        else:
-            M = self.mass.M.PtAP(restriction.P)
         rhs = restriction.reduce(restriction.pass_on(F))
         diagonal = M.getDiagonal()
         idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
-        diagonal.array[idle] = 1.0
+        diagonal.array[idle], rhs.array[idle] = 1.0, 0.0
         M.setDiagonal(diagonal)
-        rhs.array[idle] = 0.0
         ksp = PETSc.KSP().create(self.config.comm)
         ksp.setType("cg")
         ksp.getPC().setType("jacobi")
@@ -254,8 +214,7 @@ class Dynamics:
         self.acceleration.x.array[: self._n] = a.array_r * self.massy.ravel()
         self.acceleration.x.scatter_forward()
         self._acceleration = np.array(self.acceleration.x.array)
-        inertia = self.mass.M * self._like(self._acceleration[: self._n])
-        self.forces.x.array[: self._n] = inertia.array_r
+        self.forces.x.array[: self._n] = (self.mass.M * self._like(self._acceleration[: self._n])).array_r
         self.forces.x.scatter_forward()
         self.accelerated = True
 
@@ -263,7 +222,7 @@ class Dynamics:
         """Keep velocity and acceleration that belong to the present displacement."""
         if self.moving:
             n, dt = self._n, self._until - self.time
-            du, massy = self._increment[:n], self.massy.ravel()
+            du, massy = (self.config.u.x.array - self._u)[:n], self.massy.ravel()
             self.forces.x.array[:n] = self._inertia().array_r
             self.acceleration.x.array[:n] = np.where(massy, self._a_rate * du + self._a_past[:n], 0.0)
             # what has no mass has no velocity of its own
@@ -296,8 +255,7 @@ class Dynamics:
     def momentum(self) -> Array:
         """Momentum ``(gdim,)`` (collective)."""
         p = self.mass.M * self._like(self.velocity.x.array[: self._n])
-        total = p.array_r.reshape(-1, self.config.gdim).sum(axis=0)
-        return np.asarray(self.config.comm.allreduce(total))
+        return np.asarray(self.config.comm.allreduce(p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2`` (collective)."""

@@ -13,7 +13,6 @@ from typing import Any
 
 from mpi4py import MPI
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -65,8 +64,6 @@ class Mass:
     config: Configuration
     diagonal: bool
 
-    # -- what it weighs ------------------------------------------------------------------------------------------------------
-
     @cached_property
     def of_nodes(self) -> Array:
         """Diagonal of M at the owned nodes ``(n_owned, gdim)``: zero where a node is massless, else positive (collective)."""
@@ -103,8 +100,6 @@ class Mass:
         modes = rigid_velocities(self._X - (sums[:, 1:] / sums[:, :1])[body]).transpose(0, 2, 1)
         return self._moments(modes, np.ones(modes.shape[:2]))[0].sum(axis=1)
 
-    # -- massless contactors ---------------------------------------------------------------------------------------------------
-
     def without(self, nodes: npt.ArrayLike) -> Mass:
         """The same bodies with some nodes massless, whose mass goes to the other nodes of their body (collective).
 
@@ -125,8 +120,16 @@ class Mass:
         Raises:
             MassError: if the other nodes of a body cannot take over the mass, or a node is not owned.
         """
-        config = self.config
-        kept = ~self._marked(nodes)
+        config, named = self.config, np.asarray(nodes, dtype=np.int64).ravel()
+        wrong, error = named[(named < 0) | (named >= config.n_owned)], None
+        if len(wrong):
+            error = MassError(
+                f"node {wrong[0]} is none of the {config.n_owned} nodes that rank {config.comm.rank} owns: "
+                "name nodes by their local block number, each on the rank that owns it"
+            )
+        agree(config.comm, error)
+        kept = np.ones(config.n_owned, dtype=bool)
+        kept[named] = False
         if not config.comm.allreduce(int(self.of_nodes[~kept].any())):
             return self
         with timed("redistribute mass"):
@@ -137,21 +140,6 @@ class Mass:
             left.destroy()
             right.destroy()
         return Mass(M, config, self.diagonal)
-
-    def _marked(self, nodes: npt.ArrayLike) -> Bools:
-        """Which owned nodes are named ``(n_owned,)`` (collective)."""
-        named = np.asarray(nodes, dtype=np.int64).ravel()
-        wrong = named[(named < 0) | (named >= self.config.n_owned)]
-        error = None
-        if len(wrong):
-            error = MassError(
-                f"node {wrong[0]} is none of the {self.config.n_owned} nodes that rank {self.config.comm.rank} owns: "
-                "name nodes by their local block number, each on the rank that owns it"
-            )
-        agree(self.config.comm, error)
-        marked = np.zeros(self.config.n_owned, dtype=bool)
-        marked[named] = True
-        return marked
 
     def _scaling(self, kept: Bools) -> Array:
         """Factors of the nodes that are kept with which these have the moments of all ``(n_owned, gdim)`` (collective).
@@ -218,14 +206,9 @@ class Mass:
         return np.concatenate([one, xi], axis=2)
 
     def _moments(self, xi: Array, s: Array) -> tuple[Array, Array]:
-        """Moments ``(s xi_a)' M (s xi_b)`` of each component of each body, and ``M (s xi_b)`` (collective).
+        """``(s xi_a)' M (s xi_b)``, by bodies ``(n_bodies, gdim, k, k)``, and ``M (s xi_b) (n_owned, gdim, k)`` (collective).
 
-        Args:
-            xi: functions at the nodes ``(n_owned, gdim, k)``.
-            s: factors ``(n_owned, gdim)``.
-
-        Returns:
-            ``(n_bodies, gdim, k, k)`` and ``(n_owned, gdim, k)``.
+        ``xi (n_owned, gdim, k)`` are functions at the nodes, ``s (n_owned, gdim)`` factors.
         """
         fields = s[..., None] * xi
         momenta = np.stack([self._times(fields[..., k]) for k in range(xi.shape[2])], axis=2)
@@ -242,8 +225,6 @@ class Mass:
             f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
             "refine the mesh behind its contact surface, or give nodal masses that are zero at the contactors"
         )
-
-    # -- tools -------------------------------------------------------------------------------------------------------------------
 
     @property
     def _X(self) -> Array:
@@ -276,9 +257,6 @@ class Mass:
         x.destroy()
         y.destroy()
         return out
-
-
-# -- masses of bodies ------------------------------------------------------------------------------------------------------------
 
 
 def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
@@ -320,12 +298,11 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     config = Configuration(fem.Function(V))
     with timed("assemble mass"):
         density = _density(config, rho)
-        b = compat.create_vector(V)
-        forms.assemble_vector(b, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx))
-        rows = np.array(b.array_r).reshape(-1, config.gdim)[:, 0]
-        b.destroy()
+        rows = forms.assemble_array(V, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx)).reshape(-1, config.gdim)[:, 0]
         of_cells = _cell_masses(config, density)
-        shares = np.diag(_reference_mass(config))
+        points, weights = forms.quadrature_rule(config.mesh, 2 * config.degree)
+        N = forms.create_lagrange_element(compat.cell_name(config.mesh), config.degree).tabulate(0, points)[0, :, :, 0]
+        shares = np.diag(N.T @ (weights[:, None] * N))
         cells = compat.cell_dofs(V)[: len(of_cells)]
         scaled = config.to_owners(cells.ravel(), np.outer(of_cells, shares / shares.sum()).ravel())[: config.n_owned]
         body, count = find_bodies(config)
@@ -381,28 +358,16 @@ def _density(config: Configuration, rho: Any) -> Any:
 def _cell_masses(config: Configuration, density: Any) -> Array:
     """Masses of the owned cells ``(n_cells,)``, refused if they cannot be (collective)."""
     S = compat.function_space(config.mesh, ("DG", 0))
-    b = compat.create_vector(S)
-    forms.assemble_vector(b, forms.form(density * ufl.TestFunction(S) * ufl.dx))
     n_cells = config.mesh.topology.index_map(config.tdim).size_local
-    masses = np.array(b.array_r)[compat.cell_dofs(S)[:n_cells, 0]]
-    b.destroy()
-    wrong = np.flatnonzero(~((masses >= 0) & np.isfinite(masses)))
-    error = None
+    of_dofs = forms.assemble_array(S, forms.form(density * ufl.TestFunction(S) * ufl.dx))
+    masses = of_dofs[compat.cell_dofs(S)[:n_cells, 0]]
+    wrong, error = np.flatnonzero(~((masses >= 0) & np.isfinite(masses))), None
     if len(wrong):
         where = ", ".join(f"{c:.6g}" for c in config.X[compat.cell_dofs(config.V)[wrong[0]]].mean(axis=0))
-        error = MassError(
-            f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}: give a density that is finite and not negative"
-        )
+        found = f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}"
+        error = MassError(f"{found}: give a density that is finite and not negative")
     agree(config.comm, error)
     return masses
-
-
-def _reference_mass(config: Configuration) -> Array:
-    """Mass of the reference cell of unit density, one component ``(n_nodes, n_nodes)``."""
-    cell = compat.cell_name(config.mesh)
-    points, weights = basix.make_quadrature(getattr(basix.CellType, cell), 2 * config.degree)
-    N = forms.create_lagrange_element(cell, config.degree).tabulate(0, points)[0, :, :, 0]
-    return np.asarray(N.T @ (weights[:, None] * N))
 
 
 def _diagonal(config: Configuration, values: Array) -> PETSc.Mat:

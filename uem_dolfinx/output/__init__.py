@@ -1,1 +1,1 @@
-"""What is read from a solved problem: fields, tables, energies, pictures."""
+"""What is read from a solved problem, and changes nothing in it: fields, tables, energies, pictures."""

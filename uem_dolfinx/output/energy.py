@@ -1,7 +1,4 @@
-"""Energy book: where the energy of a run is after every step, what work was done, and the momentum beside.
-
-It reads a solved problem and changes nothing.
-"""
+"""Energy book: where the energy of a run is after every step, what work was done, and the momentum beside."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.log import logger
@@ -77,10 +74,8 @@ class EnergyBook(Closing):
         if problem.dynamics is None:
             raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
         self.problem, self.dynamics = problem, problem.dynamics
-        self._stored = forms.form(stored) if stored is not None else None
-        self._external = forms.form(external) if external is not None else None
-        damping = self.dynamics.damping_form
-        self._damping = forms.form(damping) if damping is not None else None
+        works = stored, external, self.dynamics.damping_form
+        self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
         #: Rows written, in order.
         self.rows: list[Energies] = []
         #: Momenta ``(gdim,)`` and impulses on the contactors' bodies ``(n_contacts, gdim)`` of the rows.
@@ -89,14 +84,12 @@ class EnergyBook(Closing):
         axes, names = "xyz"[: problem.config.gdim], [f.name for f in fields(Energies)]
         suffixes = contact_suffixes(problem.contacts)
         columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
-        self.table = None
-        begin: dict[str, float] = {}
-        if path is not None:
-            self.table = CsvTable(path, problem.comm, columns, self.dynamics if resume else None)
-            begin = self.table.last
+        resume_at = self.dynamics if resume else None
+        self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at)
+        begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
-        self._impulse = np.array([[begin.get(f"impulse_{a}{s}", 0.0) for a in axes] for s in suffixes])
-        self._impulse = self._impulse.reshape(len(suffixes), len(axes))
+        impulse = [begin.get(f"impulse_{a}{s}", 0.0) for s in suffixes for a in axes]
+        self._impulse = np.reshape(impulse, (len(suffixes), len(axes)))
         if begin and begin["time"] != self.dynamics.time:
             logger.warning(
                 "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
@@ -109,18 +102,14 @@ class EnergyBook(Closing):
         if self.table is not None and begin:
             self._first = sum(self.table.first[name] for name in ("kinetic", "stored", "dissipated"))
         else:
-            energies = self._energies()
-            self._first = sum(energies)
+            self._first = sum(energies := self._energies())
             self._append(energies)
 
     def _read_forces(self) -> None:
         """Read the forces and the displacement of this instant (collective)."""
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
-        self._u = np.array(problem.u.x.array[:n])
-        self._time = self.dynamics.time
-        contact = np.zeros(n)
-        for c in problem.contacts:
-            contact += c.force.x.array[:n]
+        self._u, self._time = np.array(problem.u.x.array[:n]), self.dynamics.time
+        contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
         problem.forces.assemble()
         reaction = (problem.forces.residual.array_r - contact) * ~problem.forces.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
@@ -130,12 +119,8 @@ class EnergyBook(Closing):
 
     def _assembled(self, form: Any) -> Array:
         """Nodal forces of a compiled linear form at the owned components, zero without one."""
-        b = compat.create_vector(self.problem.config.V)
-        if form is not None:
-            forms.assemble_vector(b, form)
-        values = np.array(b.array_r)
-        b.destroy()
-        return values
+        config = self.problem.config
+        return np.zeros(config.n_owned * config.gdim) if form is None else forms.assemble_array(config.V, form)
 
     def _energies(self) -> tuple[float, float, float]:
         """Energies kinetic, stored and dissipated (collective)."""

@@ -1,7 +1,4 @@
-"""Pictures of 2D scenes, of pressure profiles and of whatever else is drawn into their panels.
-
-They read a solved problem and change nothing.
-"""
+"""Pictures of 2D scenes, of pressure profiles and of whatever else is drawn into their panels, gathered to rank 0 for drawing alone."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ def figure(
 
     Args:
         path: name of the picture; its folder is made. None draws nothing.
-        comm: communicator; rank 0 draws.
+        comm: communicator; rank 0 draws, and to it alone everything is gathered.
         panels: number of panels.
         size: width and height of a panel in inches.
 
@@ -91,8 +88,6 @@ def plot_scene(
 ) -> None:
     """Draw a 2D scene where it is now, coloured by a field, contact forces per area as arrows (collective).
 
-    Cells are gathered to rank 0 for drawing, and only there.
-
     Args:
         problem: the scene.
         picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0).
@@ -111,25 +106,21 @@ def plot_scene(
         ValueError: if the scene is not 2D.
     """
     if problem.config.gdim != 2:
-        raise ValueError(
-            f"plot_scene draws 2D scenes, this one has dimension {problem.config.gdim}: open the XDMF file in ParaView"
-        )
+        dimension = f"this one has dimension {problem.config.gdim}"
+        raise ValueError(f"plot_scene draws 2D scenes, {dimension}: open the XDMF file in ParaView")
     config, comm = problem.config, problem.comm
     if field is None:
         field, label = ufl.sqrt(ufl.dot(problem.u, problem.u)), label or "|u|"
     x, values = _vertex_positions(problem, scale), nodal_average(field, config.mesh)
     triangles, outline = _vertex_cells(config.mesh)
-    points = comm.gather(x)
-    parts = comm.gather((triangles, outline, values))
+    parts = comm.gather((x, triangles, outline, values))
     forces = [_gather_contactors(contact, scale) for contact in problem.contacts] if arrows else []
     with _panel(picture, comm) as panel:
-        if panel is None or points is None or parts is None:
+        if panel is None or parts is None:
             return
-        start = np.cumsum([0, *(len(p) for p in points)])
-        triangles = np.concatenate([t + s for (t, _, _), s in zip(parts, start)])
-        outline = np.concatenate([o + s for (_, o, _), s in zip(parts, start)])
-        values = np.concatenate([v for _, _, v in parts])
-        x = np.concatenate(points)
+        start = np.cumsum([0, *(len(p[0]) for p in parts)])
+        shifted = [(x, t + s, o + s, v) for (x, t, o, v), s in zip(parts, start)]
+        x, triangles, outline, values = (np.concatenate(part) for part in zip(*shifted))
         _draw_scene(panel, x, triangles, outline, values, levels, label, window, mirror, cells, cmap)
         longest = max((float(p.max(initial=0.0)) for _, _, p in forces), default=0.0)
         for at, force, pressure in forces:
@@ -144,9 +135,10 @@ def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:
         scale: magnification of the displacement.
     """
     mesh = problem.config.mesh
-    S = compat.function_space(mesh, 1)
     around = _vertex_cells(mesh)[1]
-    numbers = S.dofmap.index_map.local_to_global(around.ravel().astype(np.int32)).reshape(around.shape)
+    numbers = (
+        compat.function_space(mesh, 1).dofmap.index_map.local_to_global(around.ravel().astype(np.int32)).reshape(around.shape)
+    )
     edges = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=2).reshape(-1, 2)
     ends = _vertex_positions(problem, scale)[around]
     segments = np.stack([ends[:, :-1], ends[:, 1:]], axis=2).reshape(-1, 2, problem.config.gdim)
@@ -171,28 +163,20 @@ def _draw_scene(
         lo, hi = x.min(axis=0), x.max(axis=0)
         pad = 0.02 * (hi - lo).max()
         window = ((-hi[0] if mirror else lo[0]) - pad, hi[0] + pad, lo[1] - pad, hi[1] + pad)
-    used = np.zeros(len(x), dtype=bool)
-    used[triangles] = True
+    used = np.isin(np.arange(len(x)), triangles)
     reach = np.abs(x[:, 0]) if mirror else x[:, 0]
     shown = used & (reach <= window[1]) & (x[:, 1] >= window[2]) & (x[:, 1] <= window[3])
     seen = values[shown] if shown.any() else values[used]
-    bounds: Any = levels
-    if isinstance(levels, int):
-        bounds = MaxNLocator(levels).tick_values(float(seen.min()), float(seen.max()))
-    beyond = int(seen.min() < bounds[0]) + 2 * int(seen.max() > bounds[-1])
-    extend = ("neither", "min", "max", "both")[beyond]
-    coloured = None
+    least, most, coloured = float(seen.min()), float(seen.max()), None
+    bounds: Any = MaxNLocator(levels).tick_values(least, most) if isinstance(levels, int) else levels
+    extend = ("neither", "min", "max", "both")[int(least < bounds[0]) + 2 * int(most > bounds[-1])]
     for side in (1.0, -1.0) if mirror else (1.0,):
         y = x * [side, 1.0]
         coloured = ax.tricontourf(y[:, 0], y[:, 1], triangles, values, levels=bounds, cmap=cmap, extend=extend)
         if cells:
             ax.add_collection(LineCollection(y[outline], colors="k", linewidths=0.25, alpha=0.35))
     ax.figure.colorbar(coloured, ax=ax, label=label, shrink=0.85)
-    ax.set_xlim(window[:2])
-    ax.set_ylim(window[2:])
-    ax.set_aspect("equal")
-    ax.set_xlabel("x")
-    ax.set_ylabel("y")
+    ax.set(xlim=window[:2], ylim=window[2:], aspect="equal", xlabel="x", ylabel="y")
 
 
 def _draw_arrows(ax: Any, at: Array, force: Array, pressure: Array, longest: float, mirror: bool) -> None:
@@ -225,8 +209,6 @@ def plot_pressure(
 ) -> None:
     """Draw the contact pressure at the contactors over a coordinate (collective).
 
-    Contactors are gathered to rank 0 for drawing, and only there.
-
     Args:
         contacts: one contact or several.
         picture: name of the picture, or a panel of :func:`figure`.
@@ -243,7 +225,7 @@ def plot_pressure(
         MissingBackendError: if matplotlib cannot be imported.
     """
     pairs: list[Contact] = list(contacts) if isinstance(contacts, Sequence) else [contacts]
-    found = [_gather_contactors(contact, None) for contact in pairs]
+    found = [_gather_contactors(contact, 0.0) for contact in pairs]
     with _panel(picture, pairs[0].config.comm) as ax:
         if ax is None:
             return
@@ -262,44 +244,35 @@ def plot_pressure(
             if mirror:
                 s, p = np.concatenate([-s, s]), np.concatenate([p, p])
             ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
-        ax.set_xlim(window)
+        ax.set(xlim=window, xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
         ax.set_ylim(bottom=0.0)
-        ax.set_xlabel(along_label or ("x" if gdim == 2 else "r"))
-        ax.set_ylabel(label)
         ax.grid(alpha=0.25)
         ax.legend(frameon=False)
 
 
 def nodal_average(expression: Any, mesh: Any) -> Array:
-    """Scalar UFL expression averaged over the cells around each vertex of the mesh (collective).
-
-    Returns:
-        Values at the d.o.f. of the P1 space of the mesh ``(n_local incl. ghosts,)``.
-    """
+    """Scalar UFL expression averaged over the cells around each d.o.f. of the mesh's P1 space ``(n_local incl. ghosts,)`` (collective)."""
     S = compat.function_space(mesh, 1)
     v, total = ufl.TestFunction(S), fem.Function(S)
     cells = fem.Function(compat.function_space(mesh, ("DG", 0)))
     compat.interpolate_expression(cells, expression)
     sums = []
     for weight in (cells, fem.Constant(mesh, 1.0)):
-        b = compat.create_vector(S)
-        forms.assemble_vector(b, forms.form(weight * v * ufl.dx))
-        total.x.array[: len(b.array_r)] = b.array_r
+        own = forms.assemble_array(S, forms.form(weight * v * ufl.dx))
+        total.x.array[: len(own)] = own
         total.x.scatter_forward()
         sums.append(np.array(total.x.array))
-        b.destroy()
     return np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] != 0)
 
 
 def _vertex_positions(problem: UnitedProblem, scale: float) -> Array:
     """Displaced positions of the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, gdim)``."""
     config = problem.config
-    V = compat.function_space(config.mesh, 1, (config.gdim,))
-    u = fem.Function(V)
+    u = fem.Function(compat.function_space(config.mesh, 1, (config.gdim,)))
     u.interpolate(problem.u)
     u.x.scatter_forward()
     moved = u.x.array.reshape(-1, config.gdim)
-    return np.array(V.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
+    return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
 
 
 def _vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
@@ -309,16 +282,11 @@ def _vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
     return np.concatenate([dofs[:, t] for t in TRIANGLES[name]]), dofs[:, OUTLINE[name]]
 
 
-def _gather_contactors(contact: Contact, scale: float | None) -> tuple[Array, Array, Array]:
-    """Positions, forces and pressures of all contactors on rank 0, empty elsewhere (collective).
-
-    Positions are the reference ones if ``scale`` is None, else displaced by ``scale`` times the displacement.
-    """
+def _gather_contactors(contact: Contact, scale: float) -> tuple[Array, Array, Array]:
+    """Positions, displaced by ``scale`` times the displacement, forces and pressures of all contactors on rank 0 (collective)."""
     config, nodes = contact.config, contact.pair.nodes
-    at = config.X[nodes] + (scale or 0.0) * config.displacement[nodes]
+    at = config.X[nodes] + scale * config.displacement[nodes]
     # points have no area; their forces stand for themselves
     size = contact.pressures if contact.contactor.dim else contact.pair.trial.nodal
-    parts = config.comm.gather((at, contact.pair.trial.force, size))
-    if parts is None:
-        parts = [(at[:0], at[:0], np.zeros(0))]
+    parts = config.comm.gather((at, contact.pair.trial.force, size)) or [(at[:0], at[:0], np.zeros(0))]
     return tuple(np.concatenate(columns) for columns in zip(*parts))  # type: ignore[return-value]

@@ -1,7 +1,4 @@
-"""Results to keep: files for ParaView and a history in CSV.
-
-Writers read a solved problem and change nothing.
-"""
+"""Results to keep: files for ParaView and a history in CSV."""
 
 from __future__ import annotations
 
@@ -86,12 +83,13 @@ class ResultsWriter(Closing):
             stem.parent.mkdir(parents=True, exist_ok=True)
         comm.barrier()
         self._expressions = dict(fields or {})
-        self._cellwise = {name: self._cell_field(name, e) for name, e in self._expressions.items()}
-        degree = _geometry_degree(mesh)
-        self._nodal = {}
-        for name, u in self._sources().items():
-            space = compat.function_space(mesh, degree, u.ufl_shape)
-            self._nodal[name] = fem.Function(space, name=name)
+        spaces = {name: compat.function_space(mesh, ("DG", 0), e.ufl_shape) for name, e in self._expressions.items()}
+        self._cellwise = {name: fem.Function(space, name=name) for name, space in spaces.items()}
+        n_vertices = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}[compat.cell_name(mesh)]
+        degree = 1 if compat.geometry_dofs(mesh).shape[1] == n_vertices else 2
+        self._nodal = {
+            n: fem.Function(compat.function_space(mesh, degree, u.ufl_shape), name=n) for n, u in self._sources().items()
+        }
         self.history = HistoryWriter(stem.with_name(stem.name + ".csv"), problem)
         self._xdmf = forms.open_xdmf(comm, stem.with_name(stem.name + ".xdmf"), mesh)
         self._vtx = []
@@ -101,17 +99,12 @@ class ResultsWriter(Closing):
                 if functions:
                     self._vtx.append(compat.open_vtx(comm, stem.with_name(f"{stem.name}_{kind}.bp"), functions))
 
-    def _cell_field(self, name: str, expression: Any) -> fem.Function:
-        return fem.Function(compat.function_space(self.problem.config.mesh, ("DG", 0), expression.ufl_shape), name=name)
-
     def _sources(self) -> dict[str, fem.Function]:
         """Functions of the problem by name, up to date (collective)."""
         found = {"displacement": self.problem.u}
         for contact, suffix in zip(self.problem.contacts, contact_suffixes(self.problem.contacts)):
-            found[f"contact_pressure{suffix}"] = contact.pressure
-            found[f"gap{suffix}"] = contact.gap
-            found[f"active{suffix}"] = contact.active
-            found[f"contact_force{suffix}"] = contact.force
+            found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
+            found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
@@ -154,8 +147,3 @@ def contact_suffixes(contacts: Sequence[Contact]) -> list[str]:
         return [""]
     names = ["_" + re.sub(r"\W+", "_", contact.name).strip("_") for contact in contacts]
     return [name if names.count(name) == 1 else f"{name}_{i}" for i, name in enumerate(names)]
-
-
-def _geometry_degree(mesh: Any) -> int:
-    n_vertices = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}[compat.cell_name(mesh)]
-    return 1 if compat.geometry_dofs(mesh).shape[1] == n_vertices else 2

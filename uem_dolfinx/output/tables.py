@@ -59,13 +59,9 @@ class CsvTable(Closing):
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
         self._file: IO[str] | None = None
-        self._clock: Clock | None = None
-        self._resumed = 0
-        until: float | None
-        if resume_at is None or isinstance(resume_at, (int, float)):
-            until = resume_at
-        else:
-            self._clock, self._resumed, until = resume_at, resume_at.resumed, resume_at.time
+        self._clock = None if resume_at is None or isinstance(resume_at, (int, float)) else resume_at
+        self._resumed = 0 if self._clock is None else self._clock.resumed
+        until: Any = resume_at if self._clock is None else self._clock.time
         #: Where in the file the rows kept end, 0 without any; None once it has been cut there.
         self._end: int | None = None
         kept: list[list[str]] = []
@@ -80,16 +76,14 @@ class CsvTable(Closing):
                     self.close()
                     raise
             else:
-                self._file = self.path.open("w", newline="", encoding="utf-8")
-                self._end = 0
+                self._file, self._end = self.path.open("w", newline="", encoding="utf-8"), 0
                 self._cut()
 
         self._on_rank_0(begin)
         kept = comm.bcast([*kept[:1], *kept[-1:]])
         if kept:
-            self.first, self.last = (
-                {name: float(value) for name, value in zip(self.columns, row) if value} for row in (kept[0], kept[-1])
-            )
+            numbers = [{name: float(value) for name, value in zip(self.columns, row) if value} for row in kept]
+            self.first, self.last = numbers[0], numbers[-1]
 
     def _read(self, until: float) -> list[list[str]]:
         """Rows of the file up to a value of the first column; finds where they end."""
@@ -144,7 +138,7 @@ class CsvTable(Closing):
             OSError: of rank 0, on all ranks, if the file cannot be written.
             ValueError: if the table is closed.
         """
-        if self._late:
+        if self._clock is not None and self._clock.resumed != self._resumed:
             raise CheckpointError(
                 f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "
                 "call checkpoint.begin(problem.state()) before you make what writes tables with resume=True"
@@ -158,11 +152,6 @@ class CsvTable(Closing):
             self._file.flush()
 
         self._on_rank_0(append)
-
-    @property
-    def _late(self) -> bool:
-        """Whether a checkpoint has been read since the table was made."""
-        return self._clock is not None and self._clock.resumed != self._resumed
 
     def close(self) -> None:
         """Close the file."""
