@@ -60,8 +60,12 @@ class Elastic(ABC):
         """Stored energy per reference volume."""
 
     @abstractmethod
+    def stress(self, u: Any) -> Expr:
+        """Cauchy stress in small strains, otherwise the second Piola-Kirchhoff stress S."""
+
     def first_piola(self, u: Any) -> Expr:
-        """Stress that does work on ``grad(v)``."""
+        """Stress that does work on ``grad(v)``: ``F S``."""
+        return (self._check(u) + ufl.grad(u)) * self.stress(u)
 
     def residual(self, u: Any, v: Any) -> Expr:
         """Internal virtual work per reference volume, to be integrated with ``dx``."""
@@ -110,10 +114,6 @@ class StVenantKirchhoff(Elastic):
         E = self.strain(u)
         return 2 * self.mu * E + self.lam_in_plane * ufl.tr(E) * ufl.Identity(len(u))
 
-    def first_piola(self, u: Any) -> Expr:
-        """``F S``."""
-        return (self._check(u) + ufl.grad(u)) * self.stress(u)
-
 
 @dataclass(frozen=True)
 class NeoHooke(Elastic):
@@ -144,10 +144,6 @@ class NeoHooke(Elastic):
         C_inverse = ufl.inv(ufl.Identity(len(u)) + 2 * E)
         return 2 * self.mu * C_inverse * E + self.lam / 2 * self._volume_change(u) * C_inverse
 
-    def first_piola(self, u: Any) -> Expr:
-        """``F S``."""
-        return (self._check(u) + ufl.grad(u)) * self.stress(u)
-
 
 def green_lagrange(u: Any) -> Expr:
     """Green-Lagrange strain; ``F'F - I`` would lose strains below the rounding of 1."""
@@ -156,12 +152,9 @@ def green_lagrange(u: Any) -> Expr:
 
 
 class HistoryMaterial(Protocol):
-    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity.
+    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity."""
 
-    Attributes:
-        history: committed Functions that the stress depends on, by name.
-    """
-
+    #: Committed Functions that the stress depends on, by name.
     history: dict[str, Any]
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:

@@ -24,18 +24,7 @@ DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-
 
 
 def owned_cells(domain: Any, part: Part | None) -> Indices:
-    """Cells of a part of the mesh, or all cells, that this rank owns (collective).
-
-    Args:
-        domain: the mesh.
-        part: see ``as_tag``; None is the whole mesh.
-
-    Returns:
-        Local indices ``(n_cells,)``, ascending.
-
-    Raises:
-        SpaceError, TagError: see ``as_tag``.
-    """
+    """Owned local cells ``(n_cells,)``, ascending, of a part as ``as_tag`` takes and refuses it, None for the whole mesh (collective)."""
     tdim = domain.topology.dim
     owned = domain.topology.index_map(tdim).size_local
     if part is None:
@@ -50,9 +39,8 @@ class QuadraturePoints:
     Args:
         domain: the mesh.
         cells: local indices of owned cells ``(n_cells,)``.
-        degree: of the rule; 0 is the cells' centre, for use together with other rules. Points beside it stand for it: from a rule of
-            one point, FFCx takes gradients and Jacobians for constants of the cell and uses them at the points of other rules of
-            the same form.
+        degree: of the rule; 0 is the cells' centre, for use together with other rules. Points beside it stand for it: from one point,
+            FFCx takes gradients and Jacobians for constants of the cell and uses them at the points of the form's other rules.
 
     Attributes:
         points: on the reference cell, ``(n_points, tdim)``.
@@ -69,11 +57,8 @@ class QuadraturePoints:
         if degree == 0:
             self.points = self.points + BESIDE_CENTRE * np.array(DIRECTIONS[domain.topology.dim])
             weights = np.full(len(self.points), weights[0] / len(self.points))
-            metadata = {
-                "quadrature_rule": "custom",
-                "quadrature_points": self.points.tolist(),
-                "quadrature_weights": weights.tolist(),
-            }
+            points = {"quadrature_points": self.points.tolist(), "quadrature_weights": weights.tolist()}
+            metadata = {"quadrature_rule": "custom", **points}
         self.dx = ufl.dx(domain=domain, metadata=metadata)
         jacobian = self.evaluate(self.compile(ufl.JacobianDeterminant(domain)))
         self.volumes: Array = np.abs(jacobian.reshape(len(cells), len(weights))) * weights

@@ -54,16 +54,9 @@ def radial_return(
 ) -> Returned:
     """Return of the deviator along its own direction, for 3D and plane strain (Simo and Hughes, Computational Inelasticity, box 3.2).
 
-    Args:
-        strain: ``(n, k)`` with k = 4 or 6, components as in ``Returned``.
-        plastic_strain: committed, ``(n, k)``.
-        peeq: committed equivalent plastic strain ``(n,)``.
-        mu: shear modulus ``(n,)``.
-        yield_stress: at no plastic strain, ``(n,)``; infinite where elastic.
-        hardening: slope of the yield stress over ``peeq``, ``(n,)``.
-
-    Returns:
-        Deviator, history and the deviator's tangent.
+    Strains ``(n, k)``, ``plastic_strain`` and ``peeq (n,)`` the committed ones, have components as in ``Returned``, here k = 4 or 6;
+    parameters are ``(n,)``: shear modulus, ``yield_stress`` at no plastic strain, infinite where elastic, and ``hardening``, its
+    slope over ``peeq``. The tangent is the deviator's.
     """
     s = strain - plastic_strain
     s[:, :3] -= s[:, :3].mean(axis=1, keepdims=True)
@@ -96,19 +89,8 @@ def plane_stress_return(
         h(x) = flow / q(x) + 2 H x / (6 mu) - 1.
 
     1 / q is the harmonic-like mean ``(y1^-2 + y2^-2)^(-1/2)`` of linear functions of x, so h is concave and grows: Newton's method
-    from x = 0 approaches the root from the left and needs no other safeguard.
-
-    Args:
-        strain: in the plane, ``(n, 3)``, components as in ``Returned``.
-        plastic_strain: committed, ``(n, 3)``.
-        peeq: committed equivalent plastic strain ``(n,)``.
-        E: Young's modulus ``(n,)``.
-        nu: Poisson's ratio ``(n,)``.
-        yield_stress: at no plastic strain, ``(n,)``; infinite where elastic.
-        hardening: slope of the yield stress over ``peeq``, ``(n,)``.
-
-    Returns:
-        Stress, history and tangent.
+    from x = 0 approaches the root from the left and needs no other safeguard. Arguments are those of ``radial_return`` with k = 3,
+    Young's modulus and Poisson's ratio ``(n,)`` in place of mu.
     """
     shear, area = E / (1 + nu), E / (1 - nu)
     modes = _MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])

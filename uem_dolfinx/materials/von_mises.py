@@ -15,7 +15,7 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import NotFiniteError, SpaceError, UEMError
+from uem_dolfinx.errors import NotFiniteError, SpaceError
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
 from uem_dolfinx.materials.elastic import KINDS, green_lagrange
@@ -98,9 +98,8 @@ class VonMises:
         self.u, self.kind, self.strain = u, kind, strain
         self.mesh, self.comm = V.mesh, V.mesh.comm
         self.cells = owned_cells(self.mesh, cells)
-        self._points, self._pressure_points = (
-            QuadraturePoints(self.mesh, self.cells, degree) for degree in self._degrees(quadrature_degree)
-        )
+        degrees = self._degrees(quadrature_degree)
+        self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
         self._read_parameters(E, nu, yield_stress, hardening)
         self._create_functions()
         self._strain = self._points.compile(self._vector(self._lagrangian(u)))
@@ -109,8 +108,6 @@ class VonMises:
         #: Outcome of the last update.
         self._trial: Returned
         self.update()
-
-    # -- set-up ------------------------------------------------------------------------------------------------------
 
     def _degrees(self, quadrature_degree: int | None) -> tuple[int, int]:
         """Degrees of the quadrature of stress and of pressure."""
@@ -129,9 +126,8 @@ class VonMises:
         # one point is for constant strains
         lowest = 1 if affine and degree == 1 else 2
         if quadrature_degree is not None and quadrature_degree < lowest:
-            raise ValueError(
-                f"quadrature_degree = {quadrature_degree}: expected {lowest} or more for degree {degree} on {cell} cells"
-            )
+            expected = f"expected {lowest} or more for degree {degree} on {cell} cells"
+            raise ValueError(f"quadrature_degree = {quadrature_degree}: {expected}")
         stress, pressure = (SIMPLEX_DEGREES if simplex else TENSOR_DEGREES)[degree]
         stress = max(stress, lowest) if quadrature_degree is None else quadrature_degree
         return stress, min(stress, max(pressure, lowest) if simplex else pressure)
@@ -142,10 +138,8 @@ class VonMises:
             # the points beside a centre count as one
             count = len(self._pressure_points.points)
             return np.full((len(self._points.points), count), 1.0 / count)
-        linear = forms.create_lagrange_element(compat.cell_name(self.mesh), 1)
-        at, known = (
-            linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in (self._points, self._pressure_points)
-        )
+        linear, rules = forms.create_lagrange_element(compat.cell_name(self.mesh), 1), (self._points, self._pressure_points)
+        at, known = (linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in rules)
         spread = at @ np.linalg.pinv(known)
         return spread / spread.sum(axis=1, keepdims=True)
 
@@ -155,9 +149,8 @@ class VonMises:
         most = 1.0 if self.kind == "plane_stress" else 0.5
         nu = self._cellwise("nu", nu, lambda value: (value > -1) & (value < most), f"a number between -1 and {most}")
         yield_stress = self._cellwise("yield_stress", yield_stress, lambda value: value > 0, "a positive number")
-        hardening = self._cellwise(
-            "hardening", hardening, lambda value: (value >= 0) & np.isfinite(value), "0 or a positive number"
-        )
+        zero_or_more = "0 or a positive number"
+        hardening = self._cellwise("hardening", hardening, lambda value: (value >= 0) & np.isfinite(value), zero_or_more)
         self._E, self._nu, self._yield_stress, self._hardening = (
             np.repeat(values, len(self._points.points)) for values in (E, nu, yield_stress, hardening)
         )
@@ -169,20 +162,16 @@ class VonMises:
             V = given.function_space
             dofs = compat.cell_dofs(V)
             if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
-                raise SpaceError(
-                    f"{name} is a Function of {V}: expected a number, or a scalar DG0 Function of the displacement's mesh"
-                )
+                expected = "expected a number, or a scalar DG0 Function of the displacement's mesh"
+                raise SpaceError(f"{name} is a Function of {V}: {expected}")
             values = np.array(given.x.array[dofs[self.cells, 0]])
         else:
             values = np.full(len(self.cells), float(given))
-        bad = np.flatnonzero(~good(values))
-        found = None
+        bad, found = np.flatnonzero(~good(values)), None
         if len(bad):
             where = self._points.where(bad[0] * len(self._points.points))
-            found = f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {expected}"
-        found = next((text for text in self.comm.allgather(found) if text), None)
-        if found:
-            raise ValueError(found)
+            found = ValueError(f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {expected}")
+        agree(self.comm, found)
         return values
 
     def _create_functions(self) -> None:
@@ -197,8 +186,6 @@ class VonMises:
         self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
         self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
         self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
-
-    # -- forms -------------------------------------------------------------------------------------------------------
 
     def _lagrangian(self, u: Any) -> Expr:
         return ufl.sym(ufl.grad(u)) if self.strain == "small" else green_lagrange(u)
@@ -249,8 +236,6 @@ class VonMises:
         plain = self._a * ufl.inner(A, B) + self._c * ufl.tr(A) * ufl.tr(B)
         return (plain - ufl.dot(self._m, self._vector(A)) * ufl.dot(self._m, self._vector(B))) * self._points.dx
 
-    # -- state -------------------------------------------------------------------------------------------------------
-
     def update(self) -> None:
         """Stress and tangent at the present displacement, from the committed history (collective).
 
@@ -259,44 +244,30 @@ class VonMises:
         """
         with timed("return mapping"):
             with np.errstate(over="ignore", invalid="ignore"):
-                trial = self._return(self._points.evaluate(self._strain))
-                stress = self._with_pressure(trial.stress)
-            agree(self.comm, self._not_finite(stress))
+                E, nu, law, strain = self._E, self._nu, (self._yield_stress, self._hardening), self._points.evaluate(self._strain)
+                before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
+                if self.kind == "plane_stress":
+                    trial = plane_stress_return(strain, *before, E, nu, *law)
+                else:
+                    trial = radial_return(strain, *before, E / (2 * (1 + nu)), *law)
+                stress = trial.stress.copy()
+                if self.kind != "plane_stress":
+                    stress[:, :3] += (self._bulk[:, None] * (self._volume_changes() @ self._spread.T)).reshape(-1, 1)
+            bad, error = np.flatnonzero(~np.isfinite(stress).all(axis=1)), None
+            if len(bad):
+                error = NotFiniteError(
+                    f"strain or stress of the cell at {self._points.where(bad[0])} is NaN or infinite: "
+                    "check the displacement's initial values, the loads and the Dirichlet conditions, or take smaller load steps"
+                )
+            agree(self.comm, error)
             self._trial = trial
             for f, values in ((self._s, trial.stress), (self._a, trial.a), (self._c, trial.c), (self._m, trial.m)):
                 self._points.write(f, values)
             self._points.write(self.stress, stress)
 
-    def _with_pressure(self, stress: Array) -> Array:
-        """The stress whose deviator is given, or in plane stress the given one."""
-        if self.kind == "plane_stress":
-            return stress
-        pressure = self._bulk[:, None] * (self._volume_changes() @ self._spread.T)
-        stress = stress.copy()
-        stress[:, :3] += pressure.reshape(-1, 1)
-        return stress
-
     def _volume_changes(self) -> Array:
         """Trace of the strain at the pressure points ``(n_cells, n_pressure_points)``."""
         return self._pressure_points.evaluate(self._volume_change).reshape(self._pressure_points.volumes.shape)
-
-    def _not_finite(self, stress: Array) -> UEMError | None:
-        """What to say if a stress is not finite."""
-        bad = np.flatnonzero(~np.isfinite(stress).all(axis=1))
-        if not len(bad):
-            return None
-        return NotFiniteError(
-            f"strain or stress of the cell at {self._points.where(bad[0])} is NaN or infinite: "
-            "check the displacement's initial values, the loads and the Dirichlet conditions, or take smaller load steps"
-        )
-
-    def _return(self, strain: Array) -> Returned:
-        """The kernel of this kind."""
-        E, nu = self._E, self._nu
-        before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
-        if self.kind == "plane_stress":
-            return plane_stress_return(strain, *before, E, nu, self._yield_stress, self._hardening)
-        return radial_return(strain, *before, E / (2 * (1 + nu)), self._yield_stress, self._hardening)
 
     @timed("commit history")
     def commit(self) -> None:
@@ -305,8 +276,6 @@ class VonMises:
         self._points.write(self.peeq, self._trial.peeq)
         for f in self.history.values():
             f.x.scatter_forward()
-
-    # -- results -----------------------------------------------------------------------------------------------------
 
     def energy(self) -> float:
         """Elastic energy stored at the present displacement (collective)."""
