@@ -44,9 +44,6 @@ PIECE = 2**30
 TERMINATED = 128 + signal.SIGTERM
 
 
-# ---------------------------------------------------------------------------------------------- the file
-
-
 class _Trouble:
     """First thing that went wrong on this rank: what is collective goes on, and all ranks raise at its end."""
 
@@ -112,12 +109,11 @@ def write_checkpoint(path: str | Path, state: State) -> None:
         with trouble:
             if comm.rank == 0:
                 text = _text(content)
-                _write(file, end, np.frombuffer(text, dtype=np.uint8))
-                _write(file, 0, np.frombuffer(_head(end, text), dtype=np.uint8))
-        with trouble:
-            file.Sync()
-        with trouble:
-            file.Close()
+                for offset, data in ((end, text), (0, _head(end, text))):
+                    _write(file, offset, np.frombuffer(data, dtype=np.uint8))
+        for end_of_writing in (file.Sync, file.Close):
+            with trouble:
+                end_of_writing()
         complete = all(comm.allgather(trouble.none))
         with trouble:
             if comm.rank == 0 and complete:
@@ -156,8 +152,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
             file = MPI.File.Open(comm, str(path), MPI.MODE_RDONLY)
         trouble.agree()
         # the first time for the hash alone: a damaged file must not leave half of itself behind
-        tables = [hashes(part) for part in _parts(file, state, trouble)]
-        found = fingerprint(comm, tables)
+        found = fingerprint(comm, [hashes(part) for part in _parts(file, state, trouble)])
         with trouble:
             if trouble.none and found != content["data"]:
                 raise _damaged(path, f"data with the hash {content['data']}", f"the hash {found}")
@@ -194,8 +189,7 @@ def _write(file: MPI.File, offset: int, array: AnyArray) -> None:
     """Write an array at an offset in bytes."""
     data = as_bytes(np.ascontiguousarray(array))
     for i in range(0, len(data), PIECE):
-        piece = data[i : i + PIECE]
-        status = MPI.Status()
+        piece, status = data[i : i + PIECE], MPI.Status()
         file.Write_at(offset + i, [piece, MPI.BYTE], status)
         if status.Get_count(MPI.BYTE) != len(piece):
             raise OSError(f"{status.Get_count(MPI.BYTE)} of {len(piece)} bytes written")
@@ -223,11 +217,7 @@ def _plain(value: Any) -> Any:
 
 
 def _text(content: dict[str, Any]) -> bytes:
-    """Content in JSON.
-
-    Raises:
-        CheckpointError: naming the number that is none.
-    """
+    """Content in JSON; a CheckpointError names the number that is none."""
     for name, value in content["numbers"].items():
         try:
             json.dumps(value, default=_plain)
@@ -246,17 +236,12 @@ def _head(end: int, text: bytes) -> bytes:
 
 
 def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
-    return CheckpointError(
-        f"the checkpoint {path} is damaged: expected {expected}, found {found}; remove it, and go on from a copy or start anew"
-    )
+    remedy = "remove it, and go on from a copy or start anew"
+    return CheckpointError(f"the checkpoint {path} is damaged: expected {expected}, found {found}; {remedy}")
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Content of a checkpoint that is whole but for its tables.
-
-    Raises:
-        CheckpointError: if it is not.
-    """
+    """Content of a checkpoint; a CheckpointError tells what is not whole, the tables aside."""
     try:
         with path.open("rb") as file:
             head, size = file.read(HEAD), path.stat().st_size
@@ -286,20 +271,13 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a checkpoint of another state.
-
-    Raises:
-        CheckpointError: naming the first thing that differs.
-    """
+    """Refuse a checkpoint of another state by a CheckpointError that names the first thing that differs."""
     for name in [*expected, *found]:
         if found.get(name) != expected.get(name):
             raise CheckpointError(
                 f"the checkpoint {path} belongs to another run: for {name} expected {expected.get(name, 'nothing')}, found "
                 f"{found.get(name, 'nothing')}; go on with the script and mesh that wrote it, or remove it to start anew"
             )
-
-
-# ---------------------------------------------------------------------------------------------- runs
 
 
 class Checkpoint:
@@ -326,10 +304,9 @@ class Checkpoint:
         if every != int(every) or every < 1:
             raise ValueError(f"every = {every}: expected a number of steps, 1 or more")
         self.path, self.every = Path(path), int(every)
-        self._steps, self._asked_to_end = 0, False
+        self._steps, self._asked_to_end, self._handles = 0, False, False
         self._state: State | None = None
         self._before: Any = None
-        self._handles = False
 
     def begin(self, state: State) -> bool:
         """Go on from the file if there is one, and remove what a killed run has left of another (collective).
@@ -381,11 +358,10 @@ class Checkpoint:
             CheckpointError: if it cannot be written; an earlier file stays.
             SystemExit: with status 143, after writing, if any rank has got SIGTERM.
         """
-        if self._state is None:
-            return
-        write_checkpoint(self.path, self._state)
-        if self._state.comm.allreduce(int(self._asked_to_end)):
-            self._end()
+        if self._state is not None:
+            write_checkpoint(self.path, self._state)
+            if self._state.comm.allreduce(int(self._asked_to_end)):
+                self._end()
 
     def _end(self) -> None:
         self._asked_to_end = False

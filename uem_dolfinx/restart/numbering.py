@@ -24,12 +24,9 @@ DIGEST = 16
 
 
 class Numbering:
-    """Places of this rank's rows in a table over all ranks, in the order of keys that no partition changes.
+    """Places of this rank's rows in a table over all ranks, in the order of keys that no partition changes (making one is collective).
 
-    Args:
-        comm: communicator.
-        keys: of this rank's rows ``(n,)``, each different from all others on all ranks.
-        bound: all keys are below it.
+    ``keys (n,)`` are those of this rank's rows, each different from all others on all ranks and below ``bound``.
 
     Attributes:
         place: of each row in the table ``(n,)``.
@@ -46,13 +43,9 @@ class Numbering:
         meeting = Exchange.to(comm, keys * size // max(bound, 1))
         (met,) = meeting.send(keys)
         distinct, order = np.unique(met, return_inverse=True)
-        error = None
-        if len(distinct) < len(order):
-            error = CheckpointError(
-                "the mesh does not know the numbering of its input, as meshes made from other meshes do not: "
-                "keep Functions on the mesh that was read"
-            )
-        agree(comm, error)
+        unknown = "the mesh does not know the numbering of its input, as meshes made from other meshes do not"
+        twice = len(distinct) < len(order)
+        agree(comm, CheckpointError(f"{unknown}: keep Functions on the mesh that was read") if twice else None)
         first = np.cumsum([0, *comm.allgather(len(distinct))])
         self.place: Ints = np.empty(len(keys), dtype=np.int64)
         (self.place[meeting.rows],) = meeting.back(first[rank] + order.ravel())
@@ -86,13 +79,8 @@ def node_numbering(V: Any) -> Numbering:
     """Numbering of a space's owned nodes (blocks of d.o.f.), by the first cell of the input that has them (collective).
 
     A cell keeps the order of its vertices in every partition, and with it that of its nodes as long as no edge and no facet has
-    more than one of its own: their order would follow global numbers of vertices.
-
-    Args:
-        V: Lagrange of degree 1 or 2, discontinuous Lagrange or quadrature space, with values of any shape.
-
-    Raises:
-        CheckpointError: if the space is another one.
+    more than one of its own: their order would follow global numbers of vertices. Hence Lagrange of degree
+    1 or 2, discontinuous Lagrange and quadrature spaces alone, with values of any shape; a CheckpointError refuses others.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, compat.cell_dofs(V)
     found, error = compat.element_family(V), None
@@ -136,7 +124,6 @@ def hashes(part: AnyArray) -> list[bytes]:
 
 def fingerprint(comm: MPI.Comm, tables: list[list[bytes]]) -> str:
     """One hash of several tables from the hashes of their chunks, the same for any number of ranks (collective)."""
-    parts, text = comm.gather(tables), None
-    if parts is not None:
-        text = blake2b(b"".join(h for table in zip(*parts) for rank in table for h in rank), digest_size=DIGEST).hexdigest()
-    return str(comm.bcast(text))
+    parts = comm.gather(tables) or []
+    text = b"".join(h for table in zip(*parts) for rank in table for h in rank)
+    return str(comm.bcast(blake2b(text, digest_size=DIGEST).hexdigest()))

@@ -43,13 +43,7 @@ class Entry(Protocol):
 
 
 class FunctionEntry:
-    """The values of a Function at its nodes.
-
-    Args:
-        name: of the Function in the file.
-        u: the Function.
-        numbering: of its space.
-    """
+    """The values of a Function at its nodes, under a name in the file."""
 
     def __init__(self, name: str, u: fem.Function, numbering: Numbering):
         self.name, self.u, self.numbering = f"function '{name}'", u, numbering
@@ -62,8 +56,7 @@ class FunctionEntry:
     def to_checkpoint(self) -> AnyArray:
         """A view of the owned part ``(n_owned, block size)``."""
         dofmap = self.u.function_space.dofmap
-        rows = self.u.x.array.reshape(-1, dofmap.index_map_bs)
-        return np.asarray(rows[: dofmap.index_map.size_local])
+        return np.asarray(self.u.x.array.reshape(-1, dofmap.index_map_bs)[: dofmap.index_map.size_local])
 
     def from_checkpoint(self, kept: AnyArray) -> None:
         """Overwrite the Function."""
@@ -72,13 +65,7 @@ class FunctionEntry:
 
 
 class ContactEntry:
-    """The committed states of a contact at its contactors.
-
-    Args:
-        number: of the contact, from 1.
-        contact: of a problem.
-        nodes: numbering of the displacement's space.
-    """
+    """The committed states of a contact, one of a problem's with its number from 1, in a numbering of the displacement's nodes."""
 
     def __init__(self, number: int, contact: Contact, nodes: Numbering):
         self.name, self.contact = f"contact {number} '{contact.name}'", contact
@@ -143,14 +130,12 @@ class State:
     @cached_property
     def entries(self) -> list[Entry]:
         """Everything with a row for each node, in the order of the file (collective)."""
-        known: list[tuple[Any, Numbering]] = []
+        known: dict[int, tuple[Any, Numbering]] = {}
 
         def numbering(V: Any) -> Numbering:
-            for space, found in known:
-                if space is V:
-                    return found
-            known.append((V, node_numbering(V)))
-            return known[-1][1]
+            if id(V) not in known:
+                known[id(V)] = V, node_numbering(V)
+            return known[id(V)][1]
 
         nodal = [FunctionEntry(name, u, numbering(u.function_space)) for name, u in self.functions.items()]
         return [*nodal, *(ContactEntry(i, contact, numbering(contact.config.V)) for i, contact in enumerate(self.contacts, 1))]
@@ -158,17 +143,13 @@ class State:
     def describe(self) -> dict[str, str]:
         """What tells this state from others, in the order in which it is compared (collective)."""
         cells = f"{n_cells(self.mesh)} {compat.cell_name(self.mesh)} cells in {self.mesh.geometry.dim}D"
-        described = {"mesh": f"{cells}, fingerprint {self.fingerprint}"}
-        described |= {entry.name: entry.describe() for entry in self.entries}
+        described = {"mesh": f"{cells}, fingerprint {self.fingerprint}", **{e.name: e.describe() for e in self.entries}}
         return described | {f"number '{name}'": "a value" for name in self.numbers}
 
     def motions(self) -> list[dict[str, Any] | None]:
         """Where the contacts' rigid surfaces have been moved to."""
-        found: list[dict[str, Any] | None] = []
-        for contact in self.contacts:
-            motion = contact.target.motion if isinstance(contact.target, RigidSurface) else None
-            found.append(None if motion is None else {f.name: getattr(motion, f.name).tolist() for f in fields(Motion)})
-        return found
+        motions = [c.target.motion if isinstance(c.target, RigidSurface) else None for c in self.contacts]
+        return [None if m is None else {f.name: getattr(m, f.name).tolist() for f in fields(Motion)} for m in motions]
 
     def move(self, motions: list[dict[str, Any] | None]) -> None:
         """Put the contacts' rigid surfaces where they were."""
