@@ -182,9 +182,7 @@ class Dynamics:
     def accelerate(self, restriction: Restriction, F: PETSc.Vec) -> None:
         """Acceleration at the start, of bodies united by P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
 
-        Raises:
-            NotFiniteError: if the forces are not finite.
-            LinearSolveError: if the masses are negative.
+        A NotFiniteError refuses forces that are not finite, a LinearSolveError negative masses.
         """
         if not np.isfinite(F.norm()):
             raise NotFiniteError(

@@ -146,8 +146,7 @@ class Mass:
 
         Newton's method for the coefficients of the polynomials, for every component of every body at once.
         """
-        g = self.config.gdim
-        xi = self._coordinates(kept)
+        g, xi = self.config.gdim, self._coordinates(kept)
         a, b = np.triu_indices(g + 1)
         phi = xi[..., a] * xi[..., b]
         wanted = self._moments(xi, np.ones(xi.shape[:2]))[0][..., a, b]
@@ -163,9 +162,8 @@ class Mass:
             slopes = (xi[..., a] * momenta[..., b] + momenta[..., a] * xi[..., b]) * (s > np.sqrt(1.0 - LARGEST_LOSS))[..., None]
             return s, (wanted - moments[..., a, b]) / scale, slopes
 
-        alpha = np.zeros((count, g, len(a)))
+        alpha, stuck = np.zeros((count, g, len(a))), np.zeros((count, g), dtype=bool)
         s, missing, slopes = evaluate(alpha)
-        stuck = np.zeros((count, g), dtype=bool)
         for _ in range(MOST_ITERATIONS):
             size = np.abs(missing).max(axis=2)
             done = stuck | (size <= MOMENTS_MET)

@@ -237,11 +237,7 @@ class VonMises:
         return (plain - ufl.dot(self._m, self._vector(A)) * ufl.dot(self._m, self._vector(B))) * self._points.dx
 
     def update(self) -> None:
-        """Stress and tangent at the present displacement, from the committed history (collective).
-
-        Raises:
-            NotFiniteError: if a strain or a stress holds NaN or infinity.
-        """
+        """Stress and tangent at the present displacement, from the committed history; NotFiniteError if they are not (collective)."""
         with timed("return mapping"):
             with np.errstate(over="ignore", invalid="ignore"):
                 E, nu, law, strain = self._E, self._nu, (self._yield_stress, self._hardening), self._points.evaluate(self._strain)

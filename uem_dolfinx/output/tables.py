@@ -49,8 +49,7 @@ class CsvTable(Closing):
 
     Raises:
         OSError: of rank 0, on all ranks, if the file cannot be written.
-        ValueError: likewise, if the file to go on with holds what is no number.
-        CheckpointError: likewise, if it has other columns.
+        ValueError, CheckpointError: likewise, if the file to go on with holds what is no number, or has other columns.
     """
 
     def __init__(self, path: str | Path, comm: MPI.Comm, columns: Sequence[str], resume_at: float | Clock | None = None):
@@ -133,10 +132,8 @@ class CsvTable(Closing):
     def write(self, row: Sequence[Any]) -> None:
         """Append a row; floats are written to the last bit (collective).
 
-        Raises:
-            CheckpointError: if a checkpoint was read after the table had been made to go on with its file, which stays as it was.
-            OSError: of rank 0, on all ranks, if the file cannot be written.
-            ValueError: if the table is closed.
+        Raises as the table itself, and if it is closed (ValueError) or a checkpoint was read after it had been made to go on with its
+        file, which stays as it was (CheckpointError).
         """
         if self._clock is not None and self._clock.resumed != self._resumed:
             raise CheckpointError(
