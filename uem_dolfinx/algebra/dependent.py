@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import Exchange
@@ -36,11 +36,8 @@ OWN_FIRST = 1.5
 class Group:
     """Conflicting equations that share nodes, and the independent ones that replace them.
 
-    Attributes:
-        given: which of the conflicting equations ``(m,)``.
-        independent: equations of global nodes, which may live on any rank ``(k,)``.
-        shares: forces of the conflicting equations from those of the independent ones ``(m, k)``.
-        redundant: conflicting equations that were left out ``(m,)``.
+    ``given (m,)`` tells which of the conflicting equations, ``redundant (m,)`` those left out; ``independent (k,)`` are of global
+    nodes, which may live on any rank; ``shares (m, k)`` give the forces of the conflicting equations from those of the independent.
     """
 
     given: Ints
@@ -86,17 +83,12 @@ class IndependentEquations:
         self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], config.gdim)
 
     def forces(self, multipliers: Array) -> Array:
-        """Contact forces of the given equations from those of the independent ones (collective).
-
-        Args:
-            multipliers: in the order of ``equations``.
-        """
+        """Contact forces of the given equations from ``multipliers``, those of ``equations`` in their order (collective)."""
         if not self.found:
             return multipliers
         n = int((~self._conflicting).sum())
-        (answers,) = self._scattered.back(multipliers[n:])
-        mu = np.empty(len(answers))
-        mu[self._scattered.rows] = answers
+        mu = np.empty(len(self._scattered.rows))
+        (mu[self._scattered.rows],) = self._scattered.back(multipliers[n:])
         total, end = sum(len(group.given) for group in self._groups), 0
         lam, redundant = np.zeros(total), np.zeros(total, dtype=bool)
         for group in self._groups:
@@ -137,29 +129,19 @@ def _solve(config: Configuration, rows: UnitingEquations, free: Bools) -> list[G
     for k in range(count):
         which = np.flatnonzero(label == k)
         terms = np.flatnonzero(label[rows.row] == k)
-        # the group's own columns
         columns, at = np.unique(np.concatenate([place[which], place[m + terms]]), return_inverse=True)
-        at_row = np.searchsorted(which, rows.row[terms])
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
-        np.add.at(A, (at_row, at[len(which) :]), -rows.coefficients[terms])
+        np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
         groups.append(_eliminate(A, -rows.gap[which], at[: len(which)], movable[columns], node[columns], which))
     return groups
 
 
 def _cannot_eliminate(equations: UnitingEquations, free: Bools) -> Bools:
     """Active equations that cannot eliminate a component of their own node each ``(m,)``."""
-    which = np.flatnonzero(equations.active)
     unable = np.zeros(len(equations), dtype=bool)
-    order = which[np.argsort(equations.node[which], kind="stable")]
-    _, first, counts = np.unique(equations.node[order], return_index=True, return_counts=True)
-    for k in np.unique(counts):
-        rows = order[first[counts == k][:, None] + np.arange(k)]
-        A = equations.direction[rows] * free[equations.node[rows]]
-        if k > A.shape[2]:
-            unable[rows] = True
-        else:
-            unable[rows] = (np.linalg.svd(A, compute_uv=False)[:, -1] < MOSTLY_PRESCRIBED)[:, None]
+    for nodes, rows in equations.by_node():
+        unable[rows] = (least_left(equations.direction[rows] * free[nodes, None, :]) < MOSTLY_PRESCRIBED)[:, None]
     return unable
 
 
@@ -180,13 +162,8 @@ def _with_neighbours(config: Configuration, equations: UnitingEquations, conflic
 def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: Ints) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
-    Args:
-        A: ``(m, n_nodes, gdim)``; every node has its own block of columns.
-        h: ``(m,)``.
-        own: column of each equation's contactor ``(m,)``.
-        free: ``(n_nodes, gdim)``.
-        node: global numbers ``(n_nodes,)``.
-        given: which of the conflicting equations they are ``(m,)``.
+    In ``A (m, n_nodes, gdim)`` and ``free (n_nodes, gdim)`` each of the global nodes ``node (n_nodes,)`` has its block of columns,
+    ``own (m,)`` that of each equation's contactor; ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
@@ -195,8 +172,8 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: In
     start = np.maximum(np.linalg.norm(movable, axis=1), MOSTLY_PRESCRIBED * np.linalg.norm(A.reshape(m, -1), axis=1))
     order: list[int] = []
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
-    size = np.linalg.norm(A * free, axis=2)
     while rest.any():
+        size = np.linalg.norm(A * free, axis=2)
         size[np.arange(m), own] *= OWN_FIRST
         i, t = np.unravel_index(np.argmax(np.where(rest[:, None], size, -1.0)), size.shape)
         if size[i, t] <= DEPENDENT * start[i]:
@@ -212,13 +189,11 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: In
         pivot[i], direction[i] = t, d
         rest[i] = False
         order.append(int(i))
-        size = np.linalg.norm(A * free, axis=2)
     k = np.array(order, dtype=np.int64)
-    solved = (A[k] * free).reshape(len(k), -1)
     shares: Array = np.zeros((m, 0))
     if len(k):
-        shares = np.asarray(np.linalg.lstsq(movable.T, solved.T, rcond=None)[0])
-    terms = A[k].copy()
+        shares = np.asarray(np.linalg.lstsq(movable.T, (A[k] * free).reshape(len(k), -1).T, rcond=None)[0])
+    terms = A[k]
     # what is left of the pivot's own block is across the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot[k]] -= direction[k]
     row, column = np.nonzero((np.abs(terms) > NEGLIGIBLE).any(axis=2))

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,13 +52,7 @@ class UnitingEquations:
     def along(node: Indices, direction: Array, targets: Ints, weights: Array, gap: Array, active: Bools) -> UnitingEquations:
         """Equations whose terms all have one direction: ``direction . (du_node - sum_a weights_a du_a) = -gap``.
 
-        Args:
-            node: ``(m,)``.
-            direction: ``(m, gdim)``.
-            targets: global block numbers of the nodes followed ``(m, nn)``, -1 for none.
-            weights: ``(m, nn)``.
-            gap: ``(m,)``.
-            active: ``(m,)``.
+        ``targets (m, nn)`` are the global block numbers of the nodes followed, -1 for none, with ``weights (m, nn)``.
         """
         row, a = np.nonzero(targets >= 0)
         coefficients = weights[row, a][:, None] * direction[row]
@@ -71,26 +67,27 @@ class UnitingEquations:
                 np.zeros(0, bool),
             )  # fmt: skip
         first = np.cumsum([0, *(len(p) for p in parts)])
-        return UnitingEquations(
-            np.concatenate([p.node for p in parts]),
-            np.concatenate([p.direction for p in parts]),
-            np.concatenate([p.gap for p in parts]),
-            np.concatenate([p.active for p in parts]),
-            np.concatenate([p.row + f for p, f in zip(parts, first)]),
-            np.concatenate([p.followed for p in parts]),
-            np.concatenate([p.coefficients for p in parts]),
-        )
+        parts = [replace(p, row=p.row + f) for p, f in zip(parts, first)]
+        return UnitingEquations(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(UnitingEquations)))
 
     def select(self, which: Bools) -> UnitingEquations:
         """Some of the equations, in their order ``(m,)``."""
-        place = np.cumsum(which) - 1
-        terms = which[self.row]
-        return UnitingEquations(
-            self.node[which],
-            self.direction[which],
-            self.gap[which],
-            self.active[which],
-            place[self.row[terms]].astype(np.int64),
-            self.followed[terms],
-            self.coefficients[terms],
-        )
+        place, terms = np.cumsum(which) - 1, which[self.row]
+        kept: list[Any] = [v[which] for v in (self.node, self.direction, self.gap, self.active)]
+        kept += [place[self.row[terms]].astype(np.int64), self.followed[terms], self.coefficients[terms]]
+        return UnitingEquations(*kept)
+
+    def by_node(self) -> Iterator[tuple[Indices, Ints]]:
+        """Nodes ``(n,)`` with k active equations each, and these equations ``(n, k)``, for every k."""
+        which = np.flatnonzero(self.active)
+        order = which[np.argsort(self.node[which], kind="stable")]
+        nodes, first, counts = np.unique(self.node[order], return_index=True, return_counts=True)
+        for k in np.unique(counts):
+            yield nodes[counts == k], order[first[counts == k][:, None] + np.arange(k)]
+
+
+def least_left(A: Array) -> Array:
+    """What nodes have left to eliminate by k equations each with directions ``A (n, k, gdim)``, the least singular value ``(n,)``."""
+    if A.shape[1] > A.shape[2]:
+        return np.zeros(len(A))
+    return np.asarray(np.linalg.svd(A, compute_uv=False)[:, -1])

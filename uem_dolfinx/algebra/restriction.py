@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -62,7 +62,8 @@ class Restriction:
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
         self.d = self._vector(closure)
-        self.M: Any = self._coupling() if self._n_rows else None
+        #: Rows of the eliminated nodes, columns of the nodes they follow.
+        self.M: Any = self._matrix(*self._coupling_entries) if self._n_rows else None
         #: Number of terms with M in the series of P and c.
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
@@ -78,35 +79,26 @@ class Restriction:
         g, eq = self.config.gdim, self.equations
         frames = self.free[self.nodes, None, :] * np.eye(g)
         lift = np.zeros_like(eq.direction)
-        which = np.flatnonzero(eq.active)
-        order = which[np.argsort(eq.node[which], kind="stable")]
-        nodes, first, counts = np.unique(eq.node[order], return_index=True, return_counts=True)
         error = None
-        for k in np.unique(counts):
-            at = nodes[counts == k]
-            rows = order[first[counts == k][:, None] + np.arange(k)]
+        for at, rows in eq.by_node():
             A = eq.direction[rows] * self.free[at, None, :]
-            if k > g or (np.linalg.svd(A, compute_uv=False)[:, -1] < MOSTLY_PRESCRIBED).any():
-                error = error or self._conflict(at, A)
+            left = least_left(A)
+            if (left < MOSTLY_PRESCRIBED).any():
+                error = error or self._conflict(int(at[np.argmin(left)]), rows.shape[1])
                 continue
-            pinv = np.linalg.pinv(A)
+            pinv: Array = np.asarray(np.linalg.pinv(A))
             lift[rows] = pinv.transpose(0, 2, 1)
             frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
         agree(self.comm, error)
         return frames, lift
 
-    def _conflict(self, nodes: Indices, A: Array) -> ConflictError:
-        bad = 0 if A.shape[1] > A.shape[2] else int(np.argmin(np.linalg.svd(A, compute_uv=False)[:, -1]))
-        fixed = [c for c, f in zip("xyz", self.free[nodes[bad]]) if not f]
+    def _conflict(self, node: int, n_equations: int) -> ConflictError:
+        fixed = [c for c, f in zip("xyz", self.free[node]) if not f]
         return ConflictError(
-            f"the contactor at {self.config.describe(int(nodes[bad]))} has {A.shape[1]} uniting equation(s) but its displacement "
+            f"the contactor at {self.config.describe(node)} has {n_equations} uniting equation(s) but its displacement "
             f"in {', '.join(fixed) or 'no direction'} is prescribed, so nothing is left to eliminate: release the Dirichlet "
             "condition there, or make the other surface the contactor"
         )
-
-    def _coupling(self) -> PETSc.Mat:
-        """M: rows of the eliminated nodes, columns of the nodes they follow."""
-        return self._matrix(*self._coupling_entries)
 
     def _matrix(self, rows: Ints, columns: Ints, values: Array) -> PETSc.Mat:
         """Matrix from sorted local rows, global columns and values."""
@@ -135,12 +127,7 @@ class Restriction:
         return self._matrix(*_sum_duplicates(rows.ravel().astype(np.int64), columns.ravel().astype(np.int64), blocks.ravel()))
 
     def _longest_chain(self) -> int:
-        """How many equations follow one another from node to node.
-
-        Raises:
-            ConflictError: if they never end.
-        """
-        assert self.M is not None
+        """How many equations follow one another from node to node (collective); raises ConflictError if they never end."""
         path = self.M.matMult(self._eliminated)
         indptr, columns, values = path.getValuesCSR()
         # an equation may follow what is left free of an eliminated node
@@ -268,34 +255,24 @@ def _frames(A: Array, pinv: Array, free: Bools) -> Array:
     A single direction is reflected onto the nearest axis (Householder), so that the frame stays close to the axes and the
     two tangential unknowns keep the places of the components they resemble.
 
-    Args:
-        A: directions in the free components ``(k, r, g)``.
-        pinv: their pseudo-inverses ``(k, g, r)``.
-        free: free components ``(k, g)``.
+    ``A (k, r, g)`` are directions in the free components ``free (k, g)``, and ``pinv (k, g, r)`` their pseudo-inverses.
     """
     k, r, g = A.shape
-    eye = np.eye(g)
-    n_free = free.sum(axis=1)
-    left = n_free - r
-    blocks = np.zeros((k, g, g))
-    axis = np.zeros((k, g))
+    left = free.sum(axis=1) - r
+    blocks, axis = np.zeros((k, g, g)), np.zeros((k, g))
     if r == 1:
         single = left > 0
         axis[single] = A[single, 0] / np.linalg.norm(A[single, 0], axis=1, keepdims=True)
     else:
         # the one direction left, from the projector onto the null space
         single = left == 1
-        null = free[single, None, :] * eye - pinv[single] @ A[single]
+        null = free[single, None, :] * np.eye(g) - pinv[single] @ A[single]
         column = np.argmax(np.einsum("kgg->kg", null), axis=1)
         t = null[np.arange(len(column)), :, column]
         axis[single] = t / np.linalg.norm(t, axis=1, keepdims=True)
     H, main = _reflection(axis[single])
-    keep = free[single].copy()
-    if r == 1:
-        keep[np.arange(len(main)), main] = False
-    else:
-        keep = np.arange(g)[None, :] == main[:, None]
-    blocks[single] = H * keep[:, None, :]
+    nearest = np.arange(g) == main[:, None]
+    blocks[single] = H * (free[single] & ~nearest if r == 1 else nearest)[:, None, :]
     return blocks
 
 
