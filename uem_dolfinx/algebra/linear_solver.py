@@ -52,12 +52,9 @@ def has_mumps() -> bool:
 
 def default_options(size: int, gdim: int) -> dict[str, Any]:
     """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG."""
-    if size <= DIRECT_UP_TO[gdim]:
-        options = {"ksp_type": "preonly", "pc_type": "lu"}
-        if has_mumps():
-            options["pc_factor_mat_solver_type"] = "mumps"
-        return options
-    return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
+    if size > DIRECT_UP_TO[gdim]:
+        return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
+    return {"ksp_type": "preonly", "pc_type": "lu"} | ({"pc_factor_mat_solver_type": "mumps"} if has_mumps() else {})
 
 
 def multigrid_options(amg: str = "") -> dict[str, Any]:
@@ -69,21 +66,13 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     if amg == "gamg":
         return {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
     boomeramg = {
-        "strong_threshold": 0.15,
-        "coarsen_type": "HMIS",
-        "interp_type": "ext+i",
-        "P_max": 4,
-        "relax_type_all": "Chebyshev",
-    }
+        "strong_threshold": 0.15, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4, "relax_type_all": "Chebyshev",
+    }  # fmt: skip
     return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
 
 
 def check_options(options: dict[str, Any]) -> None:
-    """Refuse options that ask for a library PETSc was built without.
-
-    Raises:
-        MissingBackendError: naming the option.
-    """
+    """Raise MissingBackendError, naming the option, where one asks for a library PETSc was built without."""
     for key, value in options.items():
         for name, there in (("hypre", has_hypre), ("mumps", has_mumps)):
             if str(value).lower() == name and not there():
@@ -96,11 +85,8 @@ def check_options(options: dict[str, Any]) -> None:
 class UnitedSolver:
     """KSP for ``P'KP dq = P'(r - K c)``.
 
-    Args:
-        config: configuration of the displacement.
-        prefix: PETSc options prefix.
-        options: PETSc options without prefix; None chooses by size. Without ``ksp_rtol`` every solve is as accurate as its Newton
-            iteration can use.
+    PETSc's ``options`` are given without their ``prefix``; None chooses by size. Without ``ksp_rtol`` every solve is as accurate as
+    its Newton iteration can use.
     """
 
     def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
@@ -164,15 +150,12 @@ class UnitedSolver:
     ) -> None:
         """Build ``Q'(K + curvature)P`` and give it to the KSP (collective).
 
-        Args:
-            restriction: of the current uniting equations: P.
-            K: tangent matrix without boundary conditions.
-            curvature: second derivatives of the gaps times contact forces, or None.
-            test: Q; None, or the same object, is P, and the matrix is symmetric.
+        ``restriction`` is P, of the current uniting equations, ``test`` is Q: if None, or the same object, P, and the matrix is
+        symmetric. ``K`` is the tangent matrix without boundary conditions, ``curvature`` second derivatives of gaps times forces.
         """
-        unsymmetric = test is not None and test is not restriction
-        self._adapt(not unsymmetric)
-        if test is not None and unsymmetric:
+        test = test or restriction
+        self._adapt(test is restriction)
+        if test is not restriction:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
                 self.set_operator(restriction, K, curvature)
@@ -202,10 +185,7 @@ class UnitedSolver:
                 fits = pattern.DIFFERENT_NONZERO_PATTERN if alone else pattern.SUBSET_NONZERO_PATTERN
                 self.A.axpy(1.0, curvature.PtAP(restriction.P), fits)
                 key = None if alone else key
-            diagonal, stiffness = self.A.getDiagonal(), K.getDiagonal()
-            idle = ~restriction.used.ravel()
-            diagonal.array[idle] = stiffness.array_r[idle]
-            self.A.setDiagonal(diagonal)
+            _stiffen_idle(self.A, K, restriction)
         self._keep_preconditioner(restriction.equations)
         self._key = key
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -240,10 +220,7 @@ class UnitedSolver:
             if curvature is not None:
                 G.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             A = Q.P.transposeMatMult(G.matMult(P.P))
-            diagonal, stiffness = A.getDiagonal(), K.getDiagonal()
-            idle = ~P.used.ravel()
-            diagonal.array[idle] = stiffness.array_r[idle]
-            A.setDiagonal(diagonal)
+            _stiffen_idle(A, K, P)
         if self.iterative:
             self.ksp.setOperators(A, self.A)
             return
@@ -289,14 +266,9 @@ class UnitedSolver:
         return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0) -> tuple[PETSc.Vec, int]:
-        """Solve for dq (collective).
+        """Solve for dq, and the number of linear iterations (collective).
 
-        Args:
-            rhs: right-hand side.
-            accuracy: part of it that may be left by an iterative solver whose options do not fix its ``ksp_rtol``.
-
-        Returns:
-            dq and the number of linear iterations.
+        An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side.
 
         Raises:
             LinearSolveError: with PETSc's reason.
@@ -329,6 +301,13 @@ class UnitedSolver:
         self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
         self._first_pace = self._first_pace or self._pace
         return dq, iterations
+
+
+def _stiffen_idle(A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> None:
+    """Give A the diagonal of K where columns of P are idle (collective)."""
+    diagonal, idle = A.getDiagonal(), ~P.used.ravel()
+    diagonal.array[idle] = K.getDiagonal().array_r[idle]
+    A.setDiagonal(diagonal)
 
 
 def rigid_body_modes(config: Configuration) -> list[Array]:
