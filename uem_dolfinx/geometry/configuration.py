@@ -19,11 +19,8 @@ from uem_dolfinx.parallel import Exchange
 class Configuration:
     """Nodes of a vector Lagrange space and where they are now: ``x = X + u``.
 
-    Args:
-        u: displacement, in a blocked Lagrange space with one component per coordinate.
-
     Raises:
-        SpaceError: if ``u`` is not such a displacement.
+        SpaceError: if ``u`` is not in a blocked Lagrange space of degree 1 or 2 with one component per coordinate.
     """
 
     def __init__(self, u: fem.Function):

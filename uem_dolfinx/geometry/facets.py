@@ -13,7 +13,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, unit_normals
+from uem_dolfinx.geometry.shapes import FacetShape, area_vectors, facet_shape, unit_normals
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import agree, count_keys
 
@@ -22,25 +22,15 @@ FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": 
 
 @dataclass(frozen=True)
 class FacetData:
-    """Target facets of one rank in the current configuration.
+    """Target facets of one rank now: their nodes' positions, global block numbers and averaged outward unit normals."""
 
-    Attributes:
-        x: node positions ``(m, nn, gdim)``.
-        nodes: global block numbers ``(m, nn)``.
-        nodal_normals: averaged outward normals at the nodes ``(m, nn, gdim)``.
-    """
-
-    x: Array
-    nodes: Ints
-    nodal_normals: Array
+    x: Array  # (m, nn, gdim)
+    nodes: Ints  # (m, nn)
+    nodal_normals: Array  # (m, nn, gdim)
 
 
 class TargetFacets:
-    """Facets of a target surface that this rank holds, oriented outwards.
-
-    Args:
-        config: configuration of the displacement.
-        tag: the target's facets.
+    """Facets of a target surface that this rank holds, oriented outwards (collective).
 
     Raises:
         OrientationError: if a facet lies between two cells, so that outward has no meaning.
@@ -48,8 +38,7 @@ class TargetFacets:
 
     def __init__(self, config: Configuration, tag: Tag):
         self.config, self.tag = config, tag
-        mesh, tdim = config.mesh, config.tdim
-        fdim = tdim - 1
+        mesh, tdim, fdim = config.mesh, config.tdim, config.tdim - 1
         mesh.topology.create_connectivity(fdim, tdim)
         mesh.topology.create_connectivity(tdim, fdim)
         f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
@@ -58,8 +47,7 @@ class TargetFacets:
         self.cells, self.sides = np.array(sides, dtype=np.int32).reshape(-1, 2).T
         self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
         cell_dofs = compat.cell_dofs(config.V)
-        table = _facet_closure(config, self.shape)
-        self.dofs = cell_dofs[self.cells[:, None], table[self.sides]]
+        self.dofs = cell_dofs[self.cells[:, None], _facet_closure(config, self.shape)[self.sides]]
         self.nodes = config.to_global(self.dofs)
         self._refuse_inner()
         self._orient(cell_dofs)
@@ -74,10 +62,8 @@ class TargetFacets:
 
     def _orient(self, cell_dofs: Indices) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
-        X = self.config.X
-        middle = np.tile(self.shape.middle, (len(self.dofs), 1))
-        tab = self.shape.tabulate(middle)
-        x = X[self.dofs]
+        X, x = self.config.X, self.config.X[self.dofs]
+        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
         inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
         height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
         self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
@@ -106,12 +92,9 @@ class TargetFacets:
 
     def _open_nodes(self) -> npt.NDArray[np.bool_]:
         """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""
-        mark = fem.Function(self.config.V)
-        marks = mark.x.array.reshape(-1, self.config.gdim)
-        for s, (_, nodes, _, _) in enumerate(self.shape.edges()):
-            marks[self.dofs[self.open_sides[:, s]][:, nodes].ravel()] = 1.0
-        forms.sum_ghosts(mark)
-        return marks[self.dofs, 0] > 0
+        sides = enumerate(self.shape.edges())
+        dofs = np.concatenate([self.dofs[self.open_sides[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
+        return self.config.to_owners(dofs, np.ones(len(dofs)))[self.dofs] > 0
 
     @cached_property
     def _normal_field(self) -> fem.Function:
@@ -129,20 +112,13 @@ class TargetFacets:
         field = self._normal_field
         field.x.array[:] = 0.0
         nodal = field.x.array.reshape(-1, gdim)
-        for a in range(self.dofs.shape[1]):
-            np.add.at(nodal, self.dofs[:, a], self._area_vector(x, a))
+        for a, xi in enumerate(self.shape.nodes):
+            tab = self.shape.tabulate(np.tile(xi, (len(x), 1)))
+            np.add.at(nodal, self.dofs[:, a], self.sign[:, None] * area_vectors(tab, x))
         forms.sum_ghosts(field)
         normals = nodal[self.dofs]
         length = np.linalg.norm(normals, axis=2, keepdims=True)
         return FacetData(x, self.nodes, normals / np.where(length > 0, length, 1.0))
-
-    def _area_vector(self, x: Array, node: int) -> Array:
-        """Outward normal of each facet at one of its nodes, weighted by the facet's size ``(m, gdim)``."""
-        xi = np.tile(self.shape.nodes[node], (len(x), 1))
-        tab = self.shape.tabulate(xi)
-        t = np.einsum("naf,nag->nfg", tab.dN, x)
-        n = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
-        return self.sign[:, None] * n
 
 
 def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
@@ -154,8 +130,7 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
         row: list[int] = []
         for dim, entities in enumerate(shape.topology):
             for local in entities:
-                wanted = sorted(vertices[v] for v in local)
-                i = [sorted(e) for e in topology[dim]].index(wanted)
+                i = [sorted(e) for e in topology[dim]].index(sorted(vertices[v] for v in local))
                 row += list(layout.entity_dofs(dim, i))
         rows.append(row)
     return np.array(rows, dtype=np.int32)

@@ -9,7 +9,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.geometry.shapes import FacetShape
 
 
 class Projection(Protocol):
@@ -61,9 +60,6 @@ class Target(Protocol):
         n_nodes: that a contactor follows; 0 if the target is rigid.
         stride: how far a contactor may move past it unseen, a length.
         averaged: whether normals are averaged at nodes and interpolated, so that they lean from the facets'.
-        faceted: whether normals jump from facet to facet.
-        dofs: local nodes of this rank's facets ``(m, nn)``.
-        keys: what tells each of these facets in any partition ``(m,)``.
     """
 
     n_nodes: int
@@ -72,15 +68,15 @@ class Target(Protocol):
 
     @property
     def faceted(self) -> bool:
-        """See above."""
+        """Whether normals jump from facet to facet."""
 
     @property
     def dofs(self) -> Indices:
-        """See above."""
+        """Local nodes of this rank's facets ``(m, nn)``."""
 
     @property
     def keys(self) -> Ints:
-        """See above."""
+        """What tells each of this rank's facets in any partition ``(m,)``."""
 
     def project(self, points: Array) -> Projection:
         """Closest points in the current configuration (collective)."""
@@ -147,16 +143,6 @@ class FacetProjection:
         for name, value in values.items():
             updates[name][which] = value
         return replace(self, **updates)
-
-    def continued(self, which: Ints, shape: FacetShape) -> FacetProjection:
-        """Copy in which some facets are continued past the target's open end, as far as their points lie beyond it."""
-        t = np.einsum("kaf,kag->kfg", self.dN[which], self.x[which])
-        m = np.einsum("kfg,keg->kfe", t, t)
-        step = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, self.beyond[which])[..., None])[..., 0]
-        xi = self.xi[which] + step
-        tab = shape.tabulate(xi)
-        foot = np.einsum("ka,kag->kg", tab.N, self.x[which])
-        return self.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).

@@ -33,24 +33,19 @@ EQUALLY_NEAR = 1e-9
 
 
 class MeshTarget:
-    """Target whose facets are spread over the ranks.
-
-    Args:
-        facets: the target's facets.
-        averaged: use nodal normals interpolated over the facet instead of the facet's own.
-    """
+    """Target whose facets are spread over the ranks; if averaged, normals are interpolated from nodes, not the facets' own."""
 
     def __init__(self, facets: TargetFacets, averaged: bool = False):
         self.facets, self.averaged = facets, averaged
         self.shape: FacetShape = facets.shape
         self.comm: MPI.Comm = facets.config.comm
+        self.dofs: Indices = facets.dofs
         self.n_nodes = facets.dofs.shape[1]
         corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
         # half of what the thinnest body of one cell, or its shortest facet, measures
-        self.stride = 0.5 * self.comm.allreduce(
-            float(min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))), op=MPI.MIN
-        )
+        shortest = min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))
+        self.stride = 0.5 * self.comm.allreduce(float(shortest), op=MPI.MIN)
         self.first: Ints = np.cumsum([0, *self.comm.allgather(len(facets.dofs))])
 
     def project(self, points: Array) -> FacetProjection:
@@ -82,18 +77,19 @@ class MeshTarget:
         return not self.averaged
 
     @property
-    def dofs(self) -> Indices:
-        """Local nodes of this rank's facets ``(m, nn)``."""
-        return self.facets.dofs
-
-    @property
     def keys(self) -> Ints:
         """What tells each of this rank's facets in any partition ``(m,)``."""
         return self.facets.keys
 
     def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
         """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
-        return projection.continued(which, self.shape)
+        p, x = projection, projection.x[which]
+        t = np.einsum("kaf,kag->kfg", p.dN[which], x)
+        m = np.einsum("kfg,keg->kfe", t, t)
+        xi = p.xi[which] + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, p.beyond[which])[..., None])[..., 0]
+        tab = self.shape.tabulate(xi)
+        foot = np.einsum("ka,kag->kg", tab.N, x)
+        return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     def chords(self, projection: FacetProjection) -> Array:
         """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
@@ -105,7 +101,7 @@ class MeshTarget:
 
     def outward(self, projection: FacetProjection) -> Array:
         """The facets' own outward normals at the feet, also where ``normal`` is an averaged one ``(n, gdim)``."""
-        own = _unit_normals_of(projection)
+        own = unit_normals(Tabulated(projection.weights, projection.dN, projection.ddN), projection.x)
         return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
 
     def keys_of(self, facet: Ints) -> Ints:
@@ -150,14 +146,9 @@ class MeshTarget:
         return near, far
 
     def _ask(
-        self,
-        exchange: Exchange,
-        data: FacetData,
-        points: Array,
-        facet: Ints | None = None,
-        xi: Array | None = None,
+        self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
         found: FacetProjection | None = None,
-    ) -> FacetProjection:
+    ) -> FacetProjection:  # fmt: skip
         """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
         p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
         if rest:
@@ -205,7 +196,8 @@ class MeshTarget:
         facet_normal = unit_normals(tab, x) * self.facets.sign[facet, None]
         raw = np.einsum("na,nag->ng", tab.N, data.nodal_normals[facet])
         length = np.linalg.norm(raw, axis=1, keepdims=True)
-        averaged_normal = raw / np.where(length > 0, length, 1.0)
+        divisor = np.where(length > 0, length, 1.0)
+        averaged_normal = raw / divisor
         on_side = self.shape.side_distances(xi) < ON_SIDE
         is_open = self.facets.open_sides[facet]
         away = points - foot
@@ -214,7 +206,7 @@ class MeshTarget:
         use_average = np.full(len(points), True) if self.averaged else at_side & (on_side & ~is_open).any(axis=1)
         use_average &= length[:, 0] > 0
         normal = np.where(use_average[:, None], averaged_normal, facet_normal)
-        bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / np.where(length > 0, length, 1.0)[:, :, None]
+        bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / divisor[:, :, None]
         bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
         bend[~use_average] = 0.0
         # along an averaged normal, which leans, the way to the facet is longer than to its closest point
@@ -224,20 +216,9 @@ class MeshTarget:
         # a facet may touch the surface's end with a vertex alone
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
         beyond[~at_end] = 0.0
+        number = facet + self.first[self.comm.rank]
         return FacetProjection(
-            gap,
-            normal,
-            data.nodes[facet],
-            tab.N,
-            facet + self.first[self.comm.rank],
-            beyond,
-            xi,
-            foot,
-            averaged_normal,
-            x,
-            tab.dN,
-            tab.ddN,
-            bend,
+            gap, normal, data.nodes[facet], tab.N, number, beyond, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
         )
 
 
@@ -256,24 +237,13 @@ def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints
     return order[first]
 
 
-def _unit_normals_of(p: FacetProjection) -> Array:
-    return unit_normals(Tabulated(p.weights, p.dN, p.ddN), p.x)
-
-
 @timed("search")
 def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
-    """All pairs (point, facet) that can be closest, from trees over the facets' middles, one per size class.
+    """Indices ``(k,)`` of points and of facets that can be closest, from trees over the facets' middles, one per size class.
 
     A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
-    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere.
-
-    Args:
-        shape: kind of the facets.
-        x: facet nodes ``(m, nn, gdim)``.
-        points: ``(n, gdim)``.
-
-    Returns:
-        Indices of points and of facets, both ``(k,)``; every point occurs at least once if there are facets.
+    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
+    ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``.
     """
     if len(points) == 0 or len(x) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -285,14 +255,12 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
     radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
     normal = unit_normals(tab, x)
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
-    bound, _ = cKDTree(middle).query(points)
-    bound = bound * (1 + EQUALLY_NEAR)
+    bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
     size_class = np.floor(np.log2(radius / radius.max()))
     pairs, facets = [], []
     for c in np.unique(size_class):
         members = np.flatnonzero(size_class == c)
-        within = bound + radius[members].max()
-        hits = cKDTree(middle[members]).query_ball_point(points, within, return_sorted=False)
+        hits = cKDTree(middle[members]).query_ball_point(points, bound + radius[members].max(), return_sorted=False)
         counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
         pairs.append(np.repeat(np.arange(len(points)), counts))
         facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])

@@ -18,26 +18,15 @@ from uem_dolfinx.forms import create_lagrange_element, reference_topology
 
 @dataclass(frozen=True)
 class Tabulated:
-    """Shape functions and derivatives at one point of each facet.
+    """Shape functions and their first and second derivatives at one point of each facet."""
 
-    Attributes:
-        N: values ``(n, nn)``.
-        dN: first derivatives ``(n, nn, fdim)``.
-        ddN: second derivatives ``(n, nn, fdim, fdim)``.
-    """
-
-    N: Array
-    dN: Array
-    ddN: Array
+    N: Array  # (n, nn)
+    dN: Array  # (n, nn, fdim)
+    ddN: Array  # (n, nn, fdim, fdim)
 
 
 class FacetShape:
-    """Lagrange facet of one kind.
-
-    Args:
-        cell: ``"point"``, ``"interval"``, ``"triangle"`` or ``"quadrilateral"``.
-        degree: polynomial degree.
-    """
+    """Lagrange facet of one degree: a ``"point"``, an ``"interval"``, a ``"triangle"`` or a ``"quadrilateral"``."""
 
     def __init__(self, cell: str, degree: int):
         self.cell, self.degree = cell, degree
@@ -46,7 +35,7 @@ class FacetShape:
         self._element = create_lagrange_element(cell, degree) if self.dim else None
         #: Bound of ``|sum_a N_a v_a|`` on the facet for values ``|v_a| <= 1`` at its nodes, their Lebesgue constant.
         self.lebesgue = (
-            1.0 if degree == 1 else {"point": 1.0, "interval": 5 / 4, "triangle": 5 / 3, "quadrilateral": 25 / 16}[cell]
+            {"point": 1.0, "interval": 5 / 4, "triangle": 5 / 3, "quadrilateral": 25 / 16}[cell] if degree > 1 else 1.0
         )
         # Newton is exact at once where the map is affine
         self.affine = degree == 1 and cell in ("point", "interval", "triangle")
@@ -90,9 +79,8 @@ class FacetShape:
 
     def contains(self, xi: Array) -> npt.NDArray[np.bool_]:
         """Which ``xi (n, fdim)`` lie in the closed reference facet."""
-        inside = (xi >= 0).all(axis=1)
         below = xi.sum(axis=1) <= 1 if self.cell == "triangle" else (xi <= 1).all(axis=1)
-        return np.asarray(inside & below)
+        return np.asarray((xi >= 0).all(axis=1) & below)
 
     def side_distances(self, xi: Array) -> Array:
         """How far ``xi (n, fdim)`` is inside each side, in reference units ``(n, n_sides)``."""
@@ -106,14 +94,13 @@ class FacetShape:
         """Boundary of the facet: per side its shape, its nodes in the facet, and the map ``xi = o + s @ D``."""
         if self.dim == 0:
             return []
-        corners = _reference_vertices(self.cell)
+        corners = facet_shape(self.cell, 1).nodes
         sides = []
         for i, vertices in enumerate(self.topology[self.dim - 1]):
             shape = facet_shape("point" if self.dim == 1 else "interval", self.degree)
             inner = [] if self.dim == 1 or self.degree == 1 else [len(self.topology[0]) + i]
             o = corners[vertices[0]]
-            D = corners[vertices[1:]] - o if self.dim == 2 else np.zeros((0, self.dim))
-            sides.append((shape, np.array([*vertices, *inner], dtype=np.int32), o, D))
+            sides.append((shape, np.array([*vertices, *inner], dtype=np.int32), o, corners[vertices[1:]] - o))
         return sides
 
 
@@ -123,40 +110,28 @@ def facet_shape(cell: str, degree: int) -> FacetShape:
     return FacetShape(cell, degree)
 
 
-def _reference_vertices(cell: str) -> Array:
-    return {
-        "interval": np.array([[0.0], [1.0]]),
-        "triangle": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
-        "quadrilateral": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]),
-    }[cell]
-
-
 def tangents(tab: Tabulated, x: Array) -> Array:
     """Covariant tangents ``(n, fdim, gdim)`` of facets with nodes ``x (n, nn, gdim)``."""
     return np.einsum("naf,nag->nfg", tab.dN, x)
 
 
+def area_vectors(tab: Tabulated, x: Array) -> Array:
+    """Normals ``(n, gdim)`` in the sense of the facet's own parametrisation, as long as the facet is large."""
+    t = tangents(tab, x)
+    return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+
+
 def unit_normals(tab: Tabulated, x: Array) -> Array:
     """Unit normals ``(n, gdim)`` in the sense of the facet's own parametrisation."""
-    t = tangents(tab, x)
-    n = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+    n = area_vectors(tab, x)
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
 def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -> tuple[Array, Array]:
-    """Exact closest point of facet i to point i.
+    """Exact closest points of facets ``x (n, nn, gdim)`` to ``p (n, gdim)``: coordinates ``xi (n, fdim)``, squared distances ``(n,)``.
 
-    The stationary point inside the facet is compared with the closest points of its sides (recursively, down to
-    the vertices); the nearest wins.
-
-    Args:
-        shape: kind of all the facets.
-        x: facet nodes ``(n, nn, gdim)``.
-        p: points ``(n, gdim)``.
-        iterations: bound on the Newton iterations of a curved facet.
-
-    Returns:
-        Reference coordinates ``xi (n, fdim)`` and squared distances ``(n,)``.
+    The stationary point inside the facet, found in at most so many Newton ``iterations``, is compared with the closest points of
+    its sides (recursively, down to the vertices); the nearest wins.
     """
     if shape.dim == 0:
         return np.zeros((len(p), 0)), np.einsum("ng,ng->n", p - x[:, 0], p - x[:, 0])
@@ -172,9 +147,7 @@ def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -
 
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
     """Newton on ``(p - y) . y,alpha = 0``; infinitely far where it ends outside the facet."""
-    xi = _nearest_sample(shape, x, p)
-    d2 = np.full(len(p), np.inf)
-    todo = np.arange(len(p))
+    xi, d2, todo = _nearest_sample(shape, x, p), np.full(len(p), np.inf), np.arange(len(p))
     for _ in range(1 if shape.affine else iterations):
         if not len(todo):
             break
@@ -188,7 +161,7 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
             m = np.where(convex[:, None, None], curved, m)
         step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
         xi[todo] += step if shape.affine else _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))
-        far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1) if not shape.affine else np.zeros(len(todo), bool)
+        far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1)
         todo = todo[(np.abs(step).max(axis=1) > 1e-15) & ~far]
     inside = shape.contains(xi)
     d2[inside] = _squared_distance(shape, x[inside], p[inside], xi[inside])

@@ -38,18 +38,11 @@ def tributary_areas(config: Configuration, tag: Tag) -> Array:
 
 def followed_nodes(config: Configuration, dofs: Indices) -> npt.NDArray[np.bool_]:
     """Which local nodes ``(n_local,)`` any rank names among its local nodes ``dofs``, of any shape (collective)."""
-    mark = fem.Function(config.V)
-    mark.x.array.reshape(-1, config.gdim)[dofs.ravel()] = 1.0
-    forms.sum_ghosts(mark)
-    return mark.x.array.reshape(-1, config.gdim)[:, 0] > 0
+    return config.to_owners(dofs.ravel(), np.ones(dofs.size)) > 0
 
 
 def check_distinct(config: Configuration, contactor: Indices, target: TargetFacets, names: tuple[str, str]) -> None:
-    """Refuse a contactor that is part of its own target (collective).
-
-    Raises:
-        SurfaceError: naming the first shared node.
-    """
+    """Raise SurfaceError, naming the first shared node, if a contactor is part of its own target (collective)."""
     shared = contactor[followed_nodes(config, target.dofs)[contactor]]
     error = None
     if len(shared):
