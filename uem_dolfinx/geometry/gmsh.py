@@ -22,15 +22,9 @@ from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 
 CELLS = {
-    2: ("triangle", 1),
-    3: ("quadrilateral", 1),
-    4: ("tetrahedron", 1),
-    5: ("hexahedron", 1),
-    9: ("triangle", 2),
-    10: ("quadrilateral", 2),
-    11: ("tetrahedron", 2),
-    12: ("hexahedron", 2),
-}
+    2: ("triangle", 1), 3: ("quadrilateral", 1), 4: ("tetrahedron", 1), 5: ("hexahedron", 1),
+    9: ("triangle", 2), 10: ("quadrilateral", 2), 11: ("tetrahedron", 2), 12: ("hexahedron", 2),
+}  # fmt: skip
 """Gmsh's element types that make a body: name of the cell and degree of its geometry."""
 
 N_VERTICES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 8: 2, 9: 3, 10: 4, 11: 4, 12: 8, 15: 1}
@@ -71,7 +65,7 @@ def read_gmsh(
                 raw = _read(source, gdim, dict(parameters or {}))
             except UEMError as e:
                 error = e
-        header = None if raw is None else (raw.cell, raw.degree, raw.points.shape[1], raw.nodes_per_cell, raw.groups)
+        header = None if raw is None else (raw.cell, raw.degree, raw.points.shape[1], raw.cells.shape[1], raw.groups)
         error, header = comm.bcast((error, header), root=0)
         if error is not None:
             raise error
@@ -82,7 +76,8 @@ def read_gmsh(
         tags = [Tag(g.name, g.number, g.dim, mesh, _local_entities(mesh, g)) for g in groups]
         sizes = np.array([len(tag.entities) for tag in tags], dtype=np.int64)
         result = Tags(tags, comm.allreduce(sizes))
-    logger.info("%s: %d %s cells of degree %d, %r", _label(source), comm.allreduce(len(cells)), cell, degree, result)
+    label = source if isinstance(source, (str, Path)) else "gmsh model"
+    logger.info("%s: %d %s cells of degree %d, %r", label, comm.allreduce(len(cells)), cell, degree, result)
     # what locating d.o.f. of tags needs, and newer DOLFINx no longer builds by itself
     tdim = mesh.topology.dim
     for dim in sorted({tdim - 1, *(group.dim for group in groups)} - {tdim}):
@@ -97,12 +92,8 @@ def read_gmsh(
 class _Group:
     """A physical group as Gmsh has it.
 
-    Attributes:
-        name: physical name or None.
-        number: physical number.
-        dim: dimension.
-        rows: for the bodies, input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
-            input node index, shape ``(n, n_vertices)``.
+    Its ``rows`` are, for the bodies, the input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
+    input node index, shape ``(n, n_vertices)``.
     """
 
     name: str | None
@@ -113,30 +104,13 @@ class _Group:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A whole mesh on one rank.
-
-    Attributes:
-        cell: name of the cell.
-        degree: degree of the geometry.
-        points: coordinates, shape ``(n_nodes, gdim)``.
-        cells: node index in Gmsh's order, shape ``(n_cells, n_nodes_per_cell)``.
-        groups: the physical groups.
-    """
+    """A whole mesh on one rank: ``points (n_nodes, gdim)``, and ``cells (n_cells, n_nodes_per_cell)`` of nodes in Gmsh's order."""
 
     cell: str
     degree: int
     points: npt.NDArray[np.float64]
     cells: npt.NDArray[np.int64]
     groups: list[_Group]
-
-    @property
-    def nodes_per_cell(self) -> int:
-        """Number of nodes of a cell."""
-        return int(self.cells.shape[1])
-
-
-def _label(source: Any) -> str:
-    return str(source) if isinstance(source, (str, Path)) else "gmsh model"
 
 
 def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
@@ -170,9 +144,7 @@ def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> _RawMe
 
 def _constants(path: Path) -> list[str]:
     """Names that DefineConstant declares in a .geo file and the files it includes."""
-    text = path.read_text(errors="replace")
-    text = re.sub(r"/\*.*?\*/", "", text, flags=re.S)
-    text = re.sub(r"//[^\n]*", "", text)
+    text = re.sub(r"//[^\n]*", "", re.sub(r"/\*.*?\*/", "", path.read_text(errors="replace"), flags=re.S))
     names: list[str] = []
     for block in re.findall(r"DefineConstant\s*\[(.*?)\]\s*;", text, flags=re.S):
         block = re.sub(r'"[^"]*"', "", block)
@@ -180,9 +152,8 @@ def _constants(path: Path) -> list[str]:
             block = inner
         names += re.findall(r"(\w+)\s*=", block) or re.findall(r"\w+", block)
     for included in re.findall(r'Include\s+"([^"]+)"', text):
-        inner_path = path.parent / included
-        if inner_path.is_file():
-            names += _constants(inner_path)
+        if (path.parent / included).is_file():
+            names += _constants(path.parent / included)
     return list(dict.fromkeys(names))
 
 
@@ -295,10 +266,8 @@ def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str)
     tags, x, _ = model.mesh.getNodes()
     order = np.argsort(tags)
     points = np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)]
-    if tdim == 2:
-        size = np.ptp(points[:, :2], axis=0).max()
-        if np.ptp(points[:, 2]) > FLAT * size:
-            raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
+    if tdim == 2 and np.ptp(points[:, 2]) > FLAT * np.ptp(points[:, :2], axis=0).max():
+        raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
     return np.ascontiguousarray(points[:, :tdim])
 
 
@@ -326,20 +295,12 @@ def _local_entities(mesh: Any, group: _Group) -> Indices:
         return np.empty(0, dtype=np.int32)
     near = np.flatnonzero(np.isin(nodes, group.rows)[vertices].all(axis=1))
     rows = np.sort(nodes[vertices[near]], axis=1)
-    _, number = np.unique(np.concatenate([group.rows, rows]), axis=0, return_inverse=True)
-    number = number.reshape(-1)
+    number = np.unique(np.concatenate([group.rows, rows]), axis=0, return_inverse=True)[1].reshape(-1)
     return near[np.isin(number[len(group.rows) :], number[: len(group.rows)])].astype(np.int32)
 
 
 def import_gmsh() -> Any:
-    """Import Gmsh's Python module.
-
-    Returns:
-        The module.
-
-    Raises:
-        MissingBackendError: it cannot be imported.
-    """
+    """Gmsh's Python module; raises MissingBackendError if it cannot be imported."""
     try:
         import gmsh
     except (ImportError, OSError) as error:

@@ -124,11 +124,8 @@ def name_of(part: Part) -> str:
 def as_tag(part: Part, mesh: Any, dims: Sequence[int], role: str) -> Tag:
     """The tag of what a user names a part of the mesh by, with its ghosts (collective).
 
-    Args:
-        part: a ``Tag``, which is returned as it is, or something else that ``Part`` lists.
-        mesh: the mesh.
-        dims: dimensions of entities that will do; indices are of the first.
-        role: what the part is for, in messages.
+    A ``Tag`` is returned as it is. Entities of any of the dimensions ``dims`` will do, indices are of the first; messages call the
+    part by its ``role``.
 
     Raises:
         TagError: nothing of that kind, of another dimension, out of range, or empty on all ranks.
@@ -164,8 +161,7 @@ def _read(part: Part, mesh: Any, dims: Sequence[int], role: str) -> list[Tag]:
         entities = np.asarray(meshtags.indices)[np.isin(meshtags.values, values)]
         tag, same = Tag(name_of(part), 0, meshtags.dim, mesh, entities), compat.belongs_to(meshtags, mesh)
     else:
-        tag, same = Tag(name_of(part), 0, dims[0], mesh, np.asarray(part)), True
-        local, index_map = np.ravel(tag.entities), mesh.topology.index_map(dims[0])
+        local, index_map = np.ravel(part), mesh.topology.index_map(dims[0])
         n = index_map.size_local + index_map.num_ghosts
         if local.shape != np.shape(part) or (len(local) and local.dtype.kind not in "iu"):
             raise TagError(
@@ -174,7 +170,7 @@ def _read(part: Part, mesh: Any, dims: Sequence[int], role: str) -> list[Tag]:
             )
         if len(local) and not 0 <= local.min() <= local.max() < n:
             raise TagError(f"{role} has the indices {local.min()} to {local.max()}: expected local ones, 0 to {n - 1}")
-        return [Tag(tag.name, 0, tag.dim, mesh, local.astype(np.int32))]
+        return [Tag(name_of(part), 0, dims[0], mesh, local.astype(np.int32))]
     if not same:
         raise SpaceError(f"{role} '{name_of(part)}' belongs to another mesh than the displacement: read both from one mesh")
     if tag.dim not in dims:
