@@ -16,17 +16,11 @@ from uem_dolfinx.arrays import Array, Indices, Ints
 
 @dataclass(frozen=True)
 class Motion:
-    """Rigid motion from the drawing to the present: ``x = about + Q (X - about) + translation``.
+    """Rigid motion from the drawing to the present: ``x = about + Q (X - about) + translation``."""
 
-    Attributes:
-        translation: of the point ``about`` ``(gdim,)``.
-        Q: rotation ``(gdim, gdim)``.
-        about: point of the drawing that the rotation leaves alone ``(gdim,)``.
-    """
-
-    translation: Array
-    Q: Array
-    about: Array
+    translation: Array  # (gdim,)
+    Q: Array  # (gdim, gdim)
+    about: Array  # (gdim,), a point of the drawing
 
     def carry(self, X: Array) -> Array:
         """Where points ``X (n, gdim)`` of the drawing are now."""
@@ -228,12 +222,9 @@ class RigidPlane(RigidSurface):
     def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike):
         p, n = np.asarray(point, dtype=float), _unit(normal)
         super().__init__(
-            lambda x: (x - p) @ n,
-            lambda x: np.tile(n, (len(x), 1)),
-            lambda x: np.zeros((len(x), len(n), len(n))),
-            name="rigid plane",
-            reference=p,
-        )
+            lambda x: (x - p) @ n, lambda x: np.tile(n, (len(x), 1)), lambda x: np.zeros((len(x), len(n), len(n))),
+            name="rigid plane", reference=p,
+        )  # fmt: skip
 
 
 class RigidSphere(RigidSurface):
@@ -250,21 +241,16 @@ class RigidSphere(RigidSurface):
 
         def arm(x: Array) -> tuple[Array, Array]:
             r = np.linalg.norm(x - c, axis=1)
-            e = np.where(r[:, None] > 0, (x - c) / np.where(r > 0, r, 1.0)[:, None], np.eye(len(c))[0])
-            return r, e
+            return r, np.where(r[:, None] > 0, (x - c) / np.where(r > 0, r, 1.0)[:, None], np.eye(len(c))[0])
 
         def hessian(x: Array) -> Array:
             r, e = arm(x)
             return side * (np.eye(len(c)) - e[:, :, None] * e[:, None, :]) / np.where(r > 0, r, np.inf)[:, None, None]
 
         super().__init__(
-            lambda x: side * (arm(x)[0] - radius),
-            lambda x: side * arm(x)[1],
-            hessian,
-            name="rigid sphere",
-            reference=c,
-            stride=radius,
-        )
+            lambda x: side * (arm(x)[0] - radius), lambda x: side * arm(x)[1], hessian,
+            name="rigid sphere", reference=c, stride=radius,
+        )  # fmt: skip
 
 
 class RigidCylinder(RigidSurface):
@@ -288,13 +274,9 @@ class RigidCylinder(RigidSurface):
             return across @ ball.hessian((x - p) @ across) @ across
 
         super().__init__(
-            lambda x: ball.distance((x - p) @ across),
-            lambda x: ball.gradient((x - p) @ across),
-            hessian,
-            name="rigid cylinder",
-            reference=p,
-            stride=radius,
-        )
+            lambda x: ball.distance((x - p) @ across), lambda x: ball.gradient((x - p) @ across), hessian,
+            name="rigid cylinder", reference=p, stride=radius,
+        )  # fmt: skip
 
 
 class RigidParaboloid(RigidSurface):
@@ -315,12 +297,9 @@ class RigidParaboloid(RigidSurface):
             return np.einsum("ng,ng->n", r, r) / (2 * radius) - (x - o) @ a
 
         super().__init__(
-            distance,
-            lambda x: (x - o) @ across / radius - a,
-            lambda x: np.tile(across / radius, (len(x), 1, 1)),
-            name="rigid paraboloid",
-            reference=o,
-        )
+            distance, lambda x: (x - o) @ across / radius - a, lambda x: np.tile(across / radius, (len(x), 1, 1)),
+            name="rigid paraboloid", reference=o,
+        )  # fmt: skip
 
 
 def rotation_matrix(turn: Array) -> Array:
@@ -334,16 +313,7 @@ def rotation_matrix(turn: Array) -> Array:
 
 
 def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Array:
-    """A point or vector of the plane or of space ``(gdim,)``.
-
-    Args:
-        value: to be read as such.
-        what: it is, for the message.
-        gdim: its dimension; None takes 2 and 3.
-
-    Raises:
-        ValueError: if it is not finite, or has another dimension.
-    """
+    """A point or vector ``(gdim,)``, by default of 2 or 3 numbers; raises ValueError, with ``what`` it is, if it is not, or not finite."""
     a = _finite(value, what)
     if a.shape not in (((2,), (3,)) if gdim is None else ((gdim,),)):
         raise ValueError(f"{what} {value!r} has shape {a.shape}: expected {'2 or 3' if gdim is None else gdim} numbers")
