@@ -116,7 +116,7 @@ class Passing:
         self.problem.system.place(returning=False)
 
     def check(self):
-        check_tunnelling(self.problem.system, self.start)
+        check_tunnelling(self.problem.config, self.problem.pairs, self.start)
 
 
 def test_depth_of_a_passage():
