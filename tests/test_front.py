@@ -108,7 +108,7 @@ def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "cache").rglob("*.so")), "nothing was compiled"
     assert done.stdout == ""
-    assert [line for line in done.stderr.splitlines() if "later runs find it in the cache" not in line] == []
+    assert not re.search("gcc|build_ext|libffcx", done.stderr), done.stderr
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
