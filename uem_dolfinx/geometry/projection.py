@@ -60,11 +60,13 @@ class Target(Protocol):
         n_nodes: that a contactor follows; 0 if the target is rigid.
         stride: how far a contactor may move past it unseen, a length.
         averaged: whether normals are averaged at nodes and interpolated, so that they lean from the facets'.
+        motion: that a rigid target has made from where it was drawn, a ``rigid.Motion``; None without any, and of a mesh.
     """
 
     n_nodes: int
     stride: float
     averaged: bool
+    motion: Any
 
     @property
     def faceted(self) -> bool:

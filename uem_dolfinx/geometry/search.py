@@ -35,6 +35,8 @@ EQUALLY_NEAR = 1e-9
 class MeshTarget:
     """Target whose facets are spread over the ranks; if averaged, normals are interpolated from nodes, not the facets' own."""
 
+    motion: Any = None
+
     def __init__(self, facets: TargetFacets, averaged: bool = False):
         self.facets, self.averaged = facets, averaged
         self.shape: FacetShape = facets.shape

@@ -18,7 +18,7 @@ from dolfinx import fem
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.geometry.rigid import Motion, RigidSurface
+from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
 
 #: Sides of a cell are fewer.
@@ -148,11 +148,11 @@ class State:
 
     def motions(self) -> list[dict[str, Any] | None]:
         """Where the contacts' rigid surfaces have been moved to."""
-        motions = [c.target.motion if isinstance(c.target, RigidSurface) else None for c in self.contacts]
+        motions = [contact.pair.target.motion for contact in self.contacts]
         return [None if m is None else {f.name: getattr(m, f.name).tolist() for f in fields(Motion)} for m in motions]
 
     def move(self, motions: list[dict[str, Any] | None]) -> None:
         """Put the contacts' rigid surfaces where they were."""
         for contact, motion in zip(self.contacts, motions):
-            if isinstance(contact.target, RigidSurface):
-                contact.target.motion = None if motion is None else Motion(**{name: np.array(v) for name, v in motion.items()})
+            moved = None if motion is None else Motion(**{name: np.array(v) for name, v in motion.items()})
+            contact.pair.target.motion = moved

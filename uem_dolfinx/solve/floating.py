@@ -31,9 +31,6 @@ BARELY_LOADED = 1e-3
 #: See ``BARELY_LOADED``.
 #: [heuristic; the model's size; -]
 SHORT_WAY = 0.01
-#: A contactor comes nearer if it closes its gap by more than this part of the motion.
-#: [heuristic; size of the motion; -]
-CLOSING = 1e-9
 #: A body that falls touches ground after so many stations at most.
 #: [bound; stations; -]
 MOST_STATIONS = 200
@@ -163,8 +160,9 @@ class FloatingBodies:
             for pair in self._pairs:
                 ahead = pair.approach
                 rate = motions.rates(ahead) @ motion
-                closing.append(rate < -CLOSING)
-                ways = np.where(rate < -CLOSING, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, CLOSING), np.inf)
+                # one that closes more slowly would not resist
+                closing.append(rate < -OPEN)
+                ways = np.where(rate < -OPEN, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, OPEN), np.inf)
                 distance = min(distance, float(ways.min(initial=np.inf)))
             distance = config.comm.allreduce(distance, op=MPI.MIN)
             if not any([pair.activate_closing(c) for pair, c in zip(self._pairs, closing)]):

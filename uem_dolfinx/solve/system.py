@@ -149,9 +149,9 @@ class BodySystem:
         F, rounding = forces.residual, self.rounding()
         with timed("uniting equations"):
             equations = [pair.equations() for pair in pairs]
-            Q, resolution = self._restrict([e.test for e in equations])
+            Q, independent = self._restrict([e.test for e in equations])
             y = Q.pass_on(F)
-            self._read_forces(equations, resolution, Q.multipliers(y))
+            self._read_forces(equations, independent, Q.multipliers(y))
             settled = Q.reduce(y).norm() <= max(SETTLED * F.norm(), rounding)
             changed = any([pair.decide(rounding, cautious, settled) for pair in pairs])
             if changed:
@@ -185,21 +185,21 @@ class BodySystem:
 
     def _restrict(self, parts: list[UnitingEquations]) -> tuple[Restriction, IndependentEquations | None]:
         """P and c of the equations of all pairs, and how those that got in each other's way were resolved."""
-        equations, resolution = UnitingEquations.join(parts, self.config.gdim), None
+        equations, independent = UnitingEquations.join(parts, self.config.gdim), None
         free = self.floating.hold(self.forces.free[: self.config.n_owned], equations)
         if self.contestable:
             mutual = np.repeat(self.mutual, [len(part) for part in parts])
-            resolution = IndependentEquations(self.config, equations, free, mutual)
-            equations = resolution.equations
-        stacked = self.stacked or (resolution is not None and resolution.found)
-        return Restriction(self.config, equations, free, self.forces.prescribed, stacked), resolution
+            independent = IndependentEquations(self.config, equations, free, mutual)
+            equations = independent.equations
+        stacked = self.stacked or (independent is not None and independent.found)
+        return Restriction(self.config, equations, free, self.forces.prescribed, stacked), independent
 
-    def _read_forces(self, equations: list[LabelledEquations], resolution: IndependentEquations | None, lam: Array) -> None:
+    def _read_forces(self, equations: list[LabelledEquations], independent: IndependentEquations | None, lam: Array) -> None:
         """Hand the contact forces to the pairs (collective)."""
         redundant = np.zeros(len(lam), dtype=bool)
-        if resolution is not None:
-            lam = resolution.forces(lam)
-            redundant = resolution.redundant
+        if independent is not None:
+            lam = independent.forces(lam)
+            redundant = independent.redundant
         start = 0
         for pair, own in zip(self.pairs, equations):
             part = slice(start, start + len(own))

@@ -13,7 +13,6 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError, UEMError
-from uem_dolfinx.geometry.rigid import RigidSurface
 from uem_dolfinx.log import progress
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
@@ -195,7 +194,7 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     assert problem.dynamics is not None
     if problem.dynamics.contactors != "massless":
         return []
-    still = [c for c in problem.contacts if not (isinstance(c.target, RigidSurface) and c.target.motion is not None)]
+    still = [c for c in problem.contacts if c.pair.target.motion is None]
     return [np.array(c.force.x.array[: problem.config.gdim * problem.config.n_owned]) for c in still if c.n_active]
 
 
