@@ -49,7 +49,7 @@ class LagrangeSystem(BodySystem):
     def __init__(self, forces: BodyForces, pairs: list[ContactPair], solver: UnitedSolver, **options: Any):
         super().__init__(forces, pairs, solver, **options)
         # nothing holds what floats
-        self.floating = FloatingBodies(forces, [], lambda: None)
+        self.floating = FloatingBodies(forces, [])
         #: The saddle-point matrix of the last solve.
         self.saddle: PETSc.Mat | None = None
         self._made_of: object = None

@@ -42,11 +42,10 @@ class FloatingBodies:
     Args:
         forces: of the bodies.
         pairs: of all contacts; without any, nothing is done about bodies that float.
-        place: projects all contactors (collective).
     """
 
-    def __init__(self, forces: BodyForces, pairs: Sequence[ContactPair], place: Callable[[], None]):
-        self._forces, self._pairs, self._place = forces, pairs, place
+    def __init__(self, forces: BodyForces, pairs: Sequence[ContactPair]):
+        self._forces, self._pairs = forces, pairs
         config, dynamics = forces.config, forces.dynamics
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
@@ -63,8 +62,8 @@ class FloatingBodies:
         #: Whether contact has yet to develop in this step.
         self._developing = False
 
-    def begin_step(self) -> None:
-        """Let bodies fall until they touch (collective).
+    def begin_step(self, place: Callable[[], None]) -> None:
+        """Let bodies fall until they touch; ``place`` projects all contactors (collective).
 
         Raises:
             FloatingBodyError: naming a body, and the motion that nothing stops.
@@ -74,7 +73,7 @@ class FloatingBodies:
         self._developing = self.motions is not None
         if self.motions is not None:
             self.motions.forget_supports()
-            self._fall(freely=True, small_loads=False)
+            self._fall(place, freely=True, small_loads=False)
 
     def begin_motion(self) -> None:
         """Take the motions of a step in time for the first acceleration."""
@@ -95,10 +94,11 @@ class FloatingBodies:
         self._open = self.motions.open_motions(equations, HARDLY_HELD if self._developing else OPEN)
         return free & ~self.motions.supports(self._open, equations)
 
-    def fall_again(self, changed: bool, settled: bool) -> bool:
+    def fall_again(self, place: Callable[[], None], changed: bool, settled: bool) -> bool:
         """Let bodies that have lost their hold fall (collective).
 
         Args:
+            place: projects all contactors (collective).
             changed: whether the active set has.
             settled: whether the bodies are in equilibrium.
 
@@ -113,7 +113,7 @@ class FloatingBodies:
             changed = self._open.shape[1] > self.motions.open_motions(self._equations()).shape[1]
         if changed or settled:
             # a body that has lost its hold on the way falls only when the others have come to rest
-            changed |= self._fall(freely=not changed, small_loads=not changed)
+            changed |= self._fall(place, freely=not changed, small_loads=not changed)
         return changed
 
     def without_open_motions(self, du: Array) -> Array:
@@ -132,10 +132,11 @@ class FloatingBodies:
         """Uniting equations of all pairs."""
         return UnitingEquations.join([pair.equations().test for pair in self._pairs], self._forces.config.gdim)
 
-    def _fall(self, freely: bool, small_loads: bool) -> bool:
+    def _fall(self, place: Callable[[], None], freely: bool, small_loads: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).
 
         Args:
+            place: projects all contactors (collective).
             freely: otherwise they only take hold of what they touch already.
             small_loads: follow small loads as well, to what is near.
 
@@ -149,7 +150,7 @@ class FloatingBodies:
         assert motions is not None
         changed, motion = False, motions.every_motion[0]
         for _ in range(MOST_STATIONS):
-            self._place()
+            place()
             self._forces.assemble()
             motion = motions.load(motions.open_motions(self._equations()), self._forces.residual.array_r.reshape(-1, config.gdim))
             way = np.inf if motions.share > BARELY_LOADED else SHORT_WAY * config.size if small_loads else 0.0

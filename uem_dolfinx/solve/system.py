@@ -62,7 +62,7 @@ class BodySystem:
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self._factored: object = None
         self._find_meetings()
-        self.floating = FloatingBodies(forces, self.pairs, lambda: self.place(returning=False))
+        self.floating = FloatingBodies(forces, self.pairs)
         self.place(returning=False)
         for pair in self.pairs:
             check_initial(pair)
@@ -114,7 +114,7 @@ class BodySystem:
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch."""
-        self.floating.begin_step()
+        self.floating.begin_step(lambda: self.place(returning=False))
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about (collective)."""
@@ -157,7 +157,7 @@ class BodySystem:
             if changed:
                 for pair in pairs:
                     pair.place_again()
-            changed = self.floating.fall_again(changed, settled)
+            changed = self.floating.fall_again(lambda: self.place(returning=False), changed, settled)
             if changed:
                 F, equations = forces.residual, [pair.equations() for pair in pairs]
                 Q, _ = self._restrict([e.test for e in equations])
