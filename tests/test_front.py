@@ -20,7 +20,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from helpers import at, blocks, clamp, highest, linear, modulus, outside_mpi
+from helpers import at, blocks, clamp, highest, linear, modulus, outside_mpi, serial
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -101,7 +101,7 @@ def first_run(folder, ranks, **environment):
     return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
 
 
-@pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
+@serial
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
     done = first_run(tmp_path, ranks)
@@ -111,7 +111,7 @@ def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
     assert not re.search("gcc|build_ext|libffcx", done.stderr), done.stderr
 
 
-@pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
+@serial
 def test_errors_of_the_compiler_are_shown(tmp_path):
     done = first_run(tmp_path, 1, CC=shutil.which("false"))
     assert done.returncode != 0 and "Error" in done.stderr and "false" in done.stderr

@@ -7,10 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from mpi4py import MPI
-
-import pytest
-from helpers import outside_mpi
+from helpers import outside_mpi, serial
 
 REPO = Path(__file__).resolve().parent.parent
 MODULES = sorted(p.relative_to(REPO).with_suffix("").parts for p in (REPO / "uem_dolfinx").rglob("*.py"))
@@ -28,7 +25,7 @@ for name in names:
 """
 
 
-@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
+@serial
 def test_wheel_elsewhere(tmp_path):
     source = tmp_path / "source"
     source.mkdir()
