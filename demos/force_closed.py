@@ -76,6 +76,7 @@ results = {
     "p_max": contact.max_pressure(),
     "p_max / p0_hertz": contact.max_pressure() / float(p0),
     "newton_iterations": sum(step.newton_iterations for step in steps),
+    "exchanges": sum(step.exchanges for step in steps),
     "steps": len(steps),
     "active": contact.n_active,
     "dofs": 2 * V.dofmap.index_map.size_global,

@@ -97,6 +97,7 @@ results = {
     "p_max": contact.max_pressure(),
     "p_max / p0_hertz": contact.max_pressure() / float(p0),
     "newton_iterations": sum(step.newton_iterations for step in steps),
+    "exchanges": sum(step.exchanges for step in steps),
     "steps": len(steps),
     "max_gap": contact.max_gap(),
     "model_size": float(np.hypot(6, 9)),

@@ -74,6 +74,7 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
         "p0_hertz": float(1.5 * P / (np.pi * a**2)),
         "p_max": contact.max_pressure(),
         "newton_iterations": sum(step.newton_iterations for step in steps),
+        "exchanges": sum(step.exchanges for step in steps),
         "linear_iterations": sum(i.linear_iterations for step in steps for i in step.iterations),
         "steps": len(steps),
         "max_gap": contact.max_gap(),

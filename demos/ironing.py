@@ -133,6 +133,7 @@ results = {
     "steps": len(done),
     "cuts": sum(step.cuts for step in done),
     "newton_iterations": sum(step.newton_iterations for step in done),
+    "exchanges": sum(step.exchanges for step in done),
     "max_newton_per_step": max(step.newton_iterations for step in done),
     "force_imbalance": None if rigid else float(worst_force),
     "moment_imbalance": None if rigid else float(worst_moment),

@@ -89,6 +89,7 @@ def solve(h: float) -> tuple[uem.UnitedProblem, uem.LinearElastic, dict[str, flo
         "active_at_first": history[0].active,
         "active": contact.n_active,
         "newton_iterations": len(history) - 1,
+        "exchanges": sum(i.exchanges for i in history),
         "max_gap": contact.max_gap(),
         "dofs": 2 * V.dofmap.index_map.size_global,
     }

@@ -149,6 +149,7 @@ results = {
     "steps": len(steps),
     "cuts": sum(step.cuts for step in steps),
     "newton_iterations": sum(iterations),
+    "exchanges": sum(step.exchanges for step in steps),
     "newton_iterations_at_departure": iterations.pop(last),
     "max_newton_elsewhere": max(iterations),
 }

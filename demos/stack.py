@@ -80,6 +80,7 @@ results = {
     "error": max(max(row["settlement_error"], row["force_error"]) for row in rows),
     "max_gap": max(contact.max_gap() for contact in contacts),
     "newton_iterations": sum(step.newton_iterations for step in steps),
+    "exchanges": sum(step.exchanges for step in steps),
     "dofs": dim * V.dofmap.index_map.size_global,
     "ranks": comm.size,
 }

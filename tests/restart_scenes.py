@@ -59,7 +59,7 @@ def lead(problem, steps):
     found = []
     for k in steps:
         problem.load(k)
-        found.append(len(problem.solve(ratio=float(k > 1))))
+        found.append(len(problem.solve()))
     return found
 
 

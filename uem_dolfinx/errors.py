@@ -60,6 +60,10 @@ class NotFiniteError(UEMError, ArithmeticError):
     """The residual, the tangent or the increment holds NaN or infinity."""
 
 
+class PrecisionError(UEMError, ArithmeticError):
+    """Rounding of the stiffest parts hides whether the forces are in equilibrium."""
+
+
 class InvertedElementError(UEMError, ArithmeticError):
     """The displacement turns a cell inside out."""
 

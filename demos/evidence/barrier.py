@@ -20,7 +20,7 @@ from evidence.pushed import PushedSystem
 from uem_dolfinx import forms
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState
+from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -193,7 +193,7 @@ class BarrierSystem(PushedSystem):
         R.array[:] -= self._push()[: self.config.n_owned].ravel()
         return restriction.reduce(R)
 
-    def unite(self, cautious: bool) -> IterationState:
+    def unite(self, settled: Settled) -> IterationState:
         """Forces of the barrier."""
         P = self.restriction()
         with timed("barrier"):
@@ -209,10 +209,11 @@ class BarrierSystem(PushedSystem):
             gap=0.0,
             active=sum(pair.n_active for pair in self.pairs),
             changed=False,
+            right=True,
             closed=self.forces.dirichlet_met(),
         )
 
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState) -> PETSc.Vec:
         """Tangent of bodies and barrier; returns the right-hand side."""
         forms.free_petsc_garbage(self.comm)
         self.forces.update_tangent()

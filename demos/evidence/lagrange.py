@@ -61,12 +61,9 @@ class LagrangeSystem(BodySystem):
             self._options |= {f"fieldsplit_u_{key}": value for key, value in amg.items()}
         self._prefix = f"saddle_{id(self)}_"
 
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState) -> PETSc.Vec:
         """Saddle-point matrix; returns what drives the step, as the united system would feel it."""
-        forms.free_petsc_garbage(self.comm)
-        if first or self.newton == "full":
-            self.forces.update_tangent()
-        curvature = self.curvature() if self.consistent_tangent else None
+        curvature = self._curvature
         equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
         self._c = self.forces.vector(self.forces.prescribed)

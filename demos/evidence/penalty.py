@@ -18,7 +18,7 @@ from evidence.line_search import flat_length
 from evidence.pushed import PushedSystem
 from uem_dolfinx import forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState
+from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -222,7 +222,7 @@ class PenaltySystem(PushedSystem):
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def unite(self, cautious: bool) -> IterationState:
+    def unite(self, settled: Settled) -> IterationState:
         """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
         F = self.forces.residual
         P = self.restriction()
@@ -246,6 +246,7 @@ class PenaltySystem(PushedSystem):
             gap=overlap,
             active=sum(pair.n_active for pair in self.pairs),
             changed=changed,
+            right=True,
             closed=self.forces.dirichlet_met() and not deep,
         )
 
@@ -259,12 +260,12 @@ class PenaltySystem(PushedSystem):
             rounding += FORCE_ROUNDING * max(self.comm.allgather(float(x * stiffest)))
         return rounding
 
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState) -> PETSc.Vec:
         """Tangent of bodies and springs; returns the right-hand side."""
         forms.free_petsc_garbage(self.comm)
-        if first or self.newton == "full":
+        if self.first or self.newton == "full":
             self.forces.update_tangent()
-        self._solves = 1 if first else self._solves + 1
+        self._solves = 1 if self.first else self._solves + 1
         if self._solves == AVERAGED_AFTER:
             for pair in self.pairs:
                 if isinstance(pair.target, MeshTarget):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
-from zlib import crc32
 
 import numpy as np
 from petsc4py import PETSc
@@ -12,7 +11,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
-from uem_dolfinx.solve.newton import IterationState
+from uem_dolfinx.solve.newton import IterationState, Settled
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
@@ -36,6 +35,7 @@ class PushedSystem(ABC):
         self.config, self.comm = forces.config, forces.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self.made_of: object = None
+        self.first = True
         self.place(returning=False)
         for pair in self.pairs:
             check_initial(pair)
@@ -44,12 +44,23 @@ class PushedSystem(ABC):
     # -- what a method has to say ------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def unite(self, cautious: bool) -> IterationState:
+    def unite(self, settled: Settled) -> IterationState:
         """Contact forces at the present displacement."""
 
     @abstractmethod
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
+    def linearise(self, state: IterationState) -> PETSc.Vec:
         """Tangent of bodies and contact forces; returns the right-hand side."""
+
+    def differentiate(self, first: bool) -> None:
+        """Note whether this is the step's first iteration: the tangent is made with the matrix."""
+        self.first = first
+
+    def forces_told_apart(self) -> float:
+        """Norm of the forces at those nodes where they are told from rounding of displacements and positions (collective)."""
+        return self.forces.told_apart(bool(self.pairs))
+
+    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> None:
+        """Contactors are pushed by forces, none changes sides."""
 
     # -- what all of them do alike -----------------------------------------------------------------------------------------
 
@@ -60,10 +71,6 @@ class PushedSystem(ABC):
         """Refuse contactors that are prescribed inside the target (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
-
-    def deformation(self, du: np.ndarray) -> np.ndarray:
-        """The whole increment."""
-        return du
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
@@ -106,10 +113,6 @@ class PushedSystem(ABC):
         rhs.axpy(1.0, state.residual)
         rhs.scale(-1.0)
         return rhs
-
-    def active_set(self) -> int:
-        """Fingerprint of the active set, the same on all ranks."""
-        return hash(tuple(self.comm.allgather(crc32(b"".join(pair.trial.united_to for pair in self.pairs)))))
 
     def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, and the number of linear iterations."""

@@ -1,6 +1,6 @@
-"""The active set as pure functions of arrays: who enters, who is released, what caution does; no mesh, no ranks.
+"""The active set as pure functions of arrays: who enters, who is released, in which order; no mesh, no ranks.
 
-Read first: ``test_exchange_is_complementarity`` and ``test_the_order_of_contactors_does_not_matter``.
+Read first: ``test_exchange_is_complementarity`` and ``test_linear_complementarity_is_solved``.
 """
 
 from dataclasses import replace
@@ -22,13 +22,15 @@ def state(active, lam=None, slips=None):
     return s if slips is None else replace(s, slips=np.array(slips))
 
 
-def decide(s, gap, *, off=None, movable=None, cautious=False, settled=True, swept=False, rounding=0.0):
-    """One decision of a single rank."""
+def wrong_ones(s, gap, lam=None, *, off=None, movable=None, rounding=0.0, stiffness=1.0):
+    """Wrong contactors of a single rank."""
     gap = np.array(gap, dtype=float)
     off = np.zeros(len(gap), bool) if off is None else np.array(off)
     movable = np.ones(len(gap), bool) if movable is None else np.array(movable)
-    wrong = active_set.find_wrong(s, gap, off, movable, force_rounding=rounding, gap_rounding=1e-13, swept=swept)
-    return active_set.exchange(s, wrong, gap, off, active_set.extremes(s, wrong, gap), cautious=cautious, settled=settled)
+    lam = s.lam if lam is None else np.array(lam, dtype=float)
+    return active_set.find_wrong(
+        s, gap, lam, off, movable, np.full(len(gap), stiffness), force_rounding=rounding, gap_rounding=1e-13
+    )
 
 
 numbers = hnp.arrays(float, 6, elements=st.floats(-1.0, 1.0))
@@ -36,77 +38,119 @@ numbers = hnp.arrays(float, 6, elements=st.floats(-1.0, 1.0))
 
 @given(active=hnp.arrays(bool, 6), lam=numbers, gap=numbers)
 def test_exchange_is_complementarity(active, lam, gap):
-    """Closed contactors in tension open, open ones inside close if they are deep enough, all others stay; forces go with the set."""
-    s, changed = decide(state(active, lam), gap)
-    inside = ~active & (gap < -1e-13)
-    enters = inside & ((gap <= 0.5 * gap[inside].min(initial=0.0)) | (inside.sum() <= active.sum()))
-    assert np.array_equal(s.active, (active & (lam >= 0)) | enters)
-    assert changed == (not np.array_equal(s.active, active))
-    assert np.array_equal(s.lam, np.where(s.active, lam, 0.0))
+    """Closed contactors in tension open, open ones inside close, all others stay."""
+    s = state(active, lam)
+    wrong = wrong_ones(s, gap)
+    assert np.array_equal(active_set.exchange(s, wrong).active, np.where(active, lam >= 0, gap < -1e-13))
+    assert wrong.count == (wrong.enter | wrong.release).sum()
+    assert wrong.worst == max(-lam[wrong.release].min(initial=0.0), -gap[wrong.enter].min(initial=0.0))
 
 
-@given(active=hnp.arrays(bool, 6), lam=numbers, gap=numbers, order=st.permutations(range(6)), cautious=st.booleans())
-def test_the_order_of_contactors_does_not_matter(active, lam, gap, order, cautious):
-    s, _ = decide(state(active, lam), gap, cautious=cautious)
-    t, _ = decide(state(active[order], lam[order]), gap[order], cautious=cautious)
-    assert np.array_equal(s.active[order], t.active)
+@given(active=hnp.arrays(bool, 6), lam=numbers, gap=numbers, order=st.permutations(range(6)), alone=st.booleans())
+def test_the_order_of_contactors_does_not_matter(active, lam, gap, order, alone):
+    s, t = state(active, lam), state(active[order], lam[order])
+    a, b = wrong_ones(s, gap), wrong_ones(t, gap[order])
+    if alone:
+        a, b = a.among_the_worst(a.worst), b.among_the_worst(b.worst)
+    assert np.array_equal(active_set.exchange(s, a).active[order], active_set.exchange(t, b).active)
 
 
-@given(active=hnp.arrays(bool, 6), lam=numbers, gap=numbers, parts=hnp.arrays(bool, 6), cautious=st.booleans())
-def test_two_ranks_decide_as_one(active, lam, gap, parts, cautious):
-    """With the extremes of all ranks, each rank's contactors do what they do on one rank."""
-    off, movable = np.zeros(6, bool), np.ones(6, bool)
-    whole, _ = decide(state(active, lam), gap, cautious=cautious)
-    pieces = []
-    for part in (parts, ~parts):
-        s = state(active[part], lam[part])
-        wrong = active_set.find_wrong(s, gap[part], off[part], movable[part], force_rounding=0.0, gap_rounding=1e-13, swept=False)
-        pieces.append((part, s, wrong, active_set.extremes(s, wrong, gap[part])))
-    of_all = active_set.Extremes(
-        max(p[3].deepest for p in pieces), max(p[3].tension for p in pieces), sum(p[3].entering for p in pieces),
-        sum(p[3].touching for p in pieces),
-    )  # fmt: skip
-    for part, s, wrong, _ in pieces:
-        t, _ = active_set.exchange(s, wrong, gap[part], off[part], of_all, cautious=cautious, settled=True)
-        assert np.array_equal(t.active, whole.active[part])
+@given(active=hnp.arrays(bool, 6), lam=numbers, gap=numbers, parts=hnp.arrays(bool, 6), alone=st.booleans())
+def test_two_ranks_decide_as_one(active, lam, gap, parts, alone):
+    """With the worst of all ranks, each rank's contactors do what they do on one rank."""
+    s = state(active, lam)
+    whole = wrong_ones(s, gap)
+    pieces = [(part, state(active[part], lam[part])) for part in (parts, ~parts)]
+    wrong = [wrong_ones(own, gap[part]) for part, own in pieces]
+    assert sum(w.count for w in wrong) == whole.count
+    worst = max(w.worst for w in wrong)
+    if alone:
+        whole, wrong = whole.among_the_worst(worst), [w.among_the_worst(worst) for w in wrong]
+    for (part, own), w in zip(pieces, wrong):
+        assert np.array_equal(active_set.exchange(own, w).active, active_set.exchange(s, whole).active[part])
 
 
-def test_caution_changes_the_worst_alone():
-    """The deepest enters first; tension is let go only in equilibrium and when nothing enters, the largest first."""
-    s = state([True, True, False, False], lam=[-1.0, -2.0, 0.0, 0.0])
-    assert decide(s, [0, 0, -0.1, -0.3], cautious=True)[0].active.tolist() == [True, True, False, True]
-    assert decide(s, [0, 0, 0.1, 0.1], cautious=True)[0].active.tolist() == [True, False, False, False]
-    assert decide(s, [0, 0, 0.1, 0.1], cautious=True, settled=False)[1] is False
+@given(
+    entries=hnp.arrays(float, (6, 6), elements=st.floats(-1.0, 1.0)), load=numbers, first=hnp.arrays(bool, 6),
+    share=st.floats(0.01, 1.0),
+)  # fmt: skip
+def test_linear_complementarity_is_solved(entries, load, first, share):
+    """``gap = A lam + load`` with any compliance A, from any first set: ``gap >= 0, lam >= 0``, one of them zero."""
+    A = entries @ entries.T + share * np.eye(6)
+    s, pivoting = state(first), active_set.Pivoting()
+    for _ in range(100):
+        lam = np.zeros(6)
+        i = np.flatnonzero(s.active)
+        lam[i] = np.linalg.solve(A[np.ix_(i, i)], -load[i])
+        gap = np.where(s.active, 0.0, A @ lam + load)
+        wrong = active_set.find_wrong(
+            s, gap, lam, np.zeros(6, bool), np.ones(6, bool), 1 / np.diag(A), force_rounding=1e-9, gap_rounding=1e-9
+        )
+        if not wrong.count:
+            break
+        s = active_set.exchange(s, wrong if pivoting.all_at_once(wrong.count) else wrong.among_the_worst(wrong.worst))
+    assert gap.min() >= -1e-9 and lam.min() >= -1e-9 and np.abs(gap * lam).max() <= 1e-9
+
+
+def test_when_the_worst_goes_alone():
+    """All at once while there are fewer wrong than ever before, and three times more; then the worst alone until there are fewer."""
+    pivoting = active_set.Pivoting()
+    assert [pivoting.all_at_once(n) for n in (9, 5, 5, 7, 6, 5, 8, 4, 4)] == [True, True, True, True, True, False, False, True, True]
+
+
+@pytest.mark.parametrize("radius", [1e-6, 1.0, 1e6])
+def test_first_touch_of_a_paraboloid(radius):
+    """Hertz: pressed in by d, a ball touches within sqrt(R d) and overlaps within sqrt(2 R d); those inside enter, to 2 %."""
+    d = 1e-4 * radius
+    r = np.linspace(0.0, 2.0, 201) * np.sqrt(radius * d)
+    gap = r**2 / (2 * radius) - d
+    wrong = wrong_ones(state([False] * len(r)), gap / radius)
+    enter = wrong.on_first_touch(gap, d).enter
+    assert r[enter].max() == pytest.approx(np.sqrt(radius * d), rel=0.02)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_equals_are_exchanged_together(size):
+    """Violations that differ by 1e-7 are equal, by 1e-5 they are not; overlaps count as the forces that would lift them."""
+    for part, together in ((1e-7, True), (1e-5, False)):
+        s = state([True, True, False], lam=[-size, -size * (1 - part), 0.0])
+        wrong = wrong_ones(s, [0.0, 0.0, -size * (1 - part) / 4], stiffness=4.0)
+        assert wrong.count == 3
+        worst = wrong.among_the_worst(wrong.worst)
+        assert worst.release.tolist() == [True, together, False] and worst.enter[2] == together
 
 
 def test_past_the_end_is_let_go_and_counted():
     """Whatever the force; a contactor that has slid off enters again only in front of the target."""
-    s, changed = decide(state([True, False], lam=[5.0, 0.0]), [0.0, -1.0], off=[True, True])
-    assert changed and not s.active.any() and s.slips.tolist() == [1, 0] and s.passed.tolist() == [True, False]
-    again, _ = decide(s, [-1.0, 1.0])
+    s = active_set.slide_off(state([True, False], lam=[5.0, 0.0]), np.array([True, True]))
+    assert not s.active.any() and s.slips.tolist() == [1, 0] and s.passed.tolist() == [True, False]
+    assert not wrong_ones(s, [-1.0, -1.0], off=[True, True]).count
+    again = active_set.exchange(s, wrong_ones(s, [-1.0, 1.0]))
     assert again.active.tolist() == [True, False] and not again.passed.any()
-    # while a thin target sweeps past, those that have slid off stay where they are
-    assert not decide(s, [-1.0, 1.0], swept=True)[0].active.any()
 
 
 def test_what_nothing_can_move_is_let_go():
-    s, _ = decide(state([True, False], lam=[1.0, 0.0]), [0.0, -1.0], movable=[False, False])
-    assert not s.active.any()
+    s = state([True, False], lam=[1.0, 0.0])
+    wrong = wrong_ones(s, [0.0, -1.0], movable=[False, False])
+    assert not active_set.exchange(s, wrong).active.any()
+    # before all others
+    assert wrong.among_the_worst(wrong.worst).release[0]
 
 
 def test_forces_below_rounding_are_no_tension():
-    assert decide(state([True], lam=[-0.9]), [0.0], rounding=1.0)[0].active.all()
-    assert not decide(state([True], lam=[-1.1]), [0.0], rounding=1.0)[0].active.any()
+    assert not wrong_ones(state([True], lam=[-0.9]), [0.0], rounding=1.0).count
+    assert wrong_ones(state([True], lam=[-1.1]), [0.0], rounding=1.0).release.all()
 
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
 def test_gaps_below_rounding_do_not_activate(size):
     """Overlaps of 3e-14 of the model's size are rounding, of 3e-13 none."""
     for depth, enters in ((3e-14, False), (3e-13, True)):
-        s, gap = state([False]), np.array([-depth * size])
-        none, every = np.zeros(1, bool), np.ones(1, bool)
+        s, gap, none = state([False]), np.array([-depth * size]), np.zeros(1)
         rounding = active_set.GAP_ROUNDING * size
-        wrong = active_set.find_wrong(s, gap, none, every, force_rounding=0.0, gap_rounding=rounding, swept=False)
+        wrong = active_set.find_wrong(
+            s, gap, none, none > 0, none == 0, none, force_rounding=0.0, gap_rounding=rounding
+        )
         assert wrong.enter.all() == enters
 
 
@@ -116,12 +160,3 @@ def test_what_touches_at_the_start(size):
     gap = size * np.array([3e-10, -3e-10, 3e-9, -3e-9, 0.0])
     allowed = np.array([True, True, True, True, False])
     assert active_set.touching(state([False] * 5), gap, size, allowed).active.tolist() == [True, True, False, False, False]
-
-
-def test_extrapolation():
-    """Forces go on as they went in the last step, gaps are those at the extrapolated displacement."""
-    before, last = state([True] * 3 + [False], lam=[2.0, 1.0, 1.0, 0.0]), state([True] * 3 + [False], lam=[3.0, 3.0, 0.0, 0.0])
-    gap, allowed = np.array([0.0, 0.0, 0.0, -1.0]), np.ones(4, bool)
-    full = active_set.extrapolate(before, last, before, 1.0, gap, allowed)
-    assert full.active.tolist() == [True, False, True, True]
-    assert active_set.extrapolate(before, last, before, 0.4, gap, ~allowed).active.tolist() == [True, True, True, False]

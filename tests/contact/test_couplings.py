@@ -59,7 +59,7 @@ def test_forces_come_in_pairs(cell, degree):
     pair, config = contact.pair, problem.config
     rows = pair.equations()
     multipliers = 1.0 + np.sin(7 * config.X[pair.nodes[rows.contactor]].sum(axis=1))
-    pair.read_forces(rows, multipliers, np.zeros(len(rows), bool))
+    pair.set_forces(*pair.forces(rows, multipliers))
     nodes, forces = pair.coupling.nodal_forces(pair.placement, pair.trial)
     total = COMM.allreduce(forces.sum(axis=0))
     assert np.abs(total).max() <= 1e-13 * COMM.allreduce(np.abs(forces).sum())
@@ -76,7 +76,7 @@ def test_trial_rows_apart_from_test_rows():
     b, problem, _ = pressed("triangle", 2, chords=True)
     system, n = problem.system, problem.config.n_owned
     problem.forces.assemble()
-    state = system.unite(cautious=False)
+    state = system.unite(lambda norm, scale, rounding: False)
     assert state.trial is not state.test
     K = problem.forces.update_tangent()
     P, Q, Kd = gathered_matrix(state.trial.P), gathered_matrix(state.test.P), gathered_matrix(K)

@@ -52,9 +52,9 @@ def test_facets_equally_near(apart, alike):
     pair, number = np.zeros(2, np.int64), np.arange(2)
     for distance in (1e-3, 1.0, 1e3):
         far = distance * np.array([1.0, 1.0 + apart])
-        assert _nearest(pair, far, distance * np.array([0.1, 0.5]), number)[0] == (1 if alike else 0)
+        assert _nearest(pair, far, distance * np.array([0.1, 0.5]), number, 0.0)[0] == (1 if alike else 0)
         high = distance * np.array([0.5, 0.5 + apart])
-        assert _nearest(pair, np.full(2, distance), high, number)[0] == (0 if alike else 1)
+        assert _nearest(pair, np.full(2, distance), high, number, 0.0)[0] == (0 if alike else 1)
 
 
 def inside(cell, n=60):

@@ -191,7 +191,7 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
     def write(name):
         mesh, contacts, _ = scenes[name]
         for i, c in enumerate(contacts):
-            c.pair.committed, c.pair.last_commit = random_state(c.pair, i), random_state(c.pair, i + 10)
+            c.pair.committed = random_state(c.pair, i)
             c.pair.reserved = c.pair.committed.active.copy()
         uem.write_checkpoint(folder / name, uem.State(mesh, contacts=contacts))
 
@@ -204,13 +204,12 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
         mesh, contacts, _ = scenes[name]
         for c in contacts:
             nothing = random_state(c.pair, 99)
-            c.pair.committed = c.pair.last_commit = c.pair.trial = nothing
+            c.pair.committed = c.pair.trial = nothing
             c.pair.reserved = np.zeros(len(c.pair.nodes), bool)
         uem.read_checkpoint(folder / file, uem.State(mesh, contacts=contacts))
         for i, c in enumerate(contacts):
             wanted = random_state(c.pair, i)
             good = same_states(c.pair.committed, wanted) and same_states(c.pair.trial, wanted)
-            good &= same_states(c.pair.last_commit, random_state(c.pair, i + 10))
             assert all(COMM.allgather(good and np.array_equal(c.pair.reserved, wanted.active)))
 
 
@@ -233,7 +232,7 @@ def test_going_on_is_not_having_stopped(cell, normals, folder):
     t, other, second = slider(COMM, cell, normals=normals)
     uem.read_checkpoint(folder / "run", second.state())
     if COMM.size == 1:
-        for name in ("committed", "_last", "_largest_forces"):
+        for name in ("committed", "_largest_forces"):
             assert np.array_equal(getattr(first, name), getattr(second, name))
         assert np.array_equal(first.forces.stiffness, second.forces.stiffness)
     assert lead(second, range(5, 11)) == iterations[4:]

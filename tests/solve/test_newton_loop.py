@@ -38,16 +38,23 @@ class OneUnknown:
     def assemble_residual(self):
         return True
 
-    def unite(self, cautious):
+    def unite(self, settled):
         R = vector(self.F())
         return SimpleNamespace(
-            residual=R, norm=R.norm(), scale=1.0, rounding=0.0, strain_rounding=0.0, gap=0.0, active=0, changed=False, closed=True
-        )
+            residual=R, norm=R.norm(), scale=1.0, rounding=0.0, strain_rounding=0.0, gap=0.0, active=0, changed=False, right=True,
+            closed=True,
+        )  # fmt: skip
 
-    def active_set(self):
-        return 0
+    def forces_told_apart(self):
+        return 0.0
 
-    def linearise(self, state, first):
+    def differentiate(self, first):
+        pass
+
+    def exchange(self, state, du, driving, accuracy):
+        return None
+
+    def linearise(self, state):
         self.solves += 1
         return vector(-self.F())
 
@@ -82,7 +89,7 @@ def test_what_the_line_search_accepts(left, length):
 def test_no_convergence_is_an_error_with_its_history():
     """Never a silent end of the loop."""
     system = OneUnknown(0.5)
-    system.linearise = lambda state, first: vector(-1.0)
+    system.linearise = lambda state: vector(-1.0)
     system.F = lambda: 1.0
     with pytest.raises(uem.ConvergenceError, match="no convergence in 4 iterations") as found:
         solve_united(system, rtol=1e-8, max_iterations=4, line_search=False, verbose=False)

@@ -1,7 +1,9 @@
 """Which contactors are active: who is released, who is activated. Pure functions of arrays, without mesh and without communication.
 
-The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. A caller with several ranks reduces ``Extremes`` over them
-between ``find_wrong`` and ``exchange``.
+The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are settled on the linearised problem, before anything
+moves: its solution foretells gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again
+(block pivoting; Judice and Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Wrong.count`` and
+``Wrong.worst`` over them between ``find_wrong`` and ``exchange``.
 """
 
 from __future__ import annotations
@@ -19,9 +21,16 @@ TOUCHING = 1e-9
 #: Gaps below this part of the model's size are zero.
 #: [convention; the model's size; test_active_set.py::test_gaps_below_rounding_do_not_activate]
 GAP_ROUNDING = 1e-13
-#: Where more contactors enter than touch, only those deeper than this part of the deepest do.
-#: [heuristic; the deepest overlap; -]
+#: Where more contactors enter than touch, only those deeper than this part of the deepest do: a paraboloid that comes down on
+#: something elastic touches where it would overlap by more than half of the most (Hertz).
+#: [derived; the deepest overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 DEEP_ENOUGH = 0.5
+#: Contactors as wrong as the worst, but for this part, are exchanged with it: rounding does not choose between equals.
+#: [convention; the worst violation; test_active_set.py::test_equals_are_exchanged_together]
+TIED = 1e-6
+#: So many exchanges in a row may bring no fewer wrong contactors before the worst is exchanged alone.
+#: [convention; exchanges; test_active_set.py::test_when_the_worst_goes_alone]
+PATIENCE = 3
 
 
 @dataclass(frozen=True)
@@ -31,89 +40,102 @@ class Wrong:
     Attributes:
         enter: open ones whose gap is negative.
         release: closed ones whose force is tension, or that can no longer be held.
+        violation: how far, as a force: the tension, or the overlap times the contactor's stiffness; zero where nothing is wrong.
     """
 
     enter: Bools
     release: Bools
+    violation: Array
 
+    @property
+    def count(self) -> int:
+        """Number of wrong contactors."""
+        return int(self.enter.sum() + self.release.sum())
 
-@dataclass(frozen=True)
-class Extremes:
-    """What the choice among wrong contactors needs to know of all of them.
+    @property
+    def worst(self) -> float:
+        """Largest violation, a force."""
+        return float(self.violation.max(initial=0.0))
 
-    Attributes:
-        deepest: largest overlap of those that enter, a length.
-        tension: largest tension of those that are released, a force.
-        entering: number of those that enter.
-        touching: number of active ones.
-    """
+    def among_the_worst(self, worst: float) -> Wrong:
+        """Those alone whose violation equals the ``worst`` of all."""
+        kept = self.violation >= (1.0 - TIED) * worst
+        return Wrong(self.enter & kept, self.release & kept, self.violation)
 
-    deepest: float
-    tension: float
-    entering: int
-    touching: int
+    def on_first_touch(self, gap: Array, deepest: float) -> Wrong:
+        """Those alone that enter deep enough, besides all that are released.
+
+        Args:
+            gap: that decides on contact ``(n,)``.
+            deepest: largest overlap of all that enter, a length.
+        """
+        return Wrong(self.enter & (gap <= -DEEP_ENOUGH * deepest), self.release, self.violation)
 
 
 def find_wrong(
-    state: PairState, gap: Array, off: Bools, movable: Bools, *, force_rounding: float, gap_rounding: float, swept: bool
+    state: PairState,
+    gap: Array,
+    lam: Array,
+    off: Bools,
+    movable: Bools,
+    stiffness: Array,
+    *,
+    force_rounding: float,
+    gap_rounding: float,
 ) -> Wrong:
     """Find the contactors that break the conditions.
 
     Args:
         state: of the contactors.
-        gap: that decides on contact ``(n,)``.
-        off: contactors past the target's end ``(n,)``.
+        gap: that decides on contact, here or foreseen ``(n,)``.
+        lam: contact force along the normal, here or foreseen ``(n,)``.
+        off: contactors past the target's end, or that may not enter for another reason ``(n,)``.
         movable: contactors whose gap can be closed ``(n,)``.
+        stiffness: of the contactors along the normal, a force per length ``(n,)``.
         force_rounding: forces below it are zero.
         gap_rounding: gaps below it are zero.
-        swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
     """
-    release = state.active & ((state.lam < -force_rounding) | off | ~movable)
+    release = state.active & ((lam < -force_rounding) | ~movable)
     enter = ~state.active & ~off & movable & (gap < -gap_rounding)
-    return Wrong(enter & (state.slips == 0) if swept else enter, release)
+    violation = np.where(enter, -gap * stiffness, np.where(release, np.where(movable, -lam, np.inf), 0.0))
+    return Wrong(enter, release, violation)
 
 
-def extremes(state: PairState, wrong: Wrong, gap: Array) -> Extremes:
-    """What the contactors of one rank contribute."""
-    return Extremes(
-        float(-np.min(gap[wrong.enter], initial=0.0)),
-        float(-np.min(state.lam[wrong.release], initial=0.0)),
-        int(wrong.enter.sum()),
-        int(state.active.sum()),
-    )
+def exchange(state: PairState, wrong: Wrong) -> PairState:
+    """The state in which the wrong contactors have changed sides; forces stay until they are read anew."""
+    active = (state.active | wrong.enter) & ~wrong.release
+    return replace(state, active=active, passed=state.passed & ~active)
 
 
-def exchange(
-    state: PairState, wrong: Wrong, gap: Array, off: Bools, of_all: Extremes, *, cautious: bool, settled: bool
-) -> tuple[PairState, bool]:
-    """Activate and release.
+def slide_off(state: PairState, off: Bools) -> PairState:
+    """The state in which active contactors past the target's end have been let go.
 
     Args:
         state: of the contactors.
-        wrong: those that break the conditions.
-        gap: that decides on contact ``(n,)``.
-        off: contactors past the target's end ``(n,)``.
-        of_all: extremes over all ranks.
-        cautious: change only the worst contactor, and release none before equilibrium: this ends a cycle of active sets.
-        settled: whether the bodies are in equilibrium with the present active set.
-
-    Returns:
-        The new state, and whether any of these contactors changed. Nodal forces stay until they are read anew: the next iteration is
-        no better without the curvature of what is released.
+        off: those past the end ``(n,)``.
     """
-    enter, release = wrong.enter, wrong.release
-    if of_all.entering > of_all.touching:
-        # a body that comes down on a paraboloid touches where the overlap exceeds half of the deepest
-        enter = enter & (gap <= -DEEP_ENOUGH * of_all.deepest)
-    if cautious:
-        enter = enter & ((gap <= -of_all.deepest) | (state.slips > 1))
-        worst = off | (state.lam <= -of_all.tension) if settled and of_all.deepest == 0.0 else off
-        release = release & worst
-    active = (state.active | enter) & ~release
-    slips = state.slips + (release & off)
-    passed = (state.passed | (release & off)) & ~active
-    new = replace(state, active=active, lam=np.where(active, state.lam, 0.0), slips=slips, passed=passed)
-    return new, bool(enter.any() or release.any())
+    gone = state.active & off
+    active = state.active & ~off
+    return replace(state, active=active, slips=state.slips + gone, passed=(state.passed | gone) & ~active)
+
+
+class Pivoting:
+    """Whether all wrong contactors are exchanged, or the worst alone, from exchange to exchange of one linearised problem.
+
+    All at once is fast but may go in circles; the worst alone does not, as a rule.
+    """
+
+    def __init__(self) -> None:
+        self._fewest: float = np.inf
+        self._tries = PATIENCE
+
+    def all_at_once(self, count: int) -> bool:
+        """Whether all ``count`` wrong contactors are exchanged."""
+        if count < self._fewest:
+            self._fewest, self._tries = count, PATIENCE
+            return True
+        self._tries -= 1
+        return self._tries >= 0
 
 
 def touching(state: PairState, gap: Array, size: float, allowed: Bools) -> PairState:
@@ -126,18 +148,3 @@ def touching(state: PairState, gap: Array, size: float, allowed: Bools) -> PairS
         allowed: contactors that may be active ``(n,)``.
     """
     return replace(state, active=state.active | ((np.abs(gap) <= TOUCHING * size) & allowed))
-
-
-def extrapolate(committed: PairState, last: PairState, trial: PairState, ratio: float, gap: Array, allowed: Bools) -> PairState:
-    """First active set of a step: active ones whose extrapolated force is no tension, open ones whose extrapolated gap is negative.
-
-    Args:
-        committed: state of the last step.
-        last: state of the step before.
-        trial: the state that gets the active set.
-        ratio: this step's length over the last one's.
-        gap: at the extrapolated displacement ``(n,)``.
-        allowed: contactors that may enter ``(n,)``.
-    """
-    lam = committed.lam + ratio * (committed.lam - last.lam)
-    return replace(trial, active=np.where(committed.active, lam >= 0, (gap < 0) & allowed))

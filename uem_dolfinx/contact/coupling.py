@@ -90,16 +90,17 @@ class Coupling(Protocol):
     def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
         """The placement after the normal return to ``points``, which left the nodal gaps ``gap (n,)`` (collective)."""
 
+    def foreseen(self, placement: Placement, du: Array) -> Array:
+        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""
 
     def movable(self, placement: Placement) -> Bools:
         """Contactors whose gap can be closed, for all the Dirichlet conditions on both sides ``(n,)``."""
 
-    def change_facets(
-        self, placement: Placement, points: Array, state: PairState, trusted: bool
-    ) -> tuple[Placement, PairState, bool]:
-        """Follow contactors across bends and corners, if forces can be ``trusted``: whether equations change here (collective)."""
+    def change_facets(self, placement: Placement, points: Array, state: PairState) -> tuple[Placement, PairState, bool]:
+        """Follow contactors across bends and corners: whether equations change here (collective)."""
 
     def return_vectors(self, placement: Placement, points: Array, state: PairState) -> Array:
         """Displacements that put the active contactors back onto the target [UEM, 4.2], zero for others ``(n, gdim)``."""

@@ -152,7 +152,7 @@ class NodeToSurface:
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
-        i = np.flatnonzero(state.active & (state.slips > 1) & (nearest.beyond * self.free != 0).any(axis=1))
+        i = np.flatnonzero(state.active & (state.slips > 1) & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i) if len(i) else nearest
 
     def _target_moves(self, p: Projection) -> Bools | None:
@@ -166,6 +166,15 @@ class NodeToSurface:
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
+    def foreseen(self, placement: Placement, du: Array) -> Array:
+        """Nodal gaps after an increment (collective)."""
+        p = placement.projection
+        move = du[self.nodes]
+        if p.nodes.shape[1]:
+            followed = self.config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, -1)
+            move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
+        return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
+
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an open end of the target in a direction in which they can move.
 
@@ -174,21 +183,19 @@ class NodeToSurface:
         p = placement.projection
         limit = np.where(state.slips > 1, END_HOLDS, SLID_OFF)
         behind = state.passed & (p.gap < -self.thickness)
-        return behind | (np.linalg.norm(p.beyond * self.free, axis=1) > limit * p.facet_size)
+        return behind | (np.linalg.norm(p.beyond, axis=1) > limit * p.facet_size)
 
     def movable(self, placement: Placement) -> Bools:
         """Contactors that can move along the normal, or whose target can."""
         own = np.linalg.norm(placement.projection.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
         return own if placement.target_moves is None else own | placement.target_moves
 
-    def change_facets(
-        self, placement: Placement, points: Array, state: PairState, trusted: bool
-    ) -> tuple[Placement, PairState, bool]:
+    def change_facets(self, placement: Placement, points: Array, state: PairState) -> tuple[Placement, PairState, bool]:
         """Follow contactors across bends, into corners and out of them (collective)."""
         if self._valleys is None:
             return placement, state, False
         feet: Feet = placement.details
-        state, left = self._valleys.leave(feet.corners, state, trusted)
+        state, left = self._valleys.leave(feet.corners, state)
         state, entered = self._valleys.follow(feet.nearest, left, points, state)
         return replace(placement, details=replace(feet, left=left)), state, bool(left.any()) or entered
 

@@ -45,7 +45,6 @@ class ContactPair:
     Attributes:
         trial: state of the present iteration.
         committed: state of the last step.
-        last_commit: state of the step before.
         placement: of the contactors, for the trial state; known after ``project``.
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
@@ -67,7 +66,7 @@ class ContactPair:
     ):
         self.config, self.nodes, self.coupling, self.name = config, nodes, coupling, name
         self.sliding, self.max_penetration, self.thickness = sliding, max_penetration, thickness
-        self.trial = self.committed = self.last_commit = PairState.initial(len(nodes), config.gdim)
+        self.trial = self.committed = PairState.initial(len(nodes), config.gdim)
         self.initial_overlap = 0.0
         self.redundant: Bools = np.zeros(len(nodes), dtype=bool)
         self.reserved: Bools = np.zeros(len(nodes), dtype=bool)
@@ -159,49 +158,50 @@ class ContactPair:
         """Start with the contactors that touch without force as active (collective)."""
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
         # a first step that fails and is cut starts from here again
-        self.committed = self.last_commit = state
+        self.committed = state
         self._set_active(state)
 
-    def predict(self, ratio: float) -> None:
-        """First active set of a step, extrapolated from the last one (collective).
-
-        Args:
-            ratio: this step's length over the last one's; the pair is projected at the displacement extrapolated likewise.
-        """
-        allowed = ~self.off & self.movable
-        self._set_active(active_set.extrapolate(self.committed, self.last_commit, self.trial, ratio, self.gap, allowed))
-
-    def decide(self, force_rounding: float, cautious: bool, settled: bool) -> bool:
-        """Release contactors in tension, activate penetrating ones, follow them from facet to facet (collective).
-
-        Args:
-            force_rounding: forces below it are zero.
-            cautious: change only the worst contactor, and release none before equilibrium: this ends a cycle of active sets.
-            settled: whether the bodies are in equilibrium with the present active set.
+    def follow(self) -> bool:
+        """Let go of contactors past an end of the target, follow the others from facet to facet (collective).
 
         Returns:
             Whether any rank changed what its contactors are united to.
         """
-        comm, off, gap = self.config.comm, self.off, self.gap
-        wrong = active_set.find_wrong(
-            self.trial,
-            gap,
-            off,
-            self.movable,
-            force_rounding=force_rounding,
-            gap_rounding=active_set.GAP_ROUNDING * self.config.size,
-            swept=self.thickness < np.inf and not settled,
-        )
-        here = active_set.extremes(self.trial, wrong, gap)
-        worst, counts = np.array([here.deepest, here.tension]), np.array([here.entering, here.touching])
-        comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
-        comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
-        of_all = active_set.Extremes(float(worst[0]), float(worst[1]), int(counts[0]), int(counts[1]))
-        state, exchanged = active_set.exchange(self.trial, wrong, gap, off, of_all, cautious=cautious, settled=settled)
-        trusted = settled or not cautious
-        self.placement, state, moved = self.coupling.change_facets(self.placement, self.points, state, trusted)
+        off = self.off
+        gone = bool((self.trial.active & off).any())
+        state = active_set.slide_off(self.trial, off)
+        self.placement, state, moved = self.coupling.change_facets(self.placement, self.points, state)
         self._set_active(state)
-        return bool(comm.allreduce(exchanged or moved, op=MPI.LOR))
+        return bool(self.config.comm.allreduce(gone or moved, op=MPI.LOR))
+
+    def foreseen(self, du: Array) -> Array:
+        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+        return self.coupling.foreseen(self.placement, du)
+
+    def wrong(
+        self, gap: Array, lam: Array, stiffness: Array, force_rounding: float, gap_rounding: float, swept: bool
+    ) -> active_set.Wrong:
+        """Contactors that break the conditions of contact with such gaps and forces.
+
+        Args:
+            gap: that decides on contact ``(n,)``.
+            lam: force along the normal that decides on contact ``(n,)``.
+            stiffness: of the contactors along the normal ``(n,)``.
+            force_rounding: forces below it are zero.
+            gap_rounding: gaps below it are zero, and below rounding of positions.
+            swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
+        """
+        off = self.off
+        if swept and self.thickness < np.inf:
+            off = off | (self.trial.slips > 0)
+        gap_rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
+        return active_set.find_wrong(
+            self.trial, gap, lam, off, self.movable, stiffness, force_rounding=force_rounding, gap_rounding=gap_rounding
+        )
+
+    def exchange(self, wrong: active_set.Wrong) -> None:
+        """Let wrong contactors change sides (collective)."""
+        self._set_active(active_set.exchange(self.trial, wrong))
 
     def place_again(self) -> None:
         """Put contactors whose equations have changed where they now belong (collective)."""
@@ -240,12 +240,15 @@ class ContactPair:
             self.reserved = self.coupling.near(self.placement, self.trial)
         return self.coupling.equations(self.placement, self.points, self.trial, np.flatnonzero(self.reserved))
 
-    def read_forces(self, equations: LabelledEquations, multipliers: Array, redundant: Bools) -> None:
-        """Take the contact forces from the multipliers of the pair's equations, and which were left out, each ``(m,)`` (collective)."""
+    def set_redundant(self, equations: LabelledEquations, redundant: Bools) -> None:
+        """Take which of the pair's equations ``(m,)`` depend on others and were left out."""
         normal = equations.kind == NORMAL
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
         self.redundant[equations.contactor[normal]] = redundant[normal]
-        self.set_forces(*self.coupling.forces(self.placement, self.trial, equations, multipliers))
+
+    def forces(self, equations: LabelledEquations, multipliers: Array) -> tuple[Array, Array, Array]:
+        """Contact forces from the multipliers of the pair's equations ``(m,)``; see ``Coupling.forces`` (collective)."""
+        return self.coupling.forces(self.placement, self.trial, equations, multipliers)
 
     def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
         """Give the trial state contact forces, and an active set if another method than elimination decides on it.
@@ -271,7 +274,7 @@ class ContactPair:
         slips = np.where(self.trial.active, self.trial.slips, 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
-        self.last_commit, self.committed = self.committed, fresh
+        self.committed = fresh
         self.restore()
         self.coupling.commit()
         if not self.trial.active.any():
@@ -284,18 +287,11 @@ class ContactPair:
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
         kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
-        for when, state in (("committed", self.committed), ("last", self.last_commit)):
-            kept |= {f"{when}_{name}": array for name, array in state.to_checkpoint(self.target.keys_of).items()}
-        return kept
+        return kept | self.committed.to_checkpoint(self.target.keys_of)
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
-
-        def state(when: str) -> PairState:
-            mine = {name.removeprefix(f"{when}_"): array for name, array in kept.items() if name.startswith(f"{when}_")}
-            return PairState.from_checkpoint(mine, self.target.facets_of)
-
         self.reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
-        self.committed, self.last_commit = state("committed"), state("last")
+        self.committed = PairState.from_checkpoint(kept, self.target.facets_of)
         self.coupling.commit()
         self.restore()

@@ -91,13 +91,12 @@ class Valleys:
             nearest = nearest.with_rows(i, {f.name: getattr(own, f.name) for f in fields(own)})
         return nearest, *self.place(nearest, points, state)
 
-    def leave(self, corners: Corners | None, state: PairState, trusted: bool) -> tuple[PairState, Bools]:
+    def leave(self, corners: Corners | None, state: PairState) -> tuple[PairState, Bools]:
         """Let go of the facet of a corner that would have to pull.
 
         Args:
             corners: that hold contactors.
             state: of the pair.
-            trusted: whether its forces tell; otherwise only contactors that are not active let go.
 
         Returns:
             The new state, and which contactors have let go ``(n,)``.
@@ -107,7 +106,7 @@ class Valleys:
             return state, left
         i = corners.which
         pulls = corners.pulls(state.force[i])
-        leaving = (trusted & (pulls < 0).any(axis=1)) | ~state.active[i]
+        leaving = (pulls < 0).any(axis=1) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)
         facets[rows, np.argmin(pulls[rows], axis=1)] = -1

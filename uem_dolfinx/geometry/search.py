@@ -58,18 +58,18 @@ class MeshTarget:
         # the answer of the rank that seems nearest tells who else can be as near
         near, far = self._bounds(points, data)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
-        found = self._ask(Exchange.to(self.comm, first), data, points)
+        found, keys = self._ask(Exchange.to(self.comm, first), data, points)
         bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
         others = (near <= bound) & (first != np.arange(size)[:, None])
-        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=found)
+        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=found, found_keys=keys)[0]
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
-        return self._ask(self._to_owners(facet), self.facets.current(), points, facet)
+        return self._ask(self._to_owners(facet), self.facets.current(), points, facet)[0]
 
     def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
         """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
-        new = self._ask(self._to_owners(old.facet), self.facets.current(), points, old.facet, old.xi)
+        new, _ = self._ask(self._to_owners(old.facet), self.facets.current(), points, old.facet, old.xi)
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
 
@@ -149,30 +149,30 @@ class MeshTarget:
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
-        found: FacetProjection | None = None,
-    ) -> FacetProjection:  # fmt: skip
-        """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found."""
+        found: FacetProjection | None = None, found_keys: Ints | None = None,
+    ) -> tuple[FacetProjection, Ints]:  # fmt: skip
+        """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found; and its keys."""
         p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
         if rest:
             rest[0] = rest[0] - self.first[self.comm.rank]
         answer = self._project_here(p, data, *rest)
+        keys = self.facets.keys[answer.facet - self.first[self.comm.rank]]
         if self.comm.size == 1:
-            return answer
+            return answer, keys
         # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
-        rows, columns = exchange.rows, exchange.back(*self._judged(p, answer))
-        if found is not None:
+        rows, columns = exchange.rows, exchange.back(*self._judged(p, answer, keys))
+        if found is not None and found_keys is not None:
             rows = np.append(rows, np.arange(len(points)))
-            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, found))]
-        distance, height, *columns = columns
-        answers = FacetProjection(*columns)
-        best = _nearest(rows, distance, height, answers.facet)
-        return FacetProjection(*(column[best] for column in columns))
+            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, found, found_keys))]
+        distance, height, keys, *columns = columns
+        best = _nearest(rows, distance, height, keys, ON_SIDE * self.stride)
+        return FacetProjection(*(column[best] for column in columns)), keys[best]
 
-    def _judged(self, points: Array, answer: FacetProjection) -> list[npt.NDArray[Any]]:
-        """What tells the nearest of several answers, distance and height over the facet's own plane, and the answer's fields."""
+    def _judged(self, points: Array, answer: FacetProjection, keys: Ints) -> list[npt.NDArray[Any]]:
+        """What tells the nearest of several answers: distance, height over the facet's own plane, key; and the answer's fields."""
         away = points - answer.foot
         height = np.einsum("ng,ng->n", away, self.outward(answer))
-        return [np.linalg.norm(away, axis=1), height, *(getattr(answer, f.name) for f in fields(answer))]
+        return [np.linalg.norm(away, axis=1), height, keys, *(getattr(answer, f.name) for f in fields(answer))]
 
     def _project_here(
         self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
@@ -184,7 +184,7 @@ class MeshTarget:
             tab = self.shape.tabulate(xi)
             away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
             height = np.einsum("ng,ng->n", away, unit_normals(tab, x)) * self.facets.sign[candidates]
-            best = _nearest(pairs, np.sqrt(d2), height, candidates)
+            best = _nearest(pairs, np.sqrt(d2), height, self.facets.keys[candidates], ON_SIDE * self.stride)
             facet, xi = candidates[best], xi[best]
         elif xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
@@ -224,17 +224,21 @@ class MeshTarget:
         )
 
 
-def _nearest(points: Ints, distance: Array, height: Array, number: Ints) -> Ints:
+def _nearest(points: Ints, distance: Array, height: Array, key: Ints, rounding: float) -> Ints:
     """The nearest of several candidates for each point, as indices.
 
     Outside a convex edge the facets that share it are equally near; the point is then above the one over which it is highest,
-    so that it cannot hover in the plane of another. What is still tied goes by number.
+    so that it cannot hover in the plane of another. What is still tied goes by the facets' keys, which no partition changes.
+    Lengths that differ by no more than ``rounding``, or by a small part of the distance, are equal.
     """
-    closest = np.full(points.max(initial=-1) + 1, np.inf)
+    n = points.max(initial=-1) + 1
+    closest, highest = np.full(n, np.inf), np.full(n, -np.inf)
     np.minimum.at(closest, points, distance)
-    farther = distance > closest[points] * (1 + EQUALLY_NEAR) + np.finfo(float).tiny
-    steps = np.rint(height / (EQUALLY_NEAR * np.where(closest > 0, closest, 1.0)[points]))
-    order = np.lexsort((number, -steps, farther, points))
+    band = (EQUALLY_NEAR * closest + rounding)[points]
+    farther = distance > closest[points] + band
+    np.maximum.at(highest, points, np.where(farther, -np.inf, height))
+    lower = height < highest[points] - band
+    order = np.lexsort((key, lower, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
 

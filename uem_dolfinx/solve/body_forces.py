@@ -16,6 +16,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
@@ -24,6 +25,9 @@ from uem_dolfinx.solve.tangent import Inversions, Tangent
 #: Multiple of the rounding of K u that the residual may be left with.
 #: [derived; rounding of K u; test_body_forces.py::test_rounding_of_forces]
 FORCE_ROUNDING = 4.0 * np.finfo(float).eps
+#: A force is told from rounding where it is larger by this factor.
+#: [convention; rounding of K u; test_body_forces.py::test_forces_told_from_rounding]
+TOLD_APART = 100.0
 #: Dirichlet values are met if they are to this part of the largest.
 #: [derived; the largest prescribed value; test_body_forces.py::test_dirichlet_values_are_met]
 VALUE_ROUNDING = 4.0 * np.finfo(float).eps
@@ -124,6 +128,25 @@ class BodyForces:
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
         return float(FORCE_ROUNDING * self.vector(rounded * self.stiffness).norm())
+
+    def told_apart(self, positioned: bool) -> float:
+        """Norm of the forces at those components where they are told from rounding (collective).
+
+        Rounding of a body's displacement is seen at all of its nodes, also where they are held.
+
+        Args:
+            positioned: whether positions count, not displacements alone.
+        """
+        F, n = self._b.array_r, self.config.n_owned
+        if self.stiffness is None:
+            return float(self.vector(F).norm())
+        body, count = find_bodies(self.config)
+        rounded = np.zeros(count)
+        np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
+        self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
+        own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
+        limit = TOLD_APART * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
+        return float(self.vector(np.where(np.abs(F) > limit.ravel(), F, 0.0)).norm())
 
     def strain_rounding(self) -> float:
         """Norm of the forces that rounding of ``1 + grad(u)`` can make (collective)."""

@@ -94,39 +94,43 @@ class FloatingBodies:
         self._open = self.motions.open_motions(equations, HARDLY_HELD if self._developing else OPEN)
         return free & ~self.motions.supports(self._open, equations)
 
+    @property
+    def adrift(self) -> bool:
+        """Whether loads drive a body along a motion that nothing but supports holds, so that no active set is its equilibrium (collective)."""
+        if self.motions is None:
+            return False
+        force = self.motions.load(self._open, self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))
+        return bool(force.any())
+
     def fall_again(self, place: Callable[[], None], changed: bool, settled: bool) -> bool:
         """Let bodies that have lost their hold fall (collective).
 
         Args:
             place: projects all contactors (collective).
-            changed: whether the active set has.
+            changed: whether the active set has, or is about to.
             settled: whether the bodies are in equilibrium.
 
         Returns:
-            Whether anything has changed now.
+            Whether anything else has changed now.
         """
         if self.motions is None:
-            return changed
+            return False
+        more = False
         if self._developing and settled and not changed:
             # go on if more was held than must be
             self._developing = False
-            changed = self._open.shape[1] > self.motions.open_motions(self._equations()).shape[1]
-        if changed or settled:
+            more = self._open.shape[1] > self.motions.open_motions(self._equations()).shape[1]
+        if changed or more or settled:
             # a body that has lost its hold on the way falls only when the others have come to rest
-            changed |= self._fall(place, freely=not changed, small_loads=not changed)
-        return changed
+            freely = not (changed or more)
+            more |= self._fall(place, freely=freely, small_loads=freely)
+        return more
 
     def without_open_motions(self, du: Array) -> Array:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
         if self.motions is None:
             return du
         return du - self.motions.part(self._open, du.reshape(-1, self._forces.config.gdim)).ravel()
-
-    def deformation(self, du: Array) -> Array:
-        """An increment ``(n_owned * gdim,)`` without any rigid motion of the bodies that only contact holds (collective)."""
-        if self.motions is None:
-            return du
-        return du - self.motions.part(self.motions.every_motion, du.reshape(-1, self._forces.config.gdim)).ravel()
 
     def _equations(self) -> UnitingEquations:
         """Uniting equations of all pairs."""

@@ -32,8 +32,13 @@ class LoadStep:
 
     @property
     def newton_iterations(self) -> int:
-        """Number of linear solves."""
+        """Number of iterations, each with a tangent and at least one linear solve."""
         return len(self.iterations) - 1
+
+    @property
+    def exchanges(self) -> int:
+        """Number of further linear solves with the same tangents, each with another active set."""
+        return sum(i.exchanges for i in self.iterations)
 
 
 def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
@@ -50,7 +55,7 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
     """
-    control, done, last = StepControl(1.0 / steps), 0.0, 0.0
+    control, done = StepControl(1.0 / steps), 0.0
     start = np.array(problem.u.x.array)
     ramped = isinstance(problem.load, fem.Constant) or problem.load is None
     while done < 1.0:
@@ -59,9 +64,7 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
             factor = 1.0
         problem.set_load(factor)
         try:
-            iterations = problem.solve(
-                start=start, fraction=factor if ramped else 1.0, ratio=(factor - done) / last if last else 0.0
-            )
+            iterations = problem.solve(start=start, fraction=factor if ramped else 1.0)
         except UEMError as error:
             # the last step may have been shorter than was meant
             if control.shorten(factor - done, error):
@@ -70,6 +73,6 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
             # the targets that the load moves are back, too
             problem.restore()
             raise
-        last, done = factor - done, factor
+        done = factor
         number, cuts = control.done(iterations)
         yield LoadStep(number, factor, iterations, cuts)

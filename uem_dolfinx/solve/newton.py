@@ -5,6 +5,7 @@ The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics al
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,15 +13,15 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; -]
 STALLED = 0.5
-#: An active set that still changes after so many iterations changes by one contactor at a time from then on.
-#: [heuristic; iterations; -]
-CAUTIOUS_AFTER = 10
+#: The active set of a linearised problem settles within so many exchanges, or the step is cut.
+#: [bound; exchanges; -]
+MOST_EXCHANGES = 100
 #: Shortest step of the line search.
 #: [bound; halvings of a step; -]
 SHORTEST_SEARCH = 1.0 / 64
@@ -33,9 +34,16 @@ ACCURACY_ON_THE_WAY = 1e-4
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 #: [heuristic; right-hand side; -]
 ACCURACY_AT_THE_END = 0.1
-#: A residual above this part of the forces that drive the step is no rounding, however far a loose body has flown.
+#: A residual below this part of the forces at work is an equilibrium in which contact forces can be read from the bodies.
+#: [heuristic; norm of the forces; -]
+SETTLED = 1e-6
+#: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
 #: [heuristic; norm of the forces; -]
 LARGEST_ROUNDING = 1e-4
+
+
+#: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
+Settled = Callable[[float, float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -45,10 +53,11 @@ class Iteration:
     Attributes:
         residual: norm of ``Q'r`` over the forces at work.
         gap: largest gap of an active contactor, a length.
-        active: number of active contactors over all ranks.
-        changed: whether contactors were activated or released.
-        linear_iterations: of the solve that followed; 0 if the step had converged.
+        active: number of active contactors over all ranks with which the bodies moved on.
+        changed: whether contactors were activated or released, or entered or left a corner.
+        linear_iterations: of the solves that followed; 0 if the step had converged.
         step_length: of the line search in the step that led here.
+        exchanges: further solves with the same tangent, each with another active set.
     """
 
     residual: float
@@ -57,6 +66,7 @@ class Iteration:
     changed: bool
     linear_iterations: int
     step_length: float
+    exchanges: int = 0
 
 
 @dataclass(frozen=True)
@@ -73,7 +83,8 @@ class IterationState:
         strain_rounding: norm that rounding of the deformation gradient alone can make, in laws that start from it.
         gap: largest gap of an active contactor, a length.
         active: number of active contactors over all ranks.
-        changed: whether the active set changed.
+        changed: whether contactors have changed what they are united to because of where they are.
+        right: whether no contactor breaks the conditions of contact, as far as the present forces tell.
         closed: whether gaps and Dirichlet conditions are met.
     """
 
@@ -87,6 +98,7 @@ class IterationState:
     gap: float
     active: int
     changed: bool
+    right: bool
     closed: bool
 
 
@@ -101,9 +113,6 @@ class UnitedSystem(Protocol):
 
     def end_step(self) -> None:
         """End a step in which the loop has converged; may refuse it."""
-
-    def deformation(self, du: Array) -> Array:
-        """An increment ``(n_owned * gdim,)`` without the rigid motions that say nothing about the next step."""
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with, in dynamics."""
@@ -125,14 +134,23 @@ class UnitedSystem(Protocol):
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
 
-    def unite(self, cautious: bool) -> IterationState:
-        """Contact forces, activation and release, and the uniting equations that follow."""
+    def unite(self, settled: Settled) -> IterationState:
+        """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
 
-    def active_set(self) -> int:
-        """Fingerprint of the active set, the same on all ranks."""
+    def differentiate(self, first: bool) -> None:
+        """Tangent of bodies and contact at the present displacement."""
 
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
-        """Tangent and united matrix ``Q'KP``; returns the right-hand side ``Q'(r - K c)``."""
+    def linearise(self, state: IterationState) -> PETSc.Vec:
+        """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)``."""
+
+    def forces_told_apart(self) -> float:
+        """Norm of the forces at those nodes where they are told from rounding."""
+
+    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
+        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none.
+
+        ``du`` solves the linearised problem, but for this ``accuracy`` of a right-hand side of norm ``driving``.
+        """
 
     def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
@@ -161,7 +179,7 @@ def solve_united(
     Args:
         system: the problem.
         rtol: bound on the norm of ``Q'r`` relative to the forces at work.
-        max_iterations: bound on the number of linear solves.
+        max_iterations: bound on the number of iterations.
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
         forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
@@ -170,13 +188,17 @@ def solve_united(
         The history; its last entry is the converged state.
 
     Raises:
-        ConvergenceError: after ``max_iterations``, with the history.
+        ConvergenceError: after ``max_iterations``, or where an active set does not settle, with the history.
+        PrecisionError: if rounding hides whether the forces are in equilibrium.
         NotFiniteError: if the residual is NaN or infinite at the start of the step.
         InvertedElementError: if even the shortest step turns a cell inside out.
     """
     history: list[Iteration] = []
-    seen: set[int] = set()
-    cautious, start, thrust, length, norm, stalled = False, 0.0, 0.0, 1.0, 0.0, 0
+    start, length, norm, stalled = 0.0, 1.0, 0.0, 0
+
+    def settled(norm: float, scale: float, rounding: float) -> bool:
+        return norm <= max(max(SETTLED, rtol) * max(scale, start), rounding)
+
     system.place(returning=False)
     if not system.assemble_residual():
         raise NotFiniteError(
@@ -184,33 +206,43 @@ def solve_united(
             "check loads, material parameters and the initial displacement for NaN and division by zero"
         )
     for k in range(max_iterations + 1):
-        state = system.unite(cautious)
+        state = system.unite(settled)
         start = start if k else state.norm
         forces = max(state.scale, start)
-        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
+        steady = state.right and not state.changed
+        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and steady else 0
         norm = state.norm
         rounding = state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding)
-        small = max(rtol * forces, min(rounding, LARGEST_ROUNDING * max(forces, thrust, forces_before)))
-        converged = not state.changed and state.closed and norm <= small
-        if converged or k == max_iterations:
+        small = rtol * forces
+        if small < norm <= rounding:
+            # rounding excuses a residual that is small beside real forces, or where there are none
+            real = max(system.forces_told_apart(), forces_before)
+            small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
+        converged = steady and state.closed and norm <= small
+        hidden = stalled >= 2 and small < norm <= rounding
+        if converged or hidden or k == max_iterations:
             history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
                 return history
+            if hidden:
+                raise _no_precision(norm, rounding, real)
             break
-        fingerprint = system.active_set()
-        cautious |= state.changed and (fingerprint in seen or k >= CAUTIOUS_AFTER)
-        seen.add(fingerprint)
-        rhs = system.linearise(state, first=k == 0)
-        driving = rhs.norm()
-        thrust = max(thrust, driving if k == 0 else 0.0)
-        passing = not cautious and (not system.linear or state.changed or (k == 0 and system.in_contact))
-        needed = ACCURACY_AT_THE_END * rtol * forces / driving if driving > 0 else 0.0
-        dq, iterations = system.solve(rhs, min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END))
-        residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
-        history.append(Iteration(residual, state.gap, state.active, state.changed, iterations, length))
+        system.differentiate(first=k == 0)
+        passing = not system.linear or state.changed or (k == 0 and system.in_contact)
+        step = _solve_linearised(system, state, rtol * forces, passing)
+        residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
+        changed = state.changed or step.exchanges > 0
+        history.append(
+            Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges)
+        )
         _report(history, verbose)
-        length = _advance(system, state, rhs, dq, line_search)
+        if step.du is None:
+            raise ConvergenceError(
+                f"the active set does not settle in {MOST_EXCHANGES} exchanges: take smaller load steps, or a target of finer facets",
+                history,
+            )
+        length = _advance(system, step.state, step.rhs, step.dq, step.du, line_search)
     last = history[-1]
     raise ConvergenceError(
         f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
@@ -219,9 +251,68 @@ def solve_united(
     )
 
 
-def _advance(system: UnitedSystem, state: IterationState, rhs: PETSc.Vec, dq: PETSc.Vec, line_search: bool) -> float:
+def _no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
+    return PrecisionError(
+        f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {_ratio(norm, real):.1g} of the forces at work, "
+        f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "
+        "forces; model them as rigid, give them less stiffness or less far to go, or raise rtol if that is accurate enough"
+    )
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Solution of a linearised problem.
+
+    Attributes:
+        state: with the active set that its solution agrees with.
+        rhs: right-hand side of the last solve.
+        dq: its unknowns.
+        du: its increment; None if the active set did not settle.
+        driving: norm of the first right-hand side.
+        linear_iterations: of all solves.
+        exchanges: number of solves after the first.
+    """
+
+    state: IterationState
+    rhs: PETSc.Vec
+    dq: PETSc.Vec
+    du: PETSc.Vec | None
+    driving: float
+    linear_iterations: int
+    exchanges: int
+
+
+def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float, passing: bool) -> _Step:
+    """Solve the linearised problem together with the conditions of contact; nothing moves.
+
+    Args:
+        system: the problem.
+        state: to begin with.
+        wanted: norm of the residual that convergence asks for.
+        passing: whether another iteration follows in any case.
+    """
+    driving, iterations = 0.0, 0
+    for exchanges in range(MOST_EXCHANGES + 1):
+        rhs = system.linearise(state)
+        norm = rhs.norm()
+        driving = driving or norm
+        needed = ACCURACY_AT_THE_END * wanted / norm if norm > 0 else 0.0
+        accuracy = min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END)
+        dq, count = system.solve(rhs, accuracy)
+        iterations += count
+        du = system.move(state, dq)
+        better = system.exchange(state, du, norm, accuracy)
+        if better is None:
+            return _Step(state, rhs, dq, du, driving, iterations, exchanges)
+        state = better
+    return _Step(state, rhs, dq, None, driving, iterations, MOST_EXCHANGES)
+
+
+def _advance(
+    system: UnitedSystem, state: IterationState, rhs: PETSc.Vec, dq: PETSc.Vec, du: PETSc.Vec, line_search: bool
+) -> float:
     """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
-    du, start = system.move(state, dq), system.displacement()
+    start = system.displacement()
     work, norm = abs(dq.dot(rhs)), rhs.norm()
     length = 1.0
     while True:
@@ -258,7 +349,7 @@ def _report(history: list[Iteration], verbose: bool) -> None:
     i = history[-1]
     line = (
         f"  {len(history) - 1:3d}  residual {i.residual:.3e}  gap {i.gap:.1e}  active {i.active:5d}{'*' if i.changed else ' '}  "
-        f"linear {i.linear_iterations:3d}  step {i.step_length:g}"
+        f"exchanges {i.exchanges:2d}  linear {i.linear_iterations:3d}  step {i.step_length:g}"
     )
     if verbose:
         say(line)

@@ -26,11 +26,6 @@ from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.system import BodySystem
 
-#: The gap beside a smooth contact grows with distance from its rim to the power 3/2, so that a rim which moves on at its pace
-#: is found by extrapolating the gaps of the last step by 1 / (2^(3/2) - 1) of it.
-#: [derived; the last step; test_prediction.py::test_a_rim_that_moves_on_at_its_pace_is_found]
-RIM = 1.0 / (2.0**1.5 - 1.0)
-
 
 class UnitedProblem:
     """Bodies in contact by the United Elements Method, in statics, or in dynamics where there is inertia.
@@ -118,7 +113,6 @@ class UnitedProblem:
         self.step_control = StepControl()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
-        self._last = np.array(u.x.array)
         self._largest_forces = 0.0
 
     # -- one step ----------------------------------------------------------------------------------------------------
@@ -130,22 +124,21 @@ class UnitedProblem:
         elif self.load is not None:
             agree_on_call(self.comm, self.load, at)
 
-    def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+    def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
 
         Arguments, return value and errors are those of :meth:`attempt`.
         """
-        history = self.attempt(start=start, fraction=fraction, ratio=ratio)
+        history = self.attempt(start=start, fraction=fraction)
         self.commit()
         return history
 
-    def attempt(self, *, start: np.ndarray | None = None, fraction: float = 1.0, ratio: float = 0.0) -> list[Iteration]:
+    def attempt(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
         Args:
             start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
             fraction: how far the Dirichlet values go, from ``start`` (0) to the values of ``bcs`` (1).
-            ratio: this step's length over the last one's, for extrapolating the active set; 0 does not extrapolate.
 
         Returns:
             The history of iterations.
@@ -159,8 +152,6 @@ class UnitedProblem:
         compat.set_bc_values(wanted, self.forces.bcs)
         self.forces.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
         try:
-            if ratio > 0.0:
-                self._predict(ratio)
             self.system.begin_step()
             history = solve_united(
                 self.system,
@@ -178,8 +169,8 @@ class UnitedProblem:
 
     def commit(self) -> None:
         """Keep the present displacement and contact state."""
-        self._last, self.committed = self.committed, np.array(self.u.x.array)
-        self._largest_forces = max(self._largest_forces, self.forces.residual.norm())
+        self.committed = np.array(self.u.x.array)
+        self._largest_forces = max(self._largest_forces, self.system.forces_told_apart())
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:
@@ -205,8 +196,8 @@ class UnitedProblem:
         Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
         added must differ from those here.
         """
-        before, stiffness = fem.Function(self.config.V), fem.Function(self.config.V)
-        functions = {"displacement": self.u, "displacement before": before, "stiffness": stiffness}
+        stiffness = fem.Function(self.config.V)
+        functions = {"displacement": self.u, "stiffness": stiffness}
         if self.dynamics is not None:
             d = self.dynamics
             functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
@@ -215,7 +206,6 @@ class UnitedProblem:
         state = State(self.config.mesh, functions, self.contacts)
 
         def collect() -> None:
-            before.x.array[:] = self._last
             known = self.forces.to_checkpoint(stiffness)
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
@@ -224,7 +214,7 @@ class UnitedProblem:
                 state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
         def restore() -> None:
-            self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
+            self.committed = np.array(self.u.x.array)
             self._largest_forces = state.numbers["largest forces"]
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             if self.dynamics is not None:
@@ -253,15 +243,3 @@ class UnitedProblem:
     def pairs(self) -> list[ContactPair]:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
-
-    def _predict(self, ratio: float) -> None:
-        """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
-        n = self.config.n_owned * self.config.gdim
-        ahead = fem.Function(self.config.V)
-        ahead.x.array[:n] = self.system.deformation((self.committed - self._last)[:n])
-        ahead.x.scatter_forward()
-        self.u.x.array[:] = self.committed + RIM * ratio * ahead.x.array
-        for pair in self.pairs:
-            pair.project()
-            pair.predict(ratio)
-        self.u.x.array[:] = self.committed

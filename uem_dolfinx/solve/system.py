@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from mpi4py import MPI
 
@@ -19,6 +20,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
 from uem_dolfinx.contact.coupling import LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
@@ -26,15 +28,39 @@ from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.floating import FloatingBodies
-from uem_dolfinx.solve.newton import IterationState
+from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.solve.tangent import contact_curvature
 
-#: Residual relative to the forces at work below which contact forces can be trusted to release a contactor for good.
-#: [heuristic; norm of the forces; -]
-SETTLED = 1e-6
+#: A direct solve foretells gaps to this part of the increment, and forces to this part of its right-hand side.
+#: [convention; increment and right-hand side; test_system.py::test_what_a_solve_foretells]
+FORESEEN = 1e-8
 #: Part of the model's size that an active contactor's gap may be left with.
 #: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
 CLOSED = 1e-13
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Uniting equations of all pairs in one state, and what was made of them.
+
+    Attributes:
+        equations: of every pair.
+        independent: how those that got in each other's way were resolved; None if none could.
+        trial: P and c.
+        test: Q.
+    """
+
+    equations: list[LabelledEquations]
+    independent: IndependentEquations | None
+    trial: Restriction
+    test: Restriction
+
+
+@dataclass(frozen=True)
+class BodyState(IterationState):
+    """``IterationState`` with the rows that it was made of."""
+
+    rows: _Rows
 
 
 class BodySystem:
@@ -61,6 +87,12 @@ class BodySystem:
         self.config, self.comm = forces.config, forces.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self._factored: object = None
+        self._curvature: PETSc.Mat | None = None
+        self._pivoting = Pivoting()
+        #: Whether the last exchange has let go of a body that loads drive.
+        self._adrift = False
+        #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
+        self._swept = False
         self._find_meetings()
         self.floating = FloatingBodies(forces, self.pairs)
         self.place(returning=False)
@@ -122,25 +154,20 @@ class BodySystem:
             check_prescribed(pair)
         self.floating.end_step()
 
-    def deformation(self, du: Array) -> Array:
-        """An increment ``(n_owned * gdim,)`` without rigid motions of bodies that only contact holds."""
-        return self.floating.deformation(du)
-
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
         return self.forces.assemble()
 
-    def unite(self, cautious: bool) -> IterationState:
-        """Contact forces, active set and uniting equations at the present displacement.
+    def unite(self, settled: Settled) -> IterationState:
+        """Where the contactors belong at the present displacement, and the equations that follow.
 
-        1. Read the contact forces from the residual with the present equations.
-        2. Let every pair activate and release, whatever the others do.
-        3. Put contactors whose equations have changed where they now belong.
-        4. Let bodies that have lost their hold fall.
-        5. Take the test rows Q of the equations that follow, and Q'F.
-        6. Take the trial rows P, which are Q unless a coupling tells them apart.
+        1. Take Q'F with the present equations.
+        2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem foretold.
+        3. Let go of contactors past an end, and follow the others across bends, into corners and out of them.
+        4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
+        5. Take the equations that follow, Q'F with them, and who breaks the conditions of contact.
         """
         forces, pairs = self.forces, self.pairs
         if forces.stiffness is None and pairs:
@@ -148,36 +175,110 @@ class BodySystem:
             forces.update_tangent()
         F, rounding = forces.residual, self.rounding()
         with timed("uniting equations"):
-            equations = [pair.equations() for pair in pairs]
-            Q, independent = self._restrict([e.test for e in equations])
-            y = Q.pass_on(F)
-            self._read_forces(equations, independent, Q.multipliers(y))
-            settled = Q.reduce(y).norm() <= max(SETTLED * F.norm(), rounding)
-            changed = any([pair.decide(rounding, cautious, settled) for pair in pairs])
-            if changed:
+            rows = self._rows()
+            y = rows.test.pass_on(F)
+            residual = rows.test.reduce(y)
+            at_rest = settled(residual.norm(), F.norm(), rounding)
+            if at_rest:
+                self._take(self._read_forces(rows, y))
+            self._swept = not at_rest
+            moved = any([pair.follow() for pair in pairs])
+            if moved:
                 for pair in pairs:
                     pair.place_again()
-            changed = self.floating.fall_again(lambda: self.place(returning=False), changed, settled)
-            if changed:
-                F, equations = forces.residual, [pair.equations() for pair in pairs]
-                Q, _ = self._restrict([e.test for e in equations])
-                y = Q.pass_on(F)
-            P = Q if all(e.trial is e.test for e in equations) else self._restrict([e.trial for e in equations])[0]
-            residual = Q.reduce(y)
-        gap = max((pair.largest_gap() for pair in pairs), default=0.0)
-        return IterationState(
-            trial=P,
-            test=Q,
+            wrong = self._count([pair.wrong(pair.gap, pair.trial.lam, self._along(pair), rounding, 0.0, self._swept) for pair in pairs])
+            # one that is let go of falls, whatever the active set lacks
+            unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
+            fallen = self.floating.fall_again(lambda: self.place(returning=False), unsettled, at_rest)
+            if moved or fallen:
+                F, rows = forces.residual, self._rows()
+                residual = rows.test.reduce(rows.test.pass_on(F))
+        return self._state(rows, residual, rounding, moved or fallen, at_rest and wrong == 0)
+
+    def _rows(self) -> _Rows:
+        """Equations of all pairs in their present states, and P and Q (collective)."""
+        equations = [pair.equations() for pair in self.pairs]
+        Q, independent = self._restrict([e.test for e in equations])
+        P = Q if all(e.trial is e.test for e in equations) else self._restrict([e.trial for e in equations])[0]
+        return _Rows(equations, independent, P, Q)
+
+    def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
+        """What the loop sees of these rows (collective)."""
+        gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
+        return BodyState(
+            trial=rows.trial,
+            test=rows.test,
             residual=residual,
             norm=residual.norm(),
-            scale=F.norm(),
+            scale=self.forces.residual.norm(),
             rounding=rounding,
-            strain_rounding=forces.strain_rounding(),
+            strain_rounding=self.forces.strain_rounding(),
             gap=gap,
-            active=sum(pair.n_active for pair in pairs),
+            active=sum(pair.n_active for pair in self.pairs),
             changed=changed,
-            closed=gap <= CLOSED * self.config.size and forces.dirichlet_met(),
+            right=right,
+            closed=gap <= CLOSED * self.config.size and self.forces.dirichlet_met(),
+            rows=rows,
         )
+
+    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
+        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none (collective).
+
+        What ``du`` shows are gaps to first order and the contact forces that balance ``F + K du``.
+        """
+        if not self.pairs:
+            return None
+        assert isinstance(state, BodyState)
+        config, rows = self.config, state.rows
+        with timed("uniting equations"):
+            F = self.forces.tangent.K * du
+            if self._curvature is not None:
+                F.axpy(1.0, self._curvature * du)
+            F.axpy(1.0, self.forces.residual)
+            forces = self._read_forces(rows, rows.test.pass_on(F))
+            error = accuracy if self.solver.iterative else FORESEEN
+            increment = du.array_r.reshape(-1, config.gdim)
+            near = error * np.abs(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            tension = max(state.rounding, error * driving)
+            foreseen = [pair.foreseen(increment) for pair in self.pairs]
+            wrong = [
+                pair.wrong(gap, lam, self._along(pair), tension, near, self._swept)
+                for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces)
+            ]
+            count = self._count(wrong)
+            if not count or self._adrift:
+                self._take(forces)
+                return None
+            wrong = self._choose(wrong, foreseen, count)
+            for pair, w in zip(self.pairs, wrong):
+                pair.exchange(w)
+            rows = self._rows()
+            # a body that is let go has to fall first
+            self._adrift = self.floating.adrift
+            residual = rows.test.reduce(rows.test.pass_on(self.forces.residual))
+        return self._state(rows, residual, state.rounding, state.changed, False)
+
+    def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
+        """Which of the wrong contactors are exchanged now (collective)."""
+        touching = sum(pair.n_active for pair in self.pairs)
+        deepest = -min(float(gap[w.enter].min(initial=0.0)) for gap, w in zip(gaps, wrong))
+        worst = max(w.worst for w in wrong)
+        deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, worst))
+        if not self._pivoting.all_at_once(count):
+            return [w.among_the_worst(worst) for w in wrong]
+        if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
+            return [w.on_first_touch(gap, deepest) for gap, w in zip(gaps, wrong)]
+        return wrong
+
+    def _count(self, wrong: list[Wrong]) -> int:
+        """Number of wrong contactors over all pairs and ranks (collective)."""
+        return int(self.comm.allreduce(sum(w.count for w in wrong)))
+
+    def _along(self, pair: ContactPair) -> Array:
+        """Stiffness of the pair's contactors along their normals ``(n,)``."""
+        if self.forces.stiffness is None:
+            return np.ones(len(pair.nodes))
+        return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
@@ -194,22 +295,34 @@ class BodySystem:
         stacked = self.stacked or (independent is not None and independent.found)
         return Restriction(self.config, equations, free, self.forces.prescribed, stacked), independent
 
-    def _read_forces(self, equations: list[LabelledEquations], independent: IndependentEquations | None, lam: Array) -> None:
-        """Hand the contact forces to the pairs (collective)."""
+    def _read_forces(self, rows: _Rows, y: PETSc.Vec) -> list[tuple[Array, Array, Array]]:
+        """Contact forces of every pair, as ``Coupling.forces`` returns them, from forces that were passed on (collective)."""
+        lam = rows.test.multipliers(y)
         redundant = np.zeros(len(lam), dtype=bool)
-        if independent is not None:
-            lam = independent.forces(lam)
-            redundant = independent.redundant
-        start = 0
-        for pair, own in zip(self.pairs, equations):
+        if rows.independent is not None:
+            lam = rows.independent.forces(lam)
+            redundant = rows.independent.redundant
+        found, start = [], 0
+        for pair, own in zip(self.pairs, rows.equations):
             part = slice(start, start + len(own))
-            pair.read_forces(own, lam[part], redundant[part])
+            pair.set_redundant(own, redundant[part])
+            found.append(pair.forces(own, lam[part]))
             start += len(own)
+        return found
+
+    def _take(self, forces: list[tuple[Array, Array, Array]]) -> None:
+        """Hand the contact forces to the pairs."""
+        for pair, own in zip(self.pairs, forces):
+            pair.set_forces(*own)
 
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
         active = [pair.nodes[pair.trial.active] for pair in self.pairs]
         return self.forces.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
+
+    def forces_told_apart(self) -> float:
+        """Norm of the forces at those nodes where they are told from rounding of displacements and positions (collective)."""
+        return self.forces.told_apart(self.in_contact)
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` at the present displacement, with the active set of ``state``.
@@ -229,23 +342,24 @@ class BodySystem:
             self.floating.begin_motion()
             dynamics.accelerate(self.restriction(), self.forces.residual)
 
-    def active_set(self) -> int:
-        """Fingerprint of the active set, the same on all ranks."""
-        return hash(tuple(self.comm.allgather(zlib.crc32(b"".join(pair.trial.united_to for pair in self.pairs)))))
-
     # -- linear system ---------------------------------------------------------------------------------------------------
 
-    def linearise(self, state: IterationState, first: bool) -> PETSc.Vec:
-        """Tangent and united matrix ``Q'KP``; returns the right-hand side ``Q'(r - K c)``."""
+    def differentiate(self, first: bool) -> None:
+        """Tangent of the bodies and curvature of the contact at the present displacement (collective)."""
         forms.free_petsc_garbage(self.comm)
         if first or self.newton == "full":
             self.forces.update_tangent()
-        K, P, Q = self.forces.tangent.K, state.trial, state.test
         with timed("contact curvature"):
-            curvature = self.curvature() if self.consistent_tangent else None
+            self._curvature = self.curvature() if self.consistent_tangent else None
+        self._pivoting, self._adrift = Pivoting(), False
+
+    def linearise(self, state: IterationState) -> PETSc.Vec:
+        """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)`` (collective)."""
+        K, P, Q, curvature = self.forces.tangent.K, state.trial, state.test, self._curvature
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
-        made_of = self.comm.allgather((self.forces.tangent.number, exact, P.fingerprint(values=False)))
+        active = zlib.crc32(P.equations.active.tobytes())
+        made_of = self.comm.allgather((self.forces.tangent.number, exact, P.fingerprint(values=False), active))
         moving = (curvature is not None or Q is not P) and self.newton == "full"
         if moving or made_of != self._factored:
             self.solver.set_operator(P, K, curvature, Q)

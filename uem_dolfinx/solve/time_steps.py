@@ -55,8 +55,13 @@ class TimeStep:
 
     @property
     def newton_iterations(self) -> int:
-        """Number of linear solves."""
+        """Number of iterations, each with a tangent and at least one linear solve."""
         return len(self.iterations) - 1
+
+    @property
+    def exchanges(self) -> int:
+        """Number of further linear solves with the same tangents, each with another active set."""
+        return sum(i.exchanges for i in self.iterations)
 
     @property
     def start(self) -> float:
