@@ -268,7 +268,7 @@ class _Step:
         rhs: right-hand side of the last solve.
         dq: its unknowns.
         du: its increment; None if the active set did not settle.
-        driving: norm of the first right-hand side.
+        driving: its norm.
         linear_iterations: of all solves.
         exchanges: number of solves after the first.
     """
@@ -291,17 +291,16 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
         wanted: norm of the residual that convergence asks for.
         passing: whether another iteration follows in any case.
     """
-    driving, iterations = 0.0, 0
+    iterations = 0
     for exchanges in range(MOST_EXCHANGES + 1):
         rhs = system.linearise(state)
-        norm = rhs.norm()
-        driving = driving or norm
-        needed = ACCURACY_AT_THE_END * wanted / norm if norm > 0 else 0.0
+        driving = rhs.norm()
+        needed = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
         accuracy = min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END)
         dq, count = system.solve(rhs, accuracy)
         iterations += count
         du = system.move(state, dq)
-        better = system.exchange(state, du, norm, accuracy)
+        better = system.exchange(state, du, driving, accuracy)
         if better is None:
             return _Step(state, rhs, dq, du, driving, iterations, exchanges)
         state = better
