@@ -103,7 +103,8 @@ def write_at(file: MPI.File, offset: int, array: AnyArray) -> None:
         piece, status = data[i : i + PIECE], MPI.Status()
         file.Write_at(offset + i, [piece, MPI.BYTE], status)
         if status.Get_count(MPI.BYTE) != len(piece):
-            raise OSError(errno.ENOSPC, f"{status.Get_count(MPI.BYTE)} of {len(piece)} bytes written")
+            reason = f"{os.strerror(errno.ENOSPC)}, {status.Get_count(MPI.BYTE)} of {len(piece)} bytes written"
+            raise OSError(errno.ENOSPC, reason)
 
 
 def read_at(file: MPI.File, offset: int, array: AnyArray) -> None:

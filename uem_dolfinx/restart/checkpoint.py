@@ -72,6 +72,7 @@ def write_checkpoint(path: str | Path, state: State) -> None:
                 write_at(file, end + width * entry.numbering.first, part)
             end += width * entry.numbering.total
         content = {"state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers}
+        content["steps"] = state.steps
         with trouble:
             if comm.rank == 0:
                 text = _text(content)
@@ -130,6 +131,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         trouble.agree()
     state.numbers.clear()
     state.numbers.update(content["numbers"])
+    state.steps = content["steps"]
     state.move(content["motions"])
     for contact in state.contacts:
         contact.pair.project()
@@ -255,7 +257,6 @@ class Checkpoint:
         if every != int(every) or every < 1:
             raise ValueError(f"every = {every}: expected a number of steps, 1 or more")
         self.path, self.every = Path(path), int(every)
-        self._steps = 0
         self._state: State | None = None
         #: Signals that ask the run to end.
         self.interruption = Interruption()
@@ -296,11 +297,11 @@ class Checkpoint:
         """
         if self._state is None:
             raise CheckpointError(f"{self.path}: there is no state to keep yet; call begin(state) before the first step")
-        self._steps += 1
+        self._state.steps += 1
         number = self.interruption.agreed(self._state.comm)
         if number:
             self.end(number)
-        if self._steps % self.every == 0:
+        if self._state.steps % self.every == 0:
             write_checkpoint(self.path, self._state)
 
     def finish(self) -> None:
