@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 pytest.register_assert_rewrite(
-    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "restart_scenes", "resting_scenes"
+    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes", "resting_scenes", "results_scenes"
 )
 from helpers import complementary, highest
 

@@ -59,6 +59,13 @@ def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.
     return mesh.create_mesh(comm, cells=cells, x=x, e=ufl.Mesh(element))
 
 
+def vtk_nodes(cell: str, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Nodes of cells ``(n, n_nodes)`` from DOLFINx's order into that of VTK and XDMF."""
+    out = np.empty_like(nodes)
+    out[:, cpp.io.perm_vtk(getattr(mesh.CellType, cell), nodes.shape[1])] = nodes
+    return out
+
+
 def cell_name(domain: Any) -> str:
     """UFL's name of the cells, e.g. ``"triangle"``."""
     name = domain.ufl_cell().cellname
@@ -246,12 +253,17 @@ def set_bc_values(x: npt.NDArray[np.float64], bcs: Sequence[Any]) -> None:
 # ---------------------------------------------------------------------------------------------- files
 
 
-def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
-    """VTX writer with ``write(t)``, a context manager, for Functions of one element; refused without ADIOS2 (collective)."""
+def require_vtx(path: str | Path) -> None:
+    """Raise a MissingBackendError where DOLFINx cannot write VTX files."""
     if not has_vtx():
         raise MissingBackendError(
             f"VTX output of {path} needs ADIOS2, which DOLFINx {dolfinx.__version__} was built without; write XDMF instead."
         )
+
+
+def open_vtx(comm: MPI.Comm, path: str | Path, functions: Sequence[Any]) -> Any:
+    """VTX writer with ``write(t)``, a context manager, for Functions of one element; refused without ADIOS2 (collective)."""
+    require_vtx(path)
     return io.VTXWriter(comm, str(path), list(functions))
 
 

@@ -86,6 +86,12 @@ class CheckpointError(UEMError, OSError):
     __str__ = Exception.__str__
 
 
+class OutputError(UEMError, OSError):
+    """Results cannot be written."""
+
+    __str__ = Exception.__str__
+
+
 class ConvergenceError(UEMError, RuntimeError):
     """The united Newton loop did not converge; the committed state has been restored.
 

@@ -6,7 +6,6 @@ Calls that are alike in all versions of DOLFINx but would have to be repeated by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +15,7 @@ import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem, io, mesh
+from dolfinx import fem, mesh
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
@@ -183,13 +182,3 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
 def free_petsc_garbage(comm: MPI.Comm) -> None:
     """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective)."""
     PETSc.garbage_cleanup(comm)
-
-
-def open_xdmf(comm: MPI.Comm, path: str | Path, domain: Any) -> Any:
-    """XDMF file with the mesh in it, a context manager; its folder exists (collective).
-
-    ``write_function(u, t)`` takes Functions of the geometry's degree and DG0 ones, each with a ``name`` of its own.
-    """
-    file = io.XDMFFile(comm, str(path), "w")
-    file.write_mesh(domain)
-    return file

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -34,20 +35,16 @@ def agree(comm: MPI.Comm, error: Exception | None) -> None:
         raise error
 
 
-def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
-    """Call a function on every rank; what it raises on one is raised on all (collective).
-
-    Args:
-        comm: the communicator whose ranks have to agree.
-        f: called with ``args``.
-        args: of the function.
+@contextmanager
+def agreed(comm: MPI.Comm) -> Iterator[None]:
+    """What one rank raises within a ``with`` block is raised on all at its end (collective).
 
     Raises:
-        Exception: the function's own error, on several ranks a RuntimeError with its words if it cannot be sent as it is.
+        Exception: the error itself, on several ranks a RuntimeError with its words if it cannot be sent as it is.
     """
     found: Exception | None = None
     try:
-        f(*args)
+        yield
     except Exception as error:
         found = error
         if comm.size > 1:
@@ -56,6 +53,18 @@ def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
             except Exception:
                 found = RuntimeError(f"{type(error).__name__}: {error}")
     agree(comm, found)
+
+
+def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
+    """Call a function on every rank; what it raises on one is raised on all, as by ``agreed`` (collective).
+
+    Args:
+        comm: the communicator whose ranks have to agree.
+        f: called with ``args``.
+        args: of the function.
+    """
+    with agreed(comm):
+        f(*args)
 
 
 class Exchange:

@@ -155,7 +155,7 @@ def test_writing_that_fails_leaves_the_last_file(folder, monkeypatch):
         raise OSError("no space left on device")
 
     if COMM.rank == COMM.size - 1:
-        monkeypatch.setattr(checkpoint, "_write", full)
+        monkeypatch.setattr(checkpoint, "write_at", full)
     alike("cannot be written .no space left on device.", lambda: uem.write_checkpoint(folder / "run", small()))
     COMM.barrier()
     assert [f.name for f in folder.iterdir()] == ["run"] and (folder / "run").read_bytes() == before

@@ -143,7 +143,7 @@ def test_ranks_change(writer, reader, folder):
 @pytest.mark.parametrize(
     "other, match",
     [
-        ({"dynamic": False}, "for function 'velocity' expected nothing, found Lagrange 1"),
+        ({"dynamic": False}, "for function 'load start' expected Lagrange 1.*, found nothing"),
         (
             {"kind": "plane_stress"},
             "for function 'plastic_strain 1' expected Quadrature 2, 3 components .* found Quadrature 2, 4",

@@ -16,8 +16,9 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.errors import MissingBackendError
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.errors import MissingBackendError, OutputError
+from uem_dolfinx.files import REMEDY
+from uem_dolfinx.parallel import agree, agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
@@ -43,10 +44,13 @@ def figure(
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
+        OutputError: if the picture cannot be written.
+        Exception: what rank 0 raises in drawing, on all ranks.
     """
     if path is None or comm.rank != 0:
         agree(comm, None)
-        yield [None] * panels
+        with agreed(comm):
+            yield [None] * panels
         return
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -55,21 +59,26 @@ def figure(
         agree(comm, MissingBackendError(f"the picture {path} needs matplotlib ({missing}): install it, or leave the picture out"))
         raise
     agree(comm, None)
-    canvas = Figure(figsize=(panels * size[0], size[1]), constrained_layout=True)
-    FigureCanvasAgg(canvas)
-    yield list(np.atleast_1d(canvas.subplots(1, panels)))
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    canvas.savefig(path, dpi=150, bbox_inches="tight")
+    with agreed(comm):
+        canvas = Figure(figsize=(panels * size[0], size[1]), constrained_layout=True)
+        FigureCanvasAgg(canvas)
+        yield list(np.atleast_1d(canvas.subplots(1, panels)))
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            canvas.savefig(path, dpi=150, bbox_inches="tight")
+        except OSError as error:
+            raise OutputError(f"the picture {path} cannot be written ({error}): {REMEDY}") from error
 
 
 @contextmanager
 def _panel(picture: str | Path | Any, comm: MPI.Comm) -> Iterator[Any]:
-    """The panel that is given, or the one of a picture of this name (collective)."""
+    """The panel that is given, or the one of a picture of this name; what is raised in drawing is raised on all ranks (collective)."""
     if isinstance(picture, (str, Path)):
         with figure(picture, comm) as (panel,):
             yield panel
     else:
-        yield picture
+        with agreed(comm):
+            yield picture
 
 
 def plot_scene(

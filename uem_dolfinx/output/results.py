@@ -9,44 +9,59 @@ from typing import Any
 
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.files import aside, keep_aside, on_rank_0
 from uem_dolfinx.log import timed
 from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.output.xdmf import XdmfSeries, geometry_degree
 from uem_dolfinx.solve.load_steps import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
+
+#: Endings of VTX files, by the rank of what is in them.
+KINDS = ("scalars", "vectors")
 
 
 class HistoryWriter(Closing):
     """CSV file with one row per load step or time step, complete after every row.
 
-    Columns: ``factor`` or ``time``, ``newton_iterations``, and for every contact ``active``, ``max_gap``, the resultant
-    ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each followed by the contact's name where there
-    are several.
+    Columns: ``factor`` or ``time``, ``step`` (how many steps the problem has done), ``newton_iterations``, and for every contact
+    ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each followed
+    by the contact's name where there are several.
 
     Args:
         path: name of the file; its folder is made.
         problem: what the rows are read from.
-        resume: keep what a file that is there says about the time up to now, and go on after it.
+        resume: keep what a file that is there says about the steps up to now, and go on after them; False keeps it in a folder
+            beside, ``NAME.1`` or the next number, and begins anew.
+
+    Raises:
+        OutputError, CheckpointError, ValueError: see ``CsvTable``.
     """
 
     def __init__(self, path: str | Path, problem: UnitedProblem, *, resume: bool = False):
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
-        columns = ["factor" if dynamics is None else "time", "newton_iterations"]
+        columns = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
         for suffix in contact_suffixes(problem.contacts):
             columns += [f"active{suffix}", f"max_gap{suffix}"]
             columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
-        self.table = CsvTable(path, problem.comm, columns, dynamics if resume else None)
+        self._progress = problem.progress
+        self.table = CsvTable(path, problem.comm, columns, problem.progress if resume else None, key="step")
+        #: Steps of the problem that the file knew all about when it was gone on with.
+        self._known = problem.progress.steps if self.table.last else -1
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
-        """Append a row (collective).
+        """Append a row, unless the file that is gone on with has it (collective).
 
         Args:
             step: a converged step; or its factor or time alone, which leaves the number of iterations empty.
         """
-        row: list[object] = [clock(step), "" if isinstance(step, (int, float)) else step.newton_iterations]
+        self.table.check()
+        if self._progress.steps <= self._known:
+            return
+        row: list[object] = [clock(step), self._progress.steps, "" if isinstance(step, (int, float)) else step.newton_iterations]
         for contact in self.problem.contacts:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
@@ -60,44 +75,99 @@ class HistoryWriter(Closing):
 class ResultsWriter(Closing):
     """Time series of everything there is to see: fields for ParaView and the history.
 
-    Writes ``PATH.xdmf`` on every DOLFINx, ``PATH_vectors.bp`` and ``PATH_scalars.bp`` where it has ADIOS2, and
-    ``PATH.csv``. Fields: displacement; for every contact its pressure, gap, status and force; and whatever ``fields``
+    Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv``, and where DOLFINx has ADIOS2 ``PATH_vectors.bp`` and
+    ``PATH_scalars.bp``. Fields: displacement; for every contact its pressure, gap, status and force; and whatever ``fields``
     names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree 2 is interpolated.
+
+    After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
+    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``.
+
+        with uem.Checkpoint("out/run.uem") as checkpoint:
+            checkpoint.begin(problem.state())
+            with uem.ResultsWriter("out/run", problem, resume=True) as writer:
+                for step in uem.load_steps(problem, 20, checkpoint=checkpoint):
+                    writer.write(step)
 
     Args:
         path: name of the files without ending; its folder is made.
         problem: what is written.
         fields: further UFL expressions by name, scalar, vector or tensor; one value per cell, in XDMF only.
         vtx: whether to write VTX; None does where DOLFINx can.
+        resume: go on with XDMF and CSV files that are there: the steps up to the checkpoint stay, later ones are replaced. VTX files
+            cannot be gone on with: new steps go to ``PATH_vectors.1.bp``, or the next number. Without files, or where no
+            checkpoint was read, begin anew.
 
     Raises:
         MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
+        OutputError: if the files cannot be written; the steps before stay.
+        CheckpointError: if the files to go on with are of another run.
     """
 
     def __init__(
-        self, path: str | Path, problem: UnitedProblem, *, fields: Mapping[str, Any] | None = None, vtx: bool | None = None
+        self,
+        path: str | Path,
+        problem: UnitedProblem,
+        *,
+        fields: Mapping[str, Any] | None = None,
+        vtx: bool | None = None,
+        resume: bool = False,
     ):
-        self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
-        stem = Path(path)
-        if comm.rank == 0:
-            stem.parent.mkdir(parents=True, exist_ok=True)
-        comm.barrier()
+        self.problem, self._stem, mesh = problem, Path(path), problem.config.mesh
+        if vtx:
+            compat.require_vtx(path)
         self._expressions = dict(fields or {})
         spaces = {name: compat.function_space(mesh, ("DG", 0), e.ufl_shape) for name, e in self._expressions.items()}
         self._cellwise = {name: fem.Function(space, name=name) for name, space in spaces.items()}
-        n_vertices = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}[compat.cell_name(mesh)]
-        degree = 1 if compat.geometry_dofs(mesh).shape[1] == n_vertices else 2
-        self._nodal = {
-            n: fem.Function(compat.function_space(mesh, degree, u.ufl_shape), name=n) for n, u in self._sources().items()
-        }
-        self.history = HistoryWriter(stem.with_name(stem.name + ".csv"), problem)
-        self._xdmf = forms.open_xdmf(comm, stem.with_name(stem.name + ".xdmf"), mesh)
-        self._vtx = []
-        if compat.has_vtx() if vtx is None else vtx:
-            for rank, kind in enumerate(("scalars", "vectors")):
-                functions = [u for u in self._sources().values() if len(u.ufl_shape) == rank]
-                if functions:
-                    self._vtx.append(compat.open_vtx(comm, stem.with_name(f"{stem.name}_{kind}.bp"), functions))
+        degree, sources = geometry_degree(mesh), self._sources()
+        shapes = {u.ufl_shape: compat.function_space(mesh, degree, u.ufl_shape) for u in sources.values()}
+        self._nodal = {name: fem.Function(shapes[u.ufl_shape], name=name) for name, u in sources.items()}
+        self._wants_vtx = compat.has_vtx() if vtx is None else vtx
+        #: A run that no checkpoint has put forward has nothing to go on with, which is known for sure at the first step.
+        self._undecided = resume and not (problem.progress.resumed or problem.progress.steps)
+        if not resume:
+            self._make_way()
+        self._open(resume)
+
+    def _name(self, ending: str) -> Path:
+        return self._stem.with_name(self._stem.name + ending)
+
+    def _make_way(self) -> None:
+        """Keep the results of another run aside (collective)."""
+
+        def move() -> None:
+            self._stem.parent.mkdir(parents=True, exist_ok=True)
+            endings = [".xdmf", ".bin", ".h5", ".csv", *(f"_{kind}.bp" for kind in KINDS)]
+            xdmf, csv = self._name(".xdmf"), self._name(".csv")
+            if (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1):
+                keep_aside(self._stem, map(self._name, endings))
+
+        on_rank_0(self.problem.comm, f"the results {self._stem} cannot be written", move)
+
+    def _open(self, resume: bool) -> None:
+        """Begin the files, or go on with them (collective)."""
+        progress = self.problem.progress
+        self.history = HistoryWriter(self._name(".csv"), self.problem, resume=resume)
+        nodal, cellwise = list(self._nodal.values()), list(self._cellwise.values())
+        until = progress.steps if resume else None
+        self._xdmf = XdmfSeries(self._name(".xdmf"), self.problem.config.mesh, nodal, cellwise, until)
+        self._known = progress.steps if self._xdmf.n_steps else -1
+        self._vtx: list[Any] | None = None
+
+    def _open_vtx(self) -> list[Any]:
+        """VTX files, beside those that are there (collective)."""
+        opened, comm = [], self.problem.comm
+        for rank, kind in enumerate(KINDS):
+            functions = [u for u in self._sources().values() if len(u.ufl_shape) == rank]
+            if self._wants_vtx and functions:
+                stem = self._name(f"_{kind}")
+                first = stem.with_name(f"{stem.name}.bp")
+
+                def free(first: Path = first) -> Path:
+                    return aside(first.with_suffix(""), ".bp") if first.exists() else first
+
+                path = on_rank_0(comm, f"the results {first} cannot be written", free)
+                opened.append(compat.open_vtx(comm, path, functions))
+        return opened
 
     def _sources(self) -> dict[str, fem.Function]:
         """Functions of the problem by name, up to date (collective)."""
@@ -108,30 +178,41 @@ class ResultsWriter(Closing):
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
-        """Append the present state (collective).
+        """Append the present state, unless the files that are gone on with have it (collective).
 
         Args:
             step: a converged step, or a load factor or time; it becomes the time in the files.
+
+        Raises:
+            OutputError: if it cannot be written.
+            CheckpointError: if a checkpoint was read after the writer had been made with ``resume=True``.
+            ValueError: after ``close``.
         """
-        time = clock(step)
-        with timed("write fields"):
-            for name, u in self._sources().items():
-                out = self._nodal[name]
-                out.interpolate(u)
-                out.x.scatter_forward()
-                self._xdmf.write_function(out, time)
-            for name, out in self._cellwise.items():
-                compat.interpolate_expression(out, self._expressions[name])
-                self._xdmf.write_function(out, time)
-            for writer in self._vtx:
-                writer.write(time)
+        self.history.table.check()
+        if self._undecided:
+            self._undecided = False
+            self._make_way()
+            self._open(False)
+        if self._vtx is None:
+            self._vtx = self._open_vtx()
+        time, steps = clock(step), self.problem.progress.steps
+        if steps > self._known:
+            with timed("write fields"):
+                for name, u in self._sources().items():
+                    out = self._nodal[name]
+                    out.interpolate(u)
+                    out.x.scatter_forward()
+                for name, out in self._cellwise.items():
+                    compat.interpolate_expression(out, self._expressions[name])
+                self._xdmf.write(time, steps)
+                for writer in self._vtx:
+                    writer.write(time)
         self.history.write(step)
 
     def close(self) -> None:
-        """Close all files (collective)."""
+        """Close all files (collective where there are VTX files)."""
         self.history.close()
-        self._xdmf.close()
-        for writer in self._vtx:
+        for writer in self._vtx or []:
             writer.close()
         self._vtx = []
 

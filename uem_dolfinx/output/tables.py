@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import csv
+import io
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, Protocol, Self
+from typing import Any, Protocol, Self
 
 from mpi4py import MPI
 
 from uem_dolfinx.errors import CheckpointError
-from uem_dolfinx.log import timed
+from uem_dolfinx.files import aside, keep_aside, on_rank_0, replace_end
+from uem_dolfinx.log import logger, timed
 
 
 class Clock(Protocol):
-    """Something that tells the time, and how often a checkpoint has put it forward."""
+    """Something that tells how far a run is, in time or in steps, and how often a checkpoint has put it forward."""
 
-    time: float
-    resumed: int
+    @property
+    def time(self) -> float:
+        """How far it is."""
+
+    @property
+    def resumed(self) -> int:
+        """How often a checkpoint was read."""
 
 
 class Closing(ABC):
@@ -38,95 +46,103 @@ class Closing(ABC):
 class CsvTable(Closing):
     """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
 
-    A file that is gone on with stays as it is until the first row is written.
+    A file that is gone on with stays as it is until the first row is written. A file that a new one would replace is kept in a folder
+    beside it, ``NAME.1`` or the next number, if it has any rows; so is a copy of one that would lose rows although no checkpoint was
+    read.
 
     Args:
         path: name of the file; its folder is made.
         comm: communicator of the run.
-        columns: their names; the first is a load factor or a time that grows.
-        resume_at: keep the rows of a file that is there up to this value of the first column, and go on after them; of a clock, up
+        columns: their names.
+        resume_at: keep the rows of a file that is there up to this value of the column ``key``, and go on after them; of a clock, up
             to its present time. None begins a new file.
+        key: column that grows from row to row, by default the first.
 
     Raises:
-        OSError: of rank 0, on all ranks, if the file cannot be written.
+        OutputError: of rank 0, on all ranks, if the file cannot be written.
         ValueError, CheckpointError: likewise, if the file to go on with holds what is no number, or has other columns.
     """
 
-    def __init__(self, path: str | Path, comm: MPI.Comm, columns: Sequence[str], resume_at: float | Clock | None = None):
+    def __init__(
+        self,
+        path: str | Path,
+        comm: MPI.Comm,
+        columns: Sequence[str],
+        resume_at: float | Clock | None = None,
+        *,
+        key: str | None = None,
+    ):
         self.columns, self.comm, self.path = list(columns), comm, Path(path)
-        #: First and last row kept, by column, as numbers; empty in a new file.
-        self.first: dict[str, float] = {}
-        self.last: dict[str, float] = {}
-        self._file: IO[str] | None = None
+        self._key = 0 if key is None else self.columns.index(key)
         self._clock = None if resume_at is None or isinstance(resume_at, (int, float)) else resume_at
         self._resumed = 0 if self._clock is None else self._clock.resumed
         until: Any = resume_at if self._clock is None else self._clock.time
-        #: Where in the file the rows kept end, 0 without any; None once it has been cut there.
-        self._end: int | None = None
+        self._closed = False
+        #: Where in the file the rows kept end, and whether later ones follow that would be lost.
+        self._end, self._later = 0, False
+        kept = self._on_rank_0(lambda: self._begin(until))
+        numbers = [{name: float(value) for name, value in zip(self.columns, row) if value} for row in kept]
+        #: First and last row kept, by column, as numbers; empty in a new file.
+        self.first: dict[str, float] = numbers[0] if kept else {}
+        self.last: dict[str, float] = numbers[-1] if kept else {}
+
+    def _on_rank_0(self, action: Any) -> Any:
+        return on_rank_0(self.comm, f"the table {self.path} cannot be written", action)
+
+    def _begin(self, until: float | None) -> list[list[str]]:
+        """First and last row of a file to go on with; without one, begin a new file."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if until is not None and self.path.exists():
+            with self.path.open("r+", newline="", encoding="utf-8") as file:
+                kept = self._read(file, until)
+            return [*kept[:1], *kept[-1:]]
+        if self.path.is_file() and self.path.read_bytes().count(b"\n") > 1:
+            keep_aside(self.path.with_suffix(""), [self.path])
+        self.path.write_bytes(b"")
+        self._put(self.columns)
+        return []
+
+    def _read(self, file: Any, until: float) -> list[list[str]]:
+        """Rows of the file up to a value of the key; finds where they end."""
         kept: list[list[str]] = []
-
-        def begin() -> None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            if until is not None and self.path.exists():
-                self._file = self.path.open("r+", newline="", encoding="utf-8")
-                try:
-                    kept.extend(self._read(until))
-                except (OSError, ValueError):
-                    self.close()
-                    raise
-            else:
-                self._file, self._end = self.path.open("w", newline="", encoding="utf-8"), 0
-                self._cut()
-
-        self._on_rank_0(begin)
-        kept = comm.bcast([*kept[:1], *kept[-1:]])
-        if kept:
-            numbers = [{name: float(value) for name, value in zip(self.columns, row) if value} for row in kept]
-            self.first, self.last = numbers[0], numbers[-1]
-
-    def _read(self, until: float) -> list[list[str]]:
-        """Rows of the file up to a value of the first column; finds where they end."""
-        assert self._file is not None
-        kept: list[list[str]] = []
-        file, end = self._file, 0
-        head = file.readline()
-        if head.endswith("\n") and next(csv.reader([head])) != self.columns:
-            raise CheckpointError(
-                f"the table {self.path} belongs to another run: expected the columns {', '.join(self.columns)}, found "
-                f"{head.strip()}; choose another name, or remove it to start anew"
-            )
+        head, end = file.readline(), 0
+        if head.endswith("\n"):
+            if next(csv.reader([head])) != self.columns:
+                raise CheckpointError(
+                    f"the table {self.path} belongs to another run: expected the columns {', '.join(self.columns)}, found "
+                    f"{head.strip()}; choose another name, or remove it to start anew"
+                )
+            end = len(head.encode())
         while line := file.readline():
             row = next(csv.reader([line]), [])
             # a killed run may have left half a row
-            if not line.endswith("\n") or len(row) != len(self.columns) or float(row[0]) > until:
+            if not line.endswith("\n") or len(row) != len(self.columns):
+                break
+            if float(row[self._key]) > until:
+                self._later = True
                 break
             kept.append(row)
-            end = file.tell()
+            end += len(line.encode())
         self._end = end
         return kept
 
-    def _cut(self) -> None:
-        """Cut the file behind the rows kept, once; without any it begins with the names of the columns."""
-        if self._file is None or self._end is None:
-            return
-        self._file.seek(self._end)
-        self._file.truncate()
-        if self._end == 0:
-            csv.writer(self._file).writerow(self.columns)
-        self._file.flush()
-        self._end = None
+    def _put(self, row: Sequence[Any]) -> None:
+        """Write a row behind the rows kept."""
+        text = io.StringIO(newline="")
+        csv.writer(text).writerow([repr(float(v)) if isinstance(v, float) else v for v in row])
+        data = text.getvalue().encode()
+        replace_end(self.path, self._end, data)
+        self._end += len(data)
 
-    def _on_rank_0(self, action: Callable[[], None]) -> None:
-        """Do something on rank 0; what it raises about the file is raised on all ranks (collective)."""
-        error = None
-        if self.comm.rank == 0:
-            try:
-                action()
-            except (OSError, ValueError) as found:
-                error = found
-        error = self.comm.bcast(error)
-        if error is not None:
-            raise error
+    def check(self) -> None:
+        """Raise a ValueError once closed, a CheckpointError if a checkpoint was read after the table was made to go on with its file."""
+        if self._closed:
+            raise ValueError(f"the table {self.path} is closed: write before close(), inside of its with block")
+        if self._clock is not None and self._clock.resumed != self._resumed:
+            raise CheckpointError(
+                f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "
+                "call checkpoint.begin(problem.state()) before you make what writes with resume=True"
+            )
 
     @timed("write table")
     def write(self, row: Sequence[Any]) -> None:
@@ -135,23 +151,21 @@ class CsvTable(Closing):
         Raises as the table itself, and if it is closed (ValueError) or a checkpoint was read after it had been made to go on with its
         file, which stays as it was (CheckpointError).
         """
-        if self._clock is not None and self._clock.resumed != self._resumed:
-            raise CheckpointError(
-                f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "
-                "call checkpoint.begin(problem.state()) before you make what writes tables with resume=True"
-            )
+        self.check()
 
         def append() -> None:
-            if self._file is None:
-                raise ValueError(f"the table {self.path} is closed: write before close(), inside of its with block")
-            self._cut()
-            csv.writer(self._file).writerow([repr(float(v)) if isinstance(v, float) else v for v in row])
-            self._file.flush()
+            if self._later and self._clock is not None and self._resumed == 0:
+                folder = aside(self.path.with_suffix(""))
+                folder.mkdir()
+                shutil.copy2(self.path, folder)
+                logger.warning("%s: rows of an earlier run are kept in %s", self.path, folder)
+            self._later = False
+            if self._end == 0:
+                self._put(self.columns)
+            self._put(row)
 
         self._on_rank_0(append)
 
     def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        """Take no more rows."""
+        self._closed = True

@@ -9,13 +9,11 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
-import threading
 from collections.abc import Iterator
 from hashlib import blake2b
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any
+from types import TracebackType
+from typing import Any, NoReturn
 
 from mpi4py import MPI
 
@@ -23,9 +21,10 @@ import numpy as np
 
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.files import REMEDY, Trouble, flush, read_at, write_at
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agree
-from uem_dolfinx.restart.numbering import DIGEST, as_bytes, fingerprint, hashes
+from uem_dolfinx.restart.interruption import Interruption, end_run
+from uem_dolfinx.restart.numbering import DIGEST, fingerprint, hashes
 from uem_dolfinx.restart.state import State
 
 #: Version of the file's layout and of the names in it.
@@ -36,39 +35,6 @@ MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
 #: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
-#: Bytes that MPI-IO gets at once, because it counts them in C's int.
-#: [format; bytes; -]
-PIECE = 2**30
-#: Exit status of a run that has ended on SIGTERM, as shells have it.
-#: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
-TERMINATED = 128 + signal.SIGTERM
-
-
-class _Trouble:
-    """First thing that went wrong on this rank: what is collective goes on, and all ranks raise at its end."""
-
-    def __init__(self, comm: MPI.Comm, what: str, remedy: str):
-        self.comm, self.what, self.remedy = comm, what, remedy
-        self._error: CheckpointError | None = None
-
-    def __enter__(self) -> _Trouble:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> bool:
-        if self._error is None and isinstance(error, CheckpointError):
-            self._error = error
-        elif self._error is None and isinstance(error, (OSError, MPI.Exception)):
-            self._error = CheckpointError(f"{self.what} ({error}): {self.remedy}")
-        return isinstance(error, (OSError, MPI.Exception))
-
-    @property
-    def none(self) -> bool:
-        """Whether nothing went wrong here yet."""
-        return self._error is None
-
-    def agree(self) -> None:
-        """Raise the error of the first rank that has one (collective)."""
-        agree(self.comm, self._error)
 
 
 def write_checkpoint(path: str | Path, state: State) -> None:
@@ -88,7 +54,7 @@ def write_checkpoint(path: str | Path, state: State) -> None:
         hook()
     with timed("write checkpoint"):
         described, beside = state.describe(), _beside(path)
-        trouble = _Trouble(comm, f"the checkpoint {path} cannot be written", "check the folder, its rights and its free space")
+        trouble = _trouble(comm, f"the checkpoint {path} cannot be written", REMEDY)
         with trouble:
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -103,23 +69,24 @@ def write_checkpoint(path: str | Path, state: State) -> None:
             width = part.dtype.itemsize * int(np.prod(part.shape[1:]))
             tables.append(hashes(part))
             with trouble:
-                _write(file, end + width * entry.numbering.first, part)
+                write_at(file, end + width * entry.numbering.first, part)
             end += width * entry.numbering.total
         content = {"state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers}
+        content["steps"] = state.steps
         with trouble:
             if comm.rank == 0:
                 text = _text(content)
                 for offset, data in ((end, text), (0, _head(end, text))):
-                    _write(file, offset, np.frombuffer(data, dtype=np.uint8))
+                    write_at(file, offset, np.frombuffer(data, dtype=np.uint8))
         for end_of_writing in (file.Sync, file.Close):
             with trouble:
                 end_of_writing()
         complete = all(comm.allgather(trouble.none))
         with trouble:
             if comm.rank == 0 and complete:
-                _flush(beside)
+                flush(beside)
                 os.replace(beside, path)
-                _flush(path.parent)
+                flush(path.parent)
             elif comm.rank == 0:
                 beside.unlink(missing_ok=True)
         trouble.agree()
@@ -141,7 +108,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
     for hook in state.collect:
         hook()
     with timed("read checkpoint"):
-        trouble = _Trouble(comm, f"the checkpoint {path} cannot be read", "check its rights, or go on from another one")
+        trouble = _trouble(comm, f"the checkpoint {path} cannot be read", "check its rights, or go on from another one")
         content: dict[str, Any] = {}
         with trouble:
             content = _content(path) if comm.rank == 0 else {}
@@ -164,6 +131,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         trouble.agree()
     state.numbers.clear()
     state.numbers.update(content["numbers"])
+    state.steps = content["steps"]
     state.move(content["motions"])
     for contact in state.contacts:
         contact.pair.project()
@@ -176,35 +144,19 @@ def _beside(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
-def _flush(path: Path) -> None:
-    """Wait until a file or folder is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _trouble(comm: MPI.Comm, what: str, remedy: str) -> Trouble:
+    return Trouble(comm, what, remedy, CheckpointError)
 
 
-def _write(file: MPI.File, offset: int, array: AnyArray) -> None:
-    """Write an array at an offset in bytes."""
-    data = as_bytes(np.ascontiguousarray(array))
-    for i in range(0, len(data), PIECE):
-        piece, status = data[i : i + PIECE], MPI.Status()
-        file.Write_at(offset + i, [piece, MPI.BYTE], status)
-        if status.Get_count(MPI.BYTE) != len(piece):
-            raise OSError(f"{status.Get_count(MPI.BYTE)} of {len(piece)} bytes written")
-
-
-def _parts(file: MPI.File, state: State, trouble: _Trouble) -> Iterator[AnyArray]:
+def _parts(file: MPI.File, state: State, trouble: Trouble) -> Iterator[AnyArray]:
     """This rank's parts of the tables, one after the other (collective)."""
     end = HEAD
     for entry in state.entries:
         rows = entry.to_checkpoint()
         part = np.zeros((entry.numbering.count, *rows.shape[1:]), dtype=rows.dtype)
-        width, data = part.dtype.itemsize * int(np.prod(part.shape[1:])), as_bytes(part)
+        width = part.dtype.itemsize * int(np.prod(part.shape[1:]))
         with trouble:
-            for i in range(0, len(data), PIECE):
-                file.Read_at(end + width * entry.numbering.first + i, [data[i : i + PIECE], MPI.BYTE])
+            read_at(file, end + width * entry.numbering.first, part)
         end += width * entry.numbering.total
         yield part
 
@@ -283,8 +235,9 @@ def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> Non
 class Checkpoint:
     """Keeps a run's state in a file, so that the same script goes on where it was killed.
 
-    As a context manager it also takes care of SIGTERM, which batch systems send before they kill: the step is finished, the state
-    written, and the run ends with exit status 143. Between steps it costs one number sent around.
+    As a context manager, and while load or time steps run with it, it takes care of Ctrl-C and of SIGTERM, which batch systems send
+    before they kill: whichever rank gets it, all finish the step, or the iteration where load and time steps are in one, write the last
+    state, and raise KeyboardInterrupt or end with exit status 143. Between steps it costs one number sent around.
 
         with uem.Checkpoint("out/run.uem", every=50) as checkpoint:
             for step in uem.time_steps(problem, dt, end, checkpoint=checkpoint):
@@ -304,9 +257,9 @@ class Checkpoint:
         if every != int(every) or every < 1:
             raise ValueError(f"every = {every}: expected a number of steps, 1 or more")
         self.path, self.every = Path(path), int(every)
-        self._steps, self._asked_to_end, self._handles = 0, False, False
         self._state: State | None = None
-        self._before: Any = None
+        #: Signals that ask the run to end.
+        self.interruption = Interruption()
 
     def begin(self, state: State) -> bool:
         """Go on from the file if there is one, and remove what a killed run has left of another (collective).
@@ -318,7 +271,7 @@ class Checkpoint:
             CheckpointError: if there is a file that is damaged or belongs to another run.
         """
         self._state, comm, found = state, state.comm, False
-        trouble = _Trouble(comm, f"what a killed run left beside {self.path} cannot be removed", "check the rights of the folder")
+        trouble = _trouble(comm, f"what a killed run left beside {self.path} cannot be removed", "check the rights of the folder")
         with trouble:
             if comm.rank == 0:
                 _beside(self.path).unlink(missing_ok=True)
@@ -340,48 +293,39 @@ class Checkpoint:
 
         Raises:
             CheckpointError: if it cannot be written; an earlier file stays.
-            SystemExit: with status 143, after writing, if any rank has got SIGTERM.
+            KeyboardInterrupt, SystemExit: after writing, if any rank has got Ctrl-C or SIGTERM.
         """
         if self._state is None:
             raise CheckpointError(f"{self.path}: there is no state to keep yet; call begin(state) before the first step")
-        self._steps += 1
-        end = bool(self._state.comm.allreduce(int(self._asked_to_end)))
-        if end or self._steps % self.every == 0:
+        self._state.steps += 1
+        number = self.interruption.agreed(self._state.comm)
+        if number:
+            self.end(number)
+        if self._state.steps % self.every == 0:
             write_checkpoint(self.path, self._state)
-        if end:
-            self._end()
 
     def finish(self) -> None:
         """Write the end state, from which the same script goes on if it is given a later end (collective).
 
         Raises:
             CheckpointError: if it cannot be written; an earlier file stays.
-            SystemExit: with status 143, after writing, if any rank has got SIGTERM.
+            KeyboardInterrupt, SystemExit: after writing, if any rank has got Ctrl-C or SIGTERM.
         """
         if self._state is not None:
+            number = self.interruption.agreed(self._state.comm)
+            if number:
+                self.end(number)
             write_checkpoint(self.path, self._state)
-            if self._state.comm.allreduce(int(self._asked_to_end)):
-                self._end()
 
-    def _end(self) -> None:
-        self._asked_to_end = False
-        logger.warning("ended by SIGTERM; the checkpoint %s holds the last step", self.path)
-        raise SystemExit(TERMINATED)
-
-    def _on_sigterm(self, number: int, frame: FrameType | None) -> None:
-        self._asked_to_end = True
+    def end(self, number: int) -> NoReturn:
+        """Write the state and end the run on a signal of this number (collective)."""
+        if self._state is not None:
+            write_checkpoint(self.path, self._state)
+        end_run(number, f"the checkpoint {self.path} holds the last step")
 
     def __enter__(self) -> Checkpoint:
-        # elsewhere Python does not allow it
-        self._handles = threading.current_thread() is threading.main_thread()
-        if self._handles:
-            self._before = signal.signal(signal.SIGTERM, self._on_sigterm)
+        self.interruption.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._handles:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL if self._before is None else self._before)
-        if self._asked_to_end:
-            # nobody has acted on it
-            self._asked_to_end = False
-            signal.raise_signal(signal.SIGTERM)
+        self.interruption.__exit__(kind, error, trace)

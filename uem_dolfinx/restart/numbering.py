@@ -8,11 +8,11 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import AnyArray, Ints
 from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.files import as_bytes
 from uem_dolfinx.parallel import Exchange, agree
 
 #: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
@@ -109,11 +109,6 @@ def mesh_fingerprint(mesh: Any) -> str:
     cells = Numbering(mesh.comm, forms.original_cells(mesh)[:n], n_cells(mesh))
     given = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
     return fingerprint(mesh.comm, [hashes(cells.to_table(values[nodes])) for values in (given, mesh.geometry.x)])
-
-
-def as_bytes(array: AnyArray) -> npt.NDArray[np.uint8]:
-    """The bytes of a contiguous array, in place."""
-    return array.reshape(-1).view(np.uint8)
 
 
 def hashes(part: AnyArray) -> list[bytes]:

@@ -108,6 +108,7 @@ class State:
         numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
         collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
         restore: called on all ranks after reading, to go on from them.
+        steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """
 
     mesh: Any
@@ -116,6 +117,7 @@ class State:
     numbers: dict[str, Any] = field(default_factory=dict)
     collect: list[Callable[[], None]] = field(default_factory=list)
     restore: list[Callable[[], None]] = field(default_factory=list)
+    steps: int = 0
 
     @property
     def comm(self) -> MPI.Comm:

@@ -172,7 +172,14 @@ class UnitedSystem(Protocol):
 
 
 def solve_united(
-    system: UnitedSystem, *, rtol: float, max_iterations: int, line_search: bool, verbose: bool, forces_before: float = 0.0
+    system: UnitedSystem,
+    *,
+    rtol: float,
+    max_iterations: int,
+    line_search: bool,
+    verbose: bool,
+    forces_before: float = 0.0,
+    heed: Callable[[], None] | None = None,
 ) -> list[Iteration]:
     """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
 
@@ -183,6 +190,7 @@ def solve_united(
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
         forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
+        heed: called on all ranks between iterations; what it raises ends the loop.
 
     Returns:
         The history; its last entry is the converged state.
@@ -243,6 +251,8 @@ def solve_united(
                 history,
             )
         length = _advance(system, step.state, step.rhs, step.dq, step.du, line_search)
+        if heed is not None:
+            heed()
     last = history[-1]
     raise ConvergenceError(
         f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "

@@ -24,6 +24,7 @@ from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.step_control import StepControl
+from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
 
 
@@ -111,6 +112,8 @@ class UnitedProblem:
         self.system = method(self.forces, pairs, solver, newton=newton, consistent_tangent=consistent_tangent)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
+        #: How far the problem is, in steps and in load.
+        self.progress = Progress()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         self._largest_forces = 0.0
@@ -160,6 +163,7 @@ class UnitedProblem:
                 line_search=self.line_search,
                 verbose=self.verbose,
                 forces_before=self._largest_forces,
+                heed=lambda: self.progress.heed(self.comm),
             )
             self.system.end_step()
         except UEMError:
@@ -178,6 +182,7 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
+        self.progress.steps += 1
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -196,9 +201,12 @@ class UnitedProblem:
         Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
         added must differ from those here.
         """
-        stiffness = fem.Function(self.config.V)
+        stiffness, start = fem.Function(self.config.V), fem.Function(self.config.V)
         functions = {"displacement": self.u, "stiffness": stiffness}
-        if self.dynamics is not None:
+        ramped = self.dynamics is None
+        if self.dynamics is None:
+            functions |= {"load start": start}
+        else:
             d = self.dynamics
             functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
         for i, material in enumerate(self.materials, 1):
@@ -210,6 +218,9 @@ class UnitedProblem:
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
             state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
+            state.numbers |= self.progress.to_checkpoint(ramped)
+            if ramped and self.progress.ramp:
+                start.x.array[:] = self.progress.start
             if self.dynamics is not None:
                 state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
@@ -217,6 +228,7 @@ class UnitedProblem:
             self.committed = np.array(self.u.x.array)
             self._largest_forces = state.numbers["largest forces"]
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
+            self.progress.from_checkpoint(state.numbers, start.x.array if ramped else None)
             if self.dynamics is not None:
                 self.dynamics.from_checkpoint(state.numbers)
                 self.step_control.from_checkpoint(state.numbers)

@@ -18,6 +18,7 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH, EnergyGivenError
+from uem_dolfinx.solve.stepping import between_steps
 from uem_dolfinx.solve.tunnelling import check_tunnelling
 
 #: Rounding of a time, a few units in its last place.
@@ -102,6 +103,7 @@ def time_steps(
         TunnellingError: if a contactor passes through a target even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
     dynamics = problem.dynamics
     if dynamics is None:
@@ -117,13 +119,12 @@ def time_steps(
         )
     if checkpoint is not None and not checkpoint.begun:
         checkpoint.begin(problem.state())
-    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt, checkpoint)
-    return iter(progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt))))
+    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
+    shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
+    return between_steps(problem.comm, problem.progress, shown, checkpoint)
 
 
-def _time_steps(
-    problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, checkpoint: Checkpoint | None
-) -> Iterator[TimeStep]:
+def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
     """The steps of ``time_steps``."""
     control = problem.step_control
     control.begin(dt)
@@ -157,10 +158,6 @@ def _time_steps(
         left = tuple(name for name, was, now in changes if was and not now)
         yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
         before = after
-        if checkpoint is not None:
-            checkpoint.step()
-    if checkpoint is not None:
-        checkpoint.finish()
 
 
 def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:

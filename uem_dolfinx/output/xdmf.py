@@ -1,0 +1,297 @@
+"""Time series of fields in XDMF: ``NAME.xdmf`` says what stands where in ``NAME.bin``, the numbers as they are in memory.
+
+Everything is in the order of the mesh's input, so that any number of ranks writes the same files and goes on with them. A step is in
+the XDMF file once all of its numbers are in the other one: a run that is killed leaves whole steps.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import AnyArray
+from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.files import REMEDY, Trouble, on_rank_0, read_at, replace_end, write_at
+from uem_dolfinx.restart.numbering import Numbering, n_cells, node_numbering
+
+#: XDMF's names of cells, by name and number of nodes.
+TOPOLOGIES = {
+    ("triangle", 3): "Triangle", ("triangle", 6): "Triangle_6",
+    ("quadrilateral", 4): "Quadrilateral", ("quadrilateral", 9): "Quadrilateral_9",
+    ("tetrahedron", 4): "Tetrahedron", ("tetrahedron", 10): "Tetrahedron_10",
+    ("hexahedron", 8): "Hexahedron", ("hexahedron", 27): "Hexahedron_27",
+}  # fmt: skip
+#: What every file begins with.
+HEAD_OF_FILE = (
+    '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n<Domain>\n<Grid Name="steps" GridType="Collection" CollectionType="Temporal">\n'
+)
+#: What every file ends with.
+TAIL = "</Grid>\n</Domain>\n</Xdmf>\n"
+#: Characters that XML wants otherwise.
+ESCAPED = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;"})
+#: A step, and what is known of it.
+STEP = re.compile(
+    r'<Grid Name="mesh">\n<Time Value="([^"]+)"/>\n<Information Name="step" Value="(\d+)"/>\n.*?</Grid>\n', re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers at nodes or cells, in the order of the mesh's input.
+
+    Attributes:
+        rows: this rank's, in its own order ``(n, width)``.
+        numbering: where they go.
+    """
+
+    rows: Callable[[], AnyArray]
+    width: int
+    numbering: Numbering
+
+    @property
+    def size(self) -> int:
+        """Bytes of all rows."""
+        return 8 * self.width * self.numbering.total
+
+
+class XdmfSeries:
+    """Fields over time on one mesh, whose nodes are those of a Lagrange space of the geometry's degree (making one is collective).
+
+    Args:
+        path: of the XDMF file, in a folder that is there.
+        mesh: the mesh.
+        nodal: scalar or vector Functions of that Lagrange space, with names.
+        cellwise: scalar, vector or tensor DG0 Functions, with names.
+        resume_at: keep the steps of files that are there up to this number, and go on after them; the files stay as they are until
+            the first step is written. None begins new ones.
+
+    Raises:
+        OutputError: if the files cannot be written.
+        CheckpointError: if those to go on with hold other fields or another mesh.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        mesh: Any,
+        nodal: Sequence[fem.Function],
+        cellwise: Sequence[fem.Function],
+        resume_at: int | None = None,
+    ):
+        self.path, self.comm, self._mesh = path, mesh.comm, mesh
+        self._numbers = path.with_suffix(".bin")
+        S = compat.function_space(mesh, geometry_degree(mesh))
+        known: dict[int, Numbering] = {}
+        self._fields: list[tuple[fem.Function, str, Table]] = []
+        for centre, functions in (("Node", nodal), ("Cell", cellwise)):
+            for u in functions:
+                V = u.function_space
+                if id(V) not in known:
+                    known[id(V)] = _numbering(V)
+                self._fields.append((u, centre, self._field(u, known[id(V)])))
+        self._cells, self._nodes = self._mesh_tables(S)
+        #: Steps in the files.
+        self.n_steps = 0
+        #: Where the last one ends in the XDMF file, and whether the files go on behind it.
+        self._end, self._more = 0, False
+        if resume_at is None or not on_rank_0(self.comm, self._trouble, path.exists):
+            self._begin()
+        else:
+            self._go_on(resume_at)
+
+    @property
+    def _trouble(self) -> str:
+        return f"the results {self.path} cannot be written"
+
+    # -- tables --------------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _field(u: fem.Function, numbering: Numbering) -> Table:
+        """Rows of a Function, vectors and tensors with three components in each direction, as XDMF wants them."""
+        shape, n = tuple(u.ufl_shape), u.function_space.dofmap.index_map.size_local
+
+        def rows() -> AnyArray:
+            padded = np.zeros((n, *(3 for _ in shape)))
+            padded[(slice(None), *map(slice, shape))] = u.x.array.reshape(-1, *shape)[:n]
+            return padded.reshape(n, -1)
+
+        return Table(rows, 3 ** len(shape), numbering)
+
+    def _mesh_tables(self, S: Any) -> tuple[Table, Table]:
+        """Nodes of every cell in VTK's order, and coordinates of the nodes."""
+        numbering, place = _numbering(S), fem.Function(S)
+        owned, gdim = len(numbering.place), self._mesh.geometry.dim
+        place.x.array[:owned] = numbering.place
+        place.x.scatter_forward()
+        n, keys = _cell_keys(self._mesh)
+        cells = compat.vtk_nodes(compat.cell_name(self._mesh), place.x.array[compat.cell_dofs(S)[:n]].astype(np.int64))
+        x = np.ascontiguousarray(S.tabulate_dof_coordinates()[:owned, :gdim])
+        order = Numbering(self.comm, keys, n_cells(self._mesh))
+        return Table(lambda: cells, cells.shape[1], order), Table(lambda: x, gdim, numbering)
+
+    # -- what the XDMF file says ---------------------------------------------------------------------------------------
+
+    def _item(self, table: Table, seek: int, kind: str = "Float") -> str:
+        return (
+            f'<DataItem Dimensions="{table.numbering.total} {table.width}" NumberType="{kind}" Precision="8" Format="Binary" '
+            f'Endian="{sys.byteorder.capitalize()}" Seek="{seek}">{self._numbers.name.translate(ESCAPED)}</DataItem>'
+        )
+
+    def _describe(self, k: int, time: float, step: int) -> str:
+        """Text of the k-th step in the files."""
+        cells, nodes, name = self._cells, self._nodes, compat.cell_name(self._mesh)
+        short = f"{time:g}"
+        lines = [
+            '<Grid Name="mesh">',
+            f'<Time Value="{short if float(short) == time else repr(float(time))}"/>',
+            f'<Information Name="step" Value="{step}"/>',
+            f'<Topology TopologyType="{TOPOLOGIES[name, cells.width]}" NumberOfElements="{cells.numbering.total}">',
+            f"{self._item(cells, 0, 'Int')}</Topology>",
+            f'<Geometry GeometryType="{"XY" if nodes.width == 2 else "XYZ"}">{self._item(nodes, cells.size)}</Geometry>',
+        ]
+        seek = self._start(k)
+        for u, centre, table in self._fields:
+            kind = ("Scalar", "Vector", "Tensor")[len(u.ufl_shape)]
+            head = f'<Attribute Name="{u.name.translate(ESCAPED)}" AttributeType="{kind}" Center="{centre}">'
+            lines.append(f"{head}{self._item(table, seek)}</Attribute>")
+            seek += table.size
+        return "\n".join([*lines, "</Grid>\n"])
+
+    def _start(self, k: int) -> int:
+        """Where the k-th step begins in the file of numbers."""
+        return self._cells.size + self._nodes.size + k * sum(table.size for _, _, table in self._fields)
+
+    # -- writing and going on ------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Begin new files with the mesh (collective)."""
+
+        def begin() -> None:
+            self._numbers.write_bytes(b"")
+            self.path.write_bytes((HEAD_OF_FILE + TAIL).encode())
+
+        on_rank_0(self.comm, self._trouble, begin)
+        self._end = len(HEAD_OF_FILE.encode())
+        self._write(0, [self._cells, self._nodes])
+
+    def _write(self, offset: int, tables: Sequence[Table]) -> None:
+        """Write tables one after the other (collective)."""
+        trouble = Trouble(self.comm, self._trouble)
+        with trouble:
+            file = MPI.File.Open(self.comm, str(self._numbers), MPI.MODE_CREATE | MPI.MODE_WRONLY)
+        trouble.agree()
+        for table in tables:
+            part = table.numbering.to_table(table.rows())
+            with trouble:
+                write_at(file, offset + 8 * table.width * table.numbering.first, part)
+            offset += table.size
+        with trouble:
+            file.Close()
+        trouble.agree()
+
+    def _go_on(self, last: int) -> None:
+        """Find the steps to keep, and see that they are of this mesh and these fields (collective)."""
+        other = f"the results {self.path} belong to another run"
+        remedy = "choose another name, or move them away to start anew"
+
+        def read() -> tuple[int, int, bool]:
+            text = self.path.read_text(encoding="utf-8")
+            steps = list(STEP.finditer(text))
+            kept = [s for s in steps if int(s[2]) <= last]
+            if not text.startswith(HEAD_OF_FILE) or any(
+                s[0] != self._describe(k, float(s[1]), int(s[2])) for k, s in enumerate(kept)
+            ):
+                raise CheckpointError(f"{other}: expected the fields {self._names} on {self._size}; {remedy}")
+            size = self._numbers.stat().st_size
+            if size < self._start(len(kept)):
+                raise CheckpointError(
+                    f"{self._numbers} is damaged: expected {self._start(len(kept))} bytes, found {size}; {remedy}"
+                )
+            known = text[: kept[-1].end()] if kept else HEAD_OF_FILE
+            return len(kept), len(known.encode()), text != known + TAIL
+
+        self.n_steps, self._end, self._more = on_rank_0(self.comm, f"the results {self.path} cannot be gone on with", read)
+        trouble = Trouble(self.comm, f"the results {self.path} cannot be read", REMEDY, CheckpointError)
+        with trouble:
+            file = MPI.File.Open(self.comm, str(self._numbers), MPI.MODE_RDONLY)
+        trouble.agree()
+        offset = 0
+        for table in (self._cells, self._nodes):
+            part = table.numbering.to_table(table.rows())
+            found = np.zeros_like(part)
+            with trouble:
+                read_at(file, offset + 8 * table.width * table.numbering.first, found)
+                if not np.array_equal(part, found):
+                    raise CheckpointError(f"{other}: expected the mesh of this one, found another; {remedy}")
+            offset += table.size
+        with trouble:
+            file.Close()
+        trouble.agree()
+
+    def _cut(self) -> None:
+        """Cut the files behind the steps kept."""
+        replace_end(self.path, self._end, TAIL.encode())
+        os.truncate(self._numbers, self._start(self.n_steps))
+
+    @property
+    def _names(self) -> str:
+        return ", ".join(u.name for u, _, _ in self._fields)
+
+    @property
+    def _size(self) -> str:
+        return f"{self._cells.numbering.total} cells and {self._nodes.numbering.total} nodes"
+
+    def write(self, time: float, step: int) -> None:
+        """Append the present values (collective).
+
+        Args:
+            time: of the step in the files.
+            step: its number, by which ``resume_at`` knows it.
+
+        Raises:
+            OutputError: if they cannot be written; the steps before stay.
+        """
+        k = self.n_steps
+        if self._more:
+            on_rank_0(self.comm, self._trouble, self._cut)
+            self._more = False
+        self._write(self._start(k), [table for _, _, table in self._fields])
+        text = self._describe(k, time, step).encode()
+        on_rank_0(self.comm, self._trouble, lambda: replace_end(self.path, self._end, text + TAIL.encode()))
+        self._end += len(text)
+        self.n_steps += 1
+
+
+def geometry_degree(mesh: Any) -> int:
+    """Degree of a mesh's geometry, 1 or 2."""
+    return 1 if compat.geometry_dofs(mesh).shape[1] == len(forms.reference_topology(compat.cell_name(mesh))[0]) else 2
+
+
+def _cell_keys(mesh: Any) -> tuple[int, AnyArray]:
+    """Number of this rank's cells, and their numbers in the input; in meshes made from others, which have none, those over all ranks."""
+    cells = mesh.topology.index_map(mesh.topology.dim)
+    n, given = cells.size_local, forms.original_cells(mesh)
+    if all(mesh.comm.allgather(len(given) == n + cells.num_ghosts)):
+        return n, given[:n]
+    return n, np.arange(*cells.local_range, dtype=np.int64)
+
+
+def _numbering(V: Any) -> Numbering:
+    """Order of a space's nodes in the files: that of the input where the mesh knows it (collective)."""
+    mesh = V.mesh
+    cells = mesh.topology.index_map(mesh.topology.dim)
+    if all(mesh.comm.allgather(len(forms.original_cells(mesh)) == cells.size_local + cells.num_ghosts)):
+        return node_numbering(V)
+    nodes = V.dofmap.index_map
+    return Numbering(mesh.comm, np.arange(*nodes.local_range, dtype=np.int64), nodes.size_global)

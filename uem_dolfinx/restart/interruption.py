@@ -1,0 +1,101 @@
+"""Ctrl-C and SIGTERM: noted when they come, on whichever rank, and acted on where all ranks have come to the same place."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Any, NoReturn, Self
+
+from mpi4py import MPI
+
+from uem_dolfinx.errors import UEMError
+from uem_dolfinx.log import logger
+
+#: Exit status of a run that has ended on SIGTERM, as shells have it.
+#: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
+TERMINATED = 128 + signal.SIGTERM
+#: What is noted, unless it is ignored.
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class InterruptedStepError(UEMError):
+    """A signal has come within a step; never leaves the load and time stepping.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(f"interrupted by {signal.Signals(number).name}")
+        self.number = number
+
+
+class Interruption:
+    """Signals that ask a run to end, noted within its ``with`` block; Ctrl-C after one does at once what it would have done outside.
+
+    Blocks may stand within each other. Python allows handlers in the main thread only; elsewhere nothing is noted.
+    """
+
+    def __init__(self) -> None:
+        self._asked, self._depth = 0, 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        self._depth += 1
+        if self._depth == 1 and threading.current_thread() is threading.main_thread():
+            # what is ignored stays so, and what C code handles cannot be put back
+            before = {number: signal.getsignal(number) for number in SIGNALS}
+            self._before = {number: was for number, was in before.items() if was not in (signal.SIG_IGN, None)}
+            for number in self._before:
+                signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._depth -= 1
+        if self._depth:
+            return
+        for number, before in self._before.items():
+            # someone else may have come since
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, before)
+        asked, self._asked = self._asked, 0
+        if asked:
+            # nobody has acted on it
+            signal.raise_signal(asked)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self._depth and not self._asked:
+            self._asked = number
+            logger.warning("%s: the run ends after this iteration or step; Ctrl-C ends it at once", signal.Signals(number).name)
+            return
+        if self._depth and number == signal.SIGTERM:
+            # some senders tell both the process and its group
+            return
+        self._asked, before = 0, self._before[number]
+        if callable(before):
+            before(number, frame)
+        else:
+            signal.signal(number, before)
+            signal.raise_signal(number)
+
+    def agreed(self, comm: MPI.Comm) -> int:
+        """Number of a signal that any rank has got since it was asked last, 0 without one (collective)."""
+        number = int(comm.allreduce(self._asked, op=MPI.MAX))
+        if number:
+            self._asked = 0
+        return number
+
+    def heed(self, comm: MPI.Comm) -> None:
+        """Raise ``InterruptedStepError`` on all ranks if any has got a signal (collective)."""
+        number = self.agreed(comm)
+        if number:
+            raise InterruptedStepError(number)
+
+
+def end_run(number: int, kept: str) -> NoReturn:
+    """End a run on a signal, with a word about what is kept: KeyboardInterrupt, or SystemExit with status 143."""
+    logger.warning("ended by %s; %s", signal.Signals(number).name, kept)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise SystemExit(TERMINATED)

@@ -1,0 +1,118 @@
+"""What load steps and time steps share: how far a problem is, and what is done between steps, on signals and for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
+from uem_dolfinx.solve.step_control import StepControl
+
+T = TypeVar("T")
+
+
+@dataclass
+class Progress:
+    """How far a problem is, in steps and in load.
+
+    Attributes:
+        steps: converged and committed.
+        resumed: how often a checkpoint has been read into it.
+        ramp: the call of ``load_steps`` that has brought the load where it is, counted from 1; 0 before the first.
+        factor: load factor reached in it.
+        start: displacement at its beginning ``(n_local incl. ghosts,)``.
+        control: length of its steps.
+        interruption: signals that are noted while the problem steps.
+    """
+
+    steps: int = 0
+    resumed: int = 0
+    ramp: int = 0
+    factor: float = 0.0
+    start: Array = field(default_factory=lambda: np.zeros(0))
+    control: StepControl = field(default_factory=StepControl)
+    interruption: Interruption | None = None
+    _calls: int = 0
+
+    @property
+    def time(self) -> float:
+        """Clock of tables that are ordered by steps."""
+        return self.steps
+
+    def begin_ramp(self, displacement: Array, steps: int) -> bool:
+        """Begin a call of ``load_steps`` with so many steps, or go on with the one that a checkpoint was written in.
+
+        Returns:
+            Whether there is anything to do; not where the checkpoint was written in a later call.
+        """
+        self._calls += 1
+        if self._calls > self.ramp:
+            self.ramp, self.factor, self.start = self._calls, 0.0, np.array(displacement)
+            self.control = StepControl()
+        self.control.begin(1.0 / steps)
+        return self._calls == self.ramp
+
+    def heed(self, comm: MPI.Comm) -> None:
+        """Raise ``InterruptedStepError`` on all ranks if any has got a signal since the stepping began (collective)."""
+        if self.interruption is not None:
+            self.interruption.heed(comm)
+
+    def to_checkpoint(self, ramped: bool) -> dict[str, Any]:
+        """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
+        load = {"load ramp": self.ramp, "load factor": self.factor} if ramped else {}
+        return {"steps committed": self.steps} | load | (self.control.to_checkpoint() if ramped else {})
+
+    def from_checkpoint(self, kept: dict[str, Any], start: Array | None) -> None:
+        """Go on from what ``to_checkpoint`` returned, load steps from the displacement at their beginning."""
+        self.steps = kept["steps committed"]
+        self.resumed += 1
+        if start is not None:
+            self.ramp, self.factor = kept["load ramp"], kept["load factor"]
+            self.start = np.array(start)
+            self.control.from_checkpoint(kept)
+            # a script that is run anew comes to this call of load_steps once more
+            self._calls = max(0, min(self._calls, self.ramp - 1))
+
+
+def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkpoint: Checkpoint | None) -> Iterator[T]:
+    """Steps, between which the checkpoint is written when it is time, and on a signal to any rank, which ends the run on all.
+
+    Args:
+        comm: communicator of the problem.
+        progress: of the problem, by which it heeds signals within a step, too.
+        steps: each brings the problem from one committed state to the next; where it raises, the last one is restored.
+        checkpoint: which has begun; None writes none.
+
+    Yields:
+        The steps.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, with the last committed state in the problem and in the checkpoint.
+        SystemExit: likewise with status 143 after SIGTERM.
+        CheckpointError: if the checkpoint cannot be written.
+    """
+    outer, progress.interruption = progress.interruption, Interruption() if checkpoint is None else checkpoint.interruption
+    try:
+        with progress.interruption:
+            try:
+                for step in steps:
+                    yield step
+                    if checkpoint is None:
+                        progress.heed(comm)
+                    else:
+                        checkpoint.step()
+                if checkpoint is not None:
+                    checkpoint.finish()
+            except InterruptedStepError as interrupted:
+                if checkpoint is None:
+                    end_run(interrupted.number, "the problem is in its last converged state")
+                checkpoint.end(interrupted.number)
+    finally:
+        progress.interruption = outer
