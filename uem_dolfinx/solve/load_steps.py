@@ -48,7 +48,7 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
 
     Raises:
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+        LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
     """
     control, done, last = StepControl(1.0 / steps), 0.0, 0.0
     start = np.array(problem.u.x.array)

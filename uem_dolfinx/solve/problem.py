@@ -16,6 +16,7 @@ from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.materials.elastic import HistoryMaterial
@@ -23,6 +24,7 @@ from uem_dolfinx.parallel import agree_on_call
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
+from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.system import BodySystem
 
@@ -119,6 +121,7 @@ class UnitedProblem:
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         self._last = np.array(u.x.array)
+        self._motions = self._rigid_motions()
         self._largest_forces = 0.0
 
     # -- one step ----------------------------------------------------------------------------------------------------
@@ -151,8 +154,8 @@ class UnitedProblem:
             The history of iterations.
 
         Raises:
-            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError: after
-                the committed state has been restored.
+            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
+            TunnellingError: after the committed state has been restored.
         """
         start = self.committed if start is None else start
         wanted = np.array(start)
@@ -171,6 +174,7 @@ class UnitedProblem:
                 forces_before=self._largest_forces,
             )
             self.system.end_step()
+            refuse_passages(self.config, self.pairs, self.committed, self._motions)
         except UEMError:
             self.restore()
             raise
@@ -187,6 +191,7 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
+        self._motions = self._rigid_motions()
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -225,7 +230,7 @@ class UnitedProblem:
 
         def restore() -> None:
             self.committed, self._last = np.array(self.u.x.array), np.array(before.x.array)
-            self._largest_forces = state.numbers["largest forces"]
+            self._largest_forces, self._motions = state.numbers["largest forces"], self._rigid_motions()
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             if self.dynamics is not None:
                 self.dynamics.from_checkpoint(state.numbers)
@@ -253,6 +258,10 @@ class UnitedProblem:
     def pairs(self) -> list[ContactPair]:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
+
+    def _rigid_motions(self) -> list[Motion | None]:
+        """Where the rigid targets are now; None for those that have not moved, and for meshes."""
+        return [pair.target.motion for pair in self.pairs]
 
     def _predict(self, ratio: float) -> None:
         """Extrapolate displacement and contact forces to guess the active set; the displacement itself stays."""
