@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.search import ON_SIDE
 
 #: Halvings that find a time to the last bit.
-#: [format; halvings; -]
+#: [bound; halvings; -]
 HALVINGS = 53
 
 
@@ -61,7 +62,7 @@ def find_crossings(start: tuple[Array, Array], end: tuple[Array, Array], sign: A
     every = np.arange(len(i))
     bounds = _extremes(lambda t: height(t, every)[0], -further, 1.0 + further)
     point, time, inwards, normal = [], [], [], []
-    for a, b in zip(bounds[:-1], bounds[1:]):
+    for a, b in pairwise(bounds):
         before, after = height(a, every)[0], height(b, every)[0]
         k = np.flatnonzero((before >= 0) != (after >= 0))
         low, high, falls = a[k], b[k], before[k] >= 0

@@ -26,9 +26,7 @@ from uem_dolfinx.solve.tunnelling import MOST_PLACES, PASSAGE_DEPTH
 LOOKING_AWAY = -0.5
 
 
-def refuse_passages(
-    config: Configuration, pairs: Sequence[ContactPair], start: Array, motions: Sequence[Motion | None]
-) -> None:
+def refuse_passages(config: Configuration, pairs: Sequence[ContactPair], start: Array, motions: Sequence[Motion | None]) -> None:
     """Refuse a step that leads a contactor through its target (collective).
 
     Steps within which nothing moves by half a facet, or half the thickness of a body of one cell, are not looked at.
@@ -46,7 +44,9 @@ def refuse_passages(
     looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.sliding == "finite"]
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # of one contact: the longest ways of both sides, the sum of the target's and their number
-    mine = np.array([[*(np.linalg.norm(w, axis=1).max(initial=0.0) for w in way), *way[1].sum(axis=0), len(way[1])] for way in ways])
+    mine = np.array(
+        [[*(np.linalg.norm(w, axis=1).max(initial=0.0) for w in way), *way[1].sum(axis=0), len(way[1])] for way in ways]
+    )
     all_ways = np.array(config.comm.allgather(mine))
     for k, (pair, motion) in enumerate(looked_at):
         longest = all_ways[:, k, :2].max(axis=0).sum()
