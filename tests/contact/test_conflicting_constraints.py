@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from helpers import CELLS, M, at, blocks, box, clamp, complementary, highest, linear, modulus, run, scene
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.algebra.dependent import IndependentEquations
+from uem_dolfinx.algebra.dependent import IndependentEquations, _eliminate
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
@@ -94,6 +94,75 @@ def test_independent_equations_say_the_same(seed, prescribed, both):
     assert np.abs(loose).max() < 1e-9
 
 
+def rows(rng, m, scale):
+    """Conflicting rows of contactors that follow two nodes each, of any length: coefficients, contactors, free components."""
+    A, own = np.zeros((m, m + 3, 2)), rng.integers(0, m, m)
+    for i in range(m):
+        n = rng.normal(size=2)
+        n /= np.linalg.norm(n)
+        A[i, own[i]] = n
+        w = rng.uniform()
+        for a, part in zip(rng.choice(np.delete(np.arange(m + 3), own[i]), 2, replace=False), (w, 1 - w)):
+            A[i, a] -= part * n
+    return A * scale[:, None, None], own, rng.uniform(size=(m + 3, 2)) > 0.15
+
+
+def eliminated(A, h, own, free):
+    """The group of these rows, and its independent rows in full ``(k, n_nodes * 2)`` with the directions that they eliminate."""
+    group = _eliminate(A, h, own, free, np.arange(A.shape[1]), np.arange(len(A)))
+    e = group.independent
+    D = np.zeros((len(e), *A.shape[1:]))
+    D[np.arange(len(e)), e.node] = e.direction
+    C = D.copy()
+    np.add.at(C, (e.row, e.followed), -e.coefficients)
+    return group, C.reshape(len(e), -1), D.reshape(len(e), -1)
+
+
+@given(seed=st.integers(0, 10**6), m=st.integers(1, 7), copies=st.integers(0, 3), decades=st.sampled_from([0.0, 3.0]))
+def test_as_many_independent_rows_as_their_rank(seed, m, copies, decades):
+    """However long the rows are: their rank decides, what is left out follows from the others, and P'KP is positive definite."""
+    rng = np.random.default_rng(seed)
+    A, own, free = rows(rng, m, 10.0 ** rng.uniform(-decades, decades, m))
+    mixed = rng.normal(size=(copies, m))
+    A = np.concatenate([A, np.einsum("ij,jng->ing", mixed, A)])
+    own = np.concatenate([own, rng.integers(0, m, copies)])
+    movable = (A * free).reshape(len(A), -1)
+    length = np.linalg.norm(movable, axis=1, keepdims=True)
+    s = np.linalg.svd(movable / np.where(length > 0, length, 1.0), compute_uv=False)
+    # dependent to rounding, or clearly not
+    assume(not ((s > 1e-9) & (s < 0.2)).any())
+    du = rng.normal(size=A.shape[1:])
+    h = np.einsum("ing,ng->i", A, du)
+    group, C, D = eliminated(A, h, own, free)
+    assert len(C) == (s > 0.2).sum() == (~group.redundant).sum()
+    # what solves the given rows solves the independent ones, each of which alone moves its own direction
+    assert np.allclose(C @ du.ravel(), -group.independent.gap, rtol=1e-9, atol=1e-9 * (1 + np.abs(C).max(initial=0.0)))
+    assert np.allclose(C @ D.T, np.eye(len(C)), atol=1e-9)
+    # and the other way round, where nothing is prescribed
+    P = np.eye(C.shape[1]) - D.T @ C
+    P = P * free.ravel()
+    assert np.abs(movable / np.where(length > 0, length, 1.0) @ P * 1.0).max(initial=0.0) < 1e-7 * (
+        1 + np.abs(C).max(initial=0.0)
+    )
+    columns = np.linalg.svd(P)[0][:, : int(free.sum()) - len(C)]
+    B = rng.normal(size=(C.shape[1], C.shape[1]))
+    assert np.linalg.eigvalsh(columns.T @ P.T @ (B @ B.T + np.eye(len(B))) @ P @ columns).min() > 0.0
+
+
+@given(seed=st.integers(0, 10**6), near=st.sampled_from([1e-6, 1e-3, 0.03]), scale=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_dependent_row_takes_no_other_along(seed, near, scale):
+    """Two long rows that are nearly one leave the rows of other contactors what they are."""
+    rng = np.random.default_rng(seed)
+    A, own, free = rows(rng, 4, np.ones(4))
+    free[:] = True
+    movable = A.reshape(4, -1)
+    assume(np.linalg.svd(movable / np.linalg.norm(movable, axis=1, keepdims=True), compute_uv=False)[-1] > 0.3)
+    twin = scale * (A[0] + near * np.linalg.norm(A[0]) * A[1] / np.linalg.norm(A[1]))
+    A, own = np.concatenate([A, twin[None]]), np.append(own, own[0])
+    group, C, _ = eliminated(A, np.zeros(5), own, free)
+    assert len(C) == 4 and not group.redundant[1:4].any() and group.redundant[[0, 4]].sum() == 1
+
+
 # -- two-pass ------------------------------------------------------------------------------------------------------------
 
 
@@ -113,18 +182,20 @@ def test_two_pass_is_exact_on_any_two_meshes(cell, n):
         assert c.balance().force < 1e-12
 
 
-def test_two_pass_of_pressed_discs():
-    """Two-pass on a curved contact, where the rows depend on each other only nearly."""
+@pytest.mark.parametrize("n", [(8, 6), (16, 12), (20, 20), (24, 14)])
+def test_two_pass_of_pressed_discs(n):
+    """Two-pass on a curved contact, whose rows depend on each other only nearly: what is left out and does not touch is open."""
     forces = []
     for passes in (2, 1):
-        b = blocks(
-            COMM, "triangle", 8, 6, gap=0.02, overhang=0.5, pose=lambda x: x + np.array([0.0, 0.1]) * (x[:, :1] - 0.5) ** 2
-        )
+        b = blocks(COMM, "triangle", *n, gap=0.02, overhang=0.5, pose=lambda x: x + np.array([0.0, 0.1]) * (x[:, :1] - 0.5) ** 2)
         contacts = [uem.Contact(b.high, b.low), uem.Contact(b.low, b.high)][:passes]
         bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.03])]
         run(uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=contacts))
         forces.append(sum(sign * c.resultant().force[1] for sign, c in zip((1, -1), contacts)))
-    assert forces[0] == pytest.approx(forces[1], rel=1e-9)
+        for c in contacts:
+            complementary(c, 1e-12, 1e-12)
+    # a contactor on a bend of the target has two lawful places
+    assert forces[0] == pytest.approx(forces[1], rel=1e-5 if n == (16, 12) else 1e-9)
 
 
 # -- prescribed contactors -------------------------------------------------------------------------------------------------
@@ -194,6 +265,27 @@ def test_stack(cell, up):
         assert abs(contact.resultant().force[-1]) == pytest.approx(k, rel=1e-9)
         complementary(contact, 1e-12, 1e-8)
         assert contact.balance().force < 1e-10
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_stack_of_thirty(up):
+    """However many layers lie upon each other, all are compressed alike."""
+    cell, layers = "quadrilateral", 30
+    bodies = [box(cell, [0.0, float(k)], [1.0, k + 1.0], [2, 1]) for k in range(layers)]
+    s = scene(COMM, cell, bodies)
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    low, high = ([s.tag(f"{k}{e}", k, at(1, float(k + e))) for k in range(layers)] for e in (0, 1))
+    contacts = [uem.Contact(low[k + 1], high[k]) if up else uem.Contact(high[k], low[k + 1]) for k in range(layers - 1)]
+    bcs = [*clamp(V, low[0], 1), *clamp(V, high[-1], 1, value=-0.01 * layers)]
+    for k in range(layers):
+        for end in (0.0, 1.0):
+            bcs += clamp(V, s.tag("side", k, at(0, end)), 0)
+    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=contacts)
+    run(problem)
+    assert highest(COMM, np.abs(problem.config.displacement[:, 1] + 0.01 * problem.config.x[:, 1] / 0.99)) < 1e-12
+    for contact in contacts[:: layers // 3]:
+        assert abs(contact.resultant().force[1]) == pytest.approx(0.01 * M, rel=1e-9)
 
 
 @pytest.mark.parametrize("overlap", [False, True])

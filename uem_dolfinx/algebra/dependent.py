@@ -23,11 +23,11 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import Exchange
 
-#: A row that has lost all but this part of its length depends on the others; the rows of surfaces that bend under load do so
-#: only to the first order of their strain.
-#: [heuristic; part of the row's first length; -]
+#: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
+#: do so only to the first order of their strain.
+#: [heuristic; part of the row's length in its free components; -]
 DEPENDENT = 0.05
-#: A contactor's own component is eliminated unless another coefficient is larger by this factor.
+#: A contactor's own component is eliminated unless another coefficient is larger by this factor, which orders pivots and no more.
 #: [heuristic; ratio of coefficients; -]
 OWN_FIRST = 1.5
 
@@ -162,26 +162,29 @@ def _with_neighbours(config: Configuration, equations: UnitingEquations, conflic
 def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: Ints) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
+    Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which neither
+    pivots nor preferences change; it is then left out, and the others go on.
+
     In ``A (m, n_nodes, gdim)`` and ``free (n_nodes, gdim)`` each of the global nodes ``node (n_nodes,)`` has its block of columns,
     ``own (m,)`` that of each equation's contactor; ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
-    A, h = A.copy(), h.copy()
-    rest = np.ones(m, dtype=bool)
-    start = np.maximum(np.linalg.norm(movable, axis=1), MOSTLY_PRESCRIBED * np.linalg.norm(A.reshape(m, -1), axis=1))
+    length = np.linalg.norm(movable, axis=1)
+    rest = length > MOSTLY_PRESCRIBED * np.linalg.norm(A.reshape(m, -1), axis=1)
+    scale = np.where(rest, length, 1.0)
+    A, h, across = A / scale[:, None, None], h / scale, movable / scale[:, None]
     order: list[int] = []
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
-    while rest.any():
+    while (rest := rest & (np.linalg.norm(across, axis=1) > DEPENDENT)).any():
         size = np.linalg.norm(A * free, axis=2)
         size[np.arange(m), own] *= OWN_FIRST
         i, t = np.unravel_index(np.argmax(np.where(rest[:, None], size, -1.0)), size.shape)
-        if size[i, t] <= DEPENDENT * start[i]:
-            break
+        q = across[i] / np.linalg.norm(across[i])
+        across -= (across @ q)[:, None] * q
         d = A[i, t] * free[t]
-        length = np.linalg.norm(d)
-        d /= length
-        A[i], h[i] = A[i] / length, h[i] / length
+        d /= (pushed := np.linalg.norm(d))
+        A[i], h[i] = A[i] / pushed, h[i] / pushed
         factor = A[:, t] @ d
         factor[i] = 0.0
         A -= factor[:, None, None] * A[i]
@@ -200,4 +203,6 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: In
     independent = UnitingEquations(
         node[pivot[k]], direction[k], -h[k], np.ones(len(k), bool), row, node[column], -terms[row, column]
     )
-    return Group(given, independent, shares, rest)
+    redundant = np.ones(m, dtype=bool)
+    redundant[k] = False
+    return Group(given, independent, shares, redundant)

@@ -161,12 +161,14 @@ class Restriction:
             # a followed component that is prescribed is no unknown
             P.diagonalScale(None, self._vector(self.used.astype(float)))
             return P
-        T = X = self._rows_of_P(coupled=False)
-        P = T.copy()
-        for _ in range(self.chain):
-            X = self.M.matMult(X)
-            P.axpy(1.0, X, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        return P
+        P, power, reach = self._rows_of_P(coupled=False), self.M, 1
+        # (1 + M)(1 + M^2)(1 + M^4)... T: twice as many equations follow one another with each product
+        while True:
+            P.axpy(1.0, power.matMult(P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            reach *= 2
+            if reach > self.chain:
+                return P
+            power = power.matMult(power)
 
     def _rows_of_P(self, coupled: bool = True) -> PETSc.Mat:
         """T, with the entries of M in the rows of the eliminated nodes if coupled."""

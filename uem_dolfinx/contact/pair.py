@@ -194,9 +194,17 @@ class ContactPair:
         off = self.off
         if swept and self.thickness < np.inf:
             off = off | (self.trial.slips > 0)
-        gap_rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
+        # an equation that was left out as dependent and does not hold is no contact
+        apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
         return active_set.find_wrong(
-            self.trial, gap, lam, off, self.movable, stiffness, force_rounding=force_rounding, gap_rounding=gap_rounding
+            self.trial,
+            gap,
+            lam,
+            off,
+            self.movable & ~apart,
+            stiffness,
+            force_rounding=force_rounding,
+            gap_rounding=max(gap_rounding, active_set.GAP_ROUNDING * self.config.size),
         )
 
     def exchange(self, wrong: active_set.Wrong) -> None:

@@ -30,6 +30,18 @@ class Motion:
         """Where points that are at ``x (n, gdim)`` now are in the drawing."""
         return (x - self.about - self.translation) @ self.Q + self.about
 
+    def since(self, before: Motion, part: float) -> Motion:
+        """The last ``part`` of the motion from where ``before`` leads: the rest of the way of ``about``, the rest of the turn."""
+        there = before.carry(self.about[None])[0]
+        turn = part * rotation_vector(self.Q @ before.Q.T)
+        at = there + (1.0 - part) * (self.about + self.translation - there)
+        return Motion(self.about + self.translation - at, rotation_matrix(turn), at)
+
+    @classmethod
+    def none(cls, gdim: int) -> Motion:
+        """Everything stays where it was drawn."""
+        return cls(np.zeros(gdim), np.eye(gdim), np.zeros(gdim))
+
 
 @dataclass(frozen=True)
 class RigidProjection:
@@ -174,7 +186,7 @@ class RigidSurface:
         touched, normal, bend = old.points, old.normal, old.bend
         if self.motion is not old.motion:
             g = points.shape[1]
-            still = Motion(np.zeros(g), np.eye(g), np.zeros(g))
+            still = Motion.none(g)
             then, now = old.motion or still, self.motion or still
             Q = now.Q @ then.Q.T
             touched, normal, bend = now.carry(then.back(touched)), normal @ Q.T, Q @ bend @ Q.T
@@ -310,6 +322,15 @@ def rotation_matrix(turn: Array) -> Array:
         return np.asarray(Rotation.from_rotvec(turn).as_matrix())
     c, s = np.cos(turn[0]), np.sin(turn[0])
     return np.array([[c, -s], [s, c]])
+
+
+def rotation_vector(Q: Array) -> Array:
+    """What ``rotation_matrix`` makes ``Q (gdim, gdim)`` of, an angle ``(1,)`` or a rotation vector ``(3,)`` of half a turn at most."""
+    if len(Q) == 3:
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(Rotation.from_matrix(Q).as_rotvec())
+    return np.array([np.arctan2(Q[1, 0], Q[0, 0])])
 
 
 def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Array:

@@ -7,7 +7,7 @@ Lagrange degree 1 or 2, so one code serves straight, bilinear and curved facets.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -76,6 +76,19 @@ class FacetShape:
     def middle(self) -> Array:
         """Reference midpoint ``(fdim,)``."""
         return np.full(self.dim, 1 / 3 if self.cell == "triangle" else 0.5)
+
+    @cached_property
+    def pieces(self) -> Indices:
+        """Nodes of the simplices that the facet's nodes cut it into, in the sense of its parametrisation ``(n_pieces, gdim)``."""
+        if self.dim == 1:
+            order = np.argsort(self.nodes[:, 0])
+            return np.column_stack([order[:-1], order[1:]])
+        from scipy.spatial import Delaunay
+
+        pieces = Delaunay(self.nodes).simplices
+        turned = np.linalg.det(self.nodes[pieces[:, 1:]] - self.nodes[pieces[:, :1]]) < 0
+        pieces[turned, 1:] = pieces[turned, :0:-1]
+        return pieces
 
     def contains(self, xi: Array) -> npt.NDArray[np.bool_]:
         """Which ``xi (n, fdim)`` lie in the closed reference facet."""

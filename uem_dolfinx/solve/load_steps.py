@@ -58,7 +58,7 @@ def load_steps(problem: UnitedProblem, steps: int = 1, *, checkpoint: Checkpoint
     Raises:
         CheckpointError: see ``Checkpoint``.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+        LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
     if checkpoint is not None and not checkpoint.begun:

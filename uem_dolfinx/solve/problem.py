@@ -16,6 +16,7 @@ from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.materials.elastic import HistoryMaterial
@@ -23,6 +24,7 @@ from uem_dolfinx.parallel import agree_on_call
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
+from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
@@ -116,6 +118,7 @@ class UnitedProblem:
         self.progress = Progress()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
+        self._motions = self._rigid_motions()
         self._largest_forces = 0.0
 
     # -- one step ----------------------------------------------------------------------------------------------------
@@ -147,8 +150,8 @@ class UnitedProblem:
             The history of iterations.
 
         Raises:
-            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError: after
-                the committed state has been restored.
+            ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
+            TunnellingError: after the committed state has been restored.
         """
         start = self.committed if start is None else start
         wanted = np.array(start)
@@ -166,6 +169,7 @@ class UnitedProblem:
                 heed=lambda: self.progress.heed(self.comm),
             )
             self.system.end_step()
+            refuse_passages(self.config, self.pairs, self.committed, self._motions)
         except UEMError:
             self.restore()
             raise
@@ -182,6 +186,7 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
+        self._motions = self._rigid_motions()
         self.progress.steps += 1
 
     def restore(self) -> None:
@@ -225,7 +230,7 @@ class UnitedProblem:
                 state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
         def restore() -> None:
-            self.committed = np.array(self.u.x.array)
+            self.committed, self._motions = np.array(self.u.x.array), self._rigid_motions()
             self._largest_forces = state.numbers["largest forces"]
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             self.progress.from_checkpoint(state.numbers, start.x.array if ramped else None)
@@ -255,3 +260,7 @@ class UnitedProblem:
     def pairs(self) -> list[ContactPair]:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
+
+    def _rigid_motions(self) -> list[Motion | None]:
+        """Where the rigid targets are now; None for those that have not moved, and for meshes."""
+        return [pair.target.motion for pair in self.pairs]

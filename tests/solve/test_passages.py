@@ -1,0 +1,278 @@
+"""Steps that would lead contactors through a body: thin plates, rigid slabs and spheres, still or moving; and those that only seem to.
+
+Two tests to read first: ``test_a_plate_is_not_passed`` and ``test_ways_that_lead_through_nothing``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import at, blocks, box, clamp, highest, linear, modulus, rotation, run, scene, st_venant
+from hypothesis import given
+from hypothesis import strategies as st
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.geometry.crossings import find_crossings
+from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
+from uem_dolfinx.solve.passages import refuse_passages
+
+COMM = MPI.COMM_WORLD
+
+
+def boundary(s, body, part):
+    """The whole boundary of a box as a tag."""
+    sides = [
+        s.tag("side", body, at(axis, value)).entities
+        for axis in range(part.x.shape[1])
+        for value in (part.x[:, axis].min(), part.x[:, axis].max())
+    ]
+    return uem.Tag("plate", 1, s.mesh.topology.dim - 1, s.mesh, np.unique(np.concatenate(sides)).astype(np.int32))
+
+
+def plate_and_block(cell="quadrilateral", thick=0.1, gap=0.05, push=(0.0, -0.7), lift=0.0, layers=1, degree=1, comm=COMM):
+    """A block above a plate that is clamped at its ends, whose whole boundary is the target: the problem and its contact.
+
+    Args:
+        cell: kind of cells.
+        thick: thickness of the plate.
+        gap: between both.
+        push: displacement of the block's top, along the plate and across it.
+        lift: displacement of the plate's ends across it.
+        layers: of cells in the plate.
+        degree: of the displacement.
+        comm: communicator.
+    """
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    wide, n = [0.3] * (g - 2), [2] * (g - 2)
+    plate = box(cell, [-1.0, *(-w for w in wide), -thick], [1.0, *wide, 0.0], [20 if g == 2 else 10, *n, layers])
+    block = box(cell, [-0.2, *(-0.5 * w for w in wide), gap], [0.2, *(0.5 * w for w in wide), gap + 0.3], [5, *n, 3])
+    s = scene(comm, cell, [plate, block])
+    V = compat.function_space(s.mesh, degree, (g,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("block", 1, at(g - 1, gap)), boundary(s, 0, plate))
+    ends = [s.tag("end", 0, at(0, x)) for x in (-1.0, 1.0)]
+    bcs = clamp(V, s.tag("top", 1, at(g - 1, gap + 0.3)), value=[push[0], *[0.0] * (g - 2), push[1]])
+    for end in ends:
+        bcs += clamp(V, end, value=[0.0] * (g - 1) + [lift])
+    return uem.UnitedProblem(linear(u, modulus(s, 1.0, 10.0)), u, bcs=bcs, contacts=[contact], rtol=1e-11), contact
+
+
+PLATES = [
+    {"cell": "triangle", "thick": 0.02},
+    {"cell": "triangle", "thick": 0.2, "lift": 0.2},
+    {"cell": "triangle", "thick": 0.1, "degree": 2, "push": (0.0, -0.5)},
+    {"thick": 0.1},
+    {"thick": 0.1, "push": (0.3, -0.7)},
+    {"thick": 0.1, "push": (-0.3, -0.7), "layers": 2},
+    {"thick": 0.02, "lift": 0.2},
+    {"thick": 0.2, "layers": 3},
+    {"cell": "tetrahedron", "thick": 0.05, "push": (0.1, -0.7)},
+    {"cell": "hexahedron", "thick": 0.2, "lift": 0.2},
+]
+
+
+@pytest.mark.parametrize("how", PLATES, ids=str)
+def test_a_plate_is_not_passed(how):
+    """One load step of several times the thickness is cut, and gives the force that many steps give."""
+    forces, cuts = [], []
+    for steps in (1, 16):
+        problem, contact = plate_and_block(**how)
+        cuts.append(sum(step.cuts for step in run(problem, steps)))
+        forces.append(contact.resultant().force)
+    assert cuts[0] > 0 and forces[1][-1] > 1e-5
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-7 * forces[1][-1])
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.2])
+def test_a_single_solve_says_so_and_restores(gap):
+    """``solve`` cannot cut its step: it names contact and contactor, and leaves the state that it found."""
+    problem, contact = plate_and_block(gap=gap, push=(0.45, -gap - 0.4))
+    before = problem.pairs[0].committed
+    with pytest.raises(
+        uem.TunnellingError, match=r"block on plate: the contactor at \(.*\) passes through the target within a step"
+    ):
+        problem.solve()
+    assert highest(COMM, np.abs(problem.u.x.array)) == 0.0
+    assert problem.pairs[0].trial is before
+
+
+def test_ranks_cut_alike():
+    """All ranks together take the steps that one takes alone."""
+    found = []
+    for comm in (COMM, MPI.COMM_SELF):
+        problem, contact = plate_and_block(comm=comm, push=(0.2, -0.6))
+        steps = run(problem)
+        found.append(([step.factor for step in steps], contact.resultant().force))
+    assert found[0][0] == found[1][0] and len(found[0][0]) > 1
+    assert np.allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
+
+
+# -- rigid targets -------------------------------------------------------------------------------------------------------
+
+
+def slab(half):
+    """Rigid slab ``|y| < half``."""
+    return uem.RigidSurface(
+        lambda x: np.abs(x[:, -1]) - half,
+        lambda x: np.where(x[:, [-1]] < 0, -1.0, 1.0) * np.eye(x.shape[1])[-1],
+        name="slab",
+        stride=half,
+    )
+
+
+def above(target, top, way, moves=None):
+    """A soft block 0.02 above a rigid target, whose far side is led by ``way``; the target moves along ``moves`` and turns."""
+    block = box("quadrilateral", [-0.2, top + 0.02], [0.2, top + 0.62], [6, 6])
+    s = scene(COMM, "quadrilateral", [block])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, led = fem.Function(V), fem.Function(V)
+    contact = uem.Contact(s.tag("tip", 0, at(1, top + 0.02)), target)
+    far = s.tag("far", 0, at(1, top + 0.62))
+
+    def load(factor):
+        led.x.array.reshape(-1, 2)[:] = factor * np.array(way)
+        if moves is not None:
+            target.move(*(factor * np.array(m) for m in moves))
+
+    bcs = [fem.dirichletbc(led, fem.locate_dofs_topological(V, 1, far.entities))]
+    return uem.UnitedProblem(st_venant(u, modulus(s, 1.0)), u, bcs=bcs, contacts=[contact], load=load, rtol=1e-11), contact
+
+
+@pytest.mark.parametrize(
+    ("target", "top", "way", "moves"),
+    [
+        (lambda: slab(0.02), 0.02, [0.0, -0.12], None),
+        (lambda: slab(0.02), 0.02, [0.1, -0.12], None),
+        (lambda: slab(0.02), 0.02, [0.0, 0.0], ([0.0, 0.12],)),
+        (lambda: slab(0.02), 0.02, [0.0, -0.05], ([0.3, 0.07],)),
+        (lambda: slab(0.02), 0.02, [0.0, -0.02], ([0.0, 0.1], [0.1])),
+    ],
+    ids=["still", "askew", "moving", "both", "turning"],
+)
+def test_rigid_targets_are_not_passed(target, top, way, moves):
+    forces, cuts = [], []
+    for steps in (1, 8):
+        problem, contact = above(target(), top, way, moves)
+        cuts.append(sum(step.cuts for step in run(problem, steps)))
+        forces.append(contact.resultant().force)
+    assert cuts[0] > 0 and forces[1][1] > 1e-3
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-8)
+
+
+def test_a_moving_target_is_refused_in_a_single_solve():
+    target = slab(0.02)
+    problem, _ = above(target, 0.02, [0.0, 0.0])
+    target.move([0.0, 0.12])
+    with pytest.raises(uem.TunnellingError, match="tip on slab"):
+        problem.solve()
+
+
+@pytest.mark.parametrize(("height", "passes"), [(0.45, True), (0.6, False)])
+def test_what_looks_away(height, passes):
+    """A straight way past the middle of a circle of radius 1 leads through it, one near its crown only cuts this short."""
+    start = [-1.9, height]
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", start, np.array(start) + 1e-3, [1, 1])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("tip", 0, at(1, height)), uem.RigidSphere([0.0, 0.0], 1.0), max_penetration=1.0)
+    whole = s.tag("whole", 0, lambda x: np.full(len(x), True))
+    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(V, whole, value=[3.8, 0.0]), contacts=[contact], line_search=False)
+    if passes:
+        with pytest.raises(uem.TunnellingError):
+            problem.solve()
+    else:
+        problem.solve()
+
+
+# -- no false alarms -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", [(1.3, 0.0), (2.5, -0.4), (40.0, -30.0), (-0.9, 0.9)])
+def test_ways_that_lead_through_nothing(way):
+    """A block slides along, past and off the end of a low block whose whole boundary is the target, in one step."""
+    low = box("quadrilateral", [0.0, -1.0], [2.0, 0.0], [10, 5])
+    high = box("quadrilateral", [1.0, 0.0], [1.4, 0.4], [3, 3])
+    s = scene(COMM, "quadrilateral", [low, high])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("high", 1, at(1, 0.0)), boundary(s, 0, low))
+    bcs = [*clamp(V, s.tag("base", 0, at(1, -1.0))), *clamp(V, s.tag("top", 1, at(1, 0.4)), value=way)]
+    problem = uem.UnitedProblem(linear(u, modulus(s, 1.0, 10.0)), u, bcs=bcs, contacts=[contact])
+    steps = run(problem)
+    assert len(steps) == 1 and steps[0].cuts == 0
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.5, 2.8])
+def test_bodies_that_turn_together(angle):
+    """Two blocks in contact are turned as one body by up to 160 degrees in a step: nothing passes."""
+    b = blocks(COMM, "quadrilateral", 3, 4)
+    contact = uem.Contact(b.high, boundary(b.scene, 0, box("quadrilateral", [0.0, -1.0], [1.0, 0.0], [3, 3])))
+    problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
+    x = problem.config.X
+    problem.config.displacement[:] = x @ rotation(2, angle).T - x
+    problem.system.place(returning=False)
+    assert contact.n_active > 0
+    refuse_passages(problem.config, problem.pairs, problem.committed, [None])
+
+
+def test_small_ways_are_not_looked_at(monkeypatch):
+    """Where nothing moves by half a facet no way is searched for crossings."""
+    from uem_dolfinx.solve import passages
+
+    monkeypatch.setattr(passages, "find_crossings", None)
+    problem, contact = plate_and_block(gap=0.0, push=(0.0, -0.6))
+    run(problem, 30)
+    assert contact.n_active > 0
+
+
+# -- the geometry --------------------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 10**6), g=st.sampled_from([2, 3]), size=st.sampled_from([1e-9, 1.0, 1e6]))
+def test_crossings_are_those_of_a_slow_search(seed, g, size):
+    """Times, senses and normals against signs of the height at many instants."""
+    rng = np.random.default_rng(seed)
+    p0, p1 = size * rng.normal(size=(2, 6, g))
+    x0, x1 = size * rng.normal(size=(2, 5, g, g))
+    sign = rng.choice([-1.0, 1.0], 5)
+    found = find_crossings((p0, x0), (p1, x1), sign, 0.0)
+    t = np.linspace(0.0, 1.0, 2001)
+    expected = []
+    for i in range(6):
+        p = p0[i] + t[:, None] * (p1[i] - p0[i])
+        for f in range(5):
+            x = x0[f] + t[:, None, None] * (x1[f] - x0[f])
+            # p = sum b_a x_a + h n with sum b_a = 1
+            e = x[:, 1:] - x[:, :1]
+            n = np.stack([e[:, 0, 1], -e[:, 0, 0]], axis=1) if g == 2 else np.cross(e[:, 0], e[:, 1])
+            n *= sign[f] / np.linalg.norm(n, axis=1, keepdims=True)
+            A = np.concatenate([e, n[:, None]], axis=1).transpose(0, 2, 1)
+            b = np.linalg.solve(A, (p - x[:, 0])[..., None])[..., 0]
+            for k in np.flatnonzero(np.diff(b[:, -1] >= 0)):
+                inner = b[k : k + 2, :-1]
+                margin = min(inner.min(), (1 - inner.sum(axis=1)).min())
+                if margin > 0.02:
+                    expected.append((i, t[k], b[k, -1] >= 0, n[k]))
+    assert len(found.point) >= len(expected)
+    for i, time, inwards, normal in expected:
+        match = (found.point == i) & (found.inwards == inwards) & (np.abs(found.time - time) < 1e-3)
+        assert match.any() and np.abs(found.normal[match] - normal).max(axis=1).min() < 0.1
+
+
+@given(seed=st.integers(0, 10**6), g=st.sampled_from([2, 3]))
+def test_the_rest_of_a_motion(seed, g):
+    """The whole of it leads from the old place to the new one, none of it nowhere, and every part is rigid."""
+    rng = np.random.default_rng(seed)
+
+    def motion():
+        return Motion(rng.normal(size=g), rotation_matrix(rng.uniform(-1.5, 1.5, 1 if g == 2 else 3)), rng.normal(size=g))
+
+    before, now, X = motion(), motion(), rng.normal(size=(4, g))
+    assert np.allclose(now.since(before, 1.0).carry(before.carry(X)), now.carry(X), atol=1e-12)
+    assert np.allclose(now.since(before, 0.0).carry(X), X, atol=1e-12)
+    part = now.since(before, rng.uniform())
+    assert np.allclose(part.Q @ part.Q.T, np.eye(g), atol=1e-12)
