@@ -102,6 +102,27 @@ def test_tables_of_earlier_runs_are_kept(kind, folder):
     assert contents(folder) == {"table.1/table.csv": made[0], "table.csv": made[1]}
 
 
+@pytest.mark.parametrize("kind", ["history", "energy"])
+def test_tables_resumed_without_a_checkpoint(kind, folder):
+    """A run that begins anew although its tables are to go on loses nothing: the whole table is kept aside as it was."""
+
+    def run():
+        problem = Bar((0.0, -3.0)).problem
+        path = folder / "table.csv"
+        table = (
+            uem.HistoryWriter(path, problem, resume=True)
+            if kind == "history"
+            else uem.EnergyBook(problem, path=path, resume=True)
+        )
+        with table:
+            for step in uem.time_steps(problem, 0.01, 0.03):
+                table.write(step)
+        return contents(folder)
+
+    (whole,) = run().values()
+    assert run() == {"table.1/table.csv": whole, "table.csv": whole}
+
+
 def test_resumed_without_a_checkpoint(folder):
     """The checkpoint is gone, the results are not: the run begins anew, and they are kept aside."""
     RAMPS["ramped"](COMM).run(folder, every=2)
