@@ -75,6 +75,8 @@ def test_results_of_earlier_runs_are_kept(folder, caplog):
     """Every run with the same name finds its place, whatever stands beside; what has no step in it is no loss."""
     problem = pressed(COMM, "triangle")
     uem.ResultsWriter(folder / "run", problem).close()
+    for name in ("run_of_another.csv", "run.1.txt"):
+        (folder / name).write_text("beside")
     for k in range(3):
         before = contents(folder)
         write(problem, folder / "run", [float(k)])
