@@ -25,8 +25,9 @@ import numpy as np
 import pytest
 
 pytest.register_assert_rewrite(
-    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes", "resting_scenes", "results_scenes"
-)
+    "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes", "resting_scenes",
+    "results_scenes",
+)  # fmt: skip
 from helpers import complementary, highest
 
 import uem_dolfinx as uem

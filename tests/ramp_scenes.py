@@ -49,7 +49,7 @@ class Ramps:
         return done
 
 
-def nothing() -> None:
+def nothing(at: float = 0.0) -> None:
     """Leave everything as it is."""
 
 

@@ -50,7 +50,9 @@ def test_folder_that_cannot_be_made(what, folder):
     if COMM.rank == 0:
         (folder / "out").write_text("in the way")
     COMM.barrier()
-    alike(uem.OutputError, "out.*cannot be written .*: check the folder, its rights", lambda: MAKERS[what](folder / "out" / "run"))
+    alike(
+        uem.OutputError, "out.*cannot be written .*: check the folder, its rights", lambda: MAKERS[what](folder / "out" / "run")
+    )
     alike(OSError, "out", lambda: MAKERS[what](folder / "out" / "deeper" / "run"))
 
 

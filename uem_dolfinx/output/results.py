@@ -136,10 +136,12 @@ class ResultsWriter(Closing):
 
         def move() -> None:
             self._stem.parent.mkdir(parents=True, exist_ok=True)
-            endings = [".xdmf", ".bin", ".h5", ".csv", *(f"_{kind}.bp" for kind in KINDS)]
+            own = [self._name(ending) for ending in (".xdmf", ".bin", ".h5", ".csv")]
+            begin = tuple(f"{self._stem.name}_{kind}." for kind in KINDS)
+            own += [f for f in sorted(self._stem.parent.iterdir()) if f.name.startswith(begin) and f.suffix == ".bp"]
             xdmf, csv = self._name(".xdmf"), self._name(".csv")
             if (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1):
-                keep_aside(self._stem, map(self._name, endings))
+                keep_aside(self._stem, own)
 
         on_rank_0(self.problem.comm, f"the results {self._stem} cannot be written", move)
 

@@ -71,8 +71,10 @@ def write_checkpoint(path: str | Path, state: State) -> None:
             with trouble:
                 write_at(file, end + width * entry.numbering.first, part)
             end += width * entry.numbering.total
-        content = {"state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers}
-        content["steps"] = state.steps
+        content = {
+            "state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers,
+            "steps": state.steps,
+        }  # fmt: skip
         with trouble:
             if comm.rank == 0:
                 text = _text(content)

@@ -97,5 +97,5 @@ def end_run(number: int, kept: str) -> NoReturn:
     """End a run on a signal, with a word about what is kept: KeyboardInterrupt, or SystemExit with status 143."""
     logger.warning("ended by %s; %s", signal.Signals(number).name, kept)
     if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise SystemExit(TERMINATED)
+        raise KeyboardInterrupt from None
+    raise SystemExit(TERMINATED) from None

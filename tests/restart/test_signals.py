@@ -1,0 +1,196 @@
+"""Ctrl-C and SIGTERM while load or time steps run: on whichever rank they come, all end together and the last state is kept.
+
+The test to read first is ``test_one_rank_is_interrupted``.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import blocks, linear, serial, start_process
+from ramp_scenes import COMM, nothing
+from resting_scenes import Bar
+
+import uem_dolfinx as uem
+
+ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: SystemExit}
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """Python's own handler of Ctrl-C and one that tells of SIGTERM, which are there again after every test."""
+    before = {number: signal.getsignal(number) for number in ENDS}
+    heard = []
+    own = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: lambda number, frame: heard.append(number)}
+    for number, handler in own.items():
+        signal.signal(number, handler)
+    yield own, heard
+    assert {number: signal.getsignal(number) for number in own} == own
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def send(number, rank=COMM.size - 1):
+    """A signal to one rank alone, which has come when this returns."""
+    if COMM.rank == rank:
+        os.kill(os.getpid(), number)
+
+
+def scene(in_time, load):
+    """A problem, and a function that begins its five steps with or without a checkpoint."""
+    if in_time:
+        problem = Bar((0.0, -3.0), load=load).problem
+        return problem, lambda checkpoint: uem.time_steps(problem, 0.02, 0.1, checkpoint=checkpoint)
+    b = blocks(COMM, "triangle")
+    weight = fem.Constant(b.scene.mesh, 0.0)
+
+    def pull(factor):
+        weight.value = factor
+        load(factor)
+
+    F = linear(b.u, 1.0) + 0.1 * weight * ufl.TestFunction(b.V)[1] * ufl.dx
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)], load=pull)
+    return problem, lambda checkpoint: uem.load_steps(problem, 5, checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("within", ["load", "solve", "body"])
+@pytest.mark.parametrize("number", ENDS, ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("in_time", [False, True], ids=["load", "time"])
+def test_one_rank_is_interrupted(in_time, number, within, kept, folder, handlers, monkeypatch):
+    """Before a step, within an iteration and in the caller's loop: all ranks end in the same committed state, which is kept."""
+    done, sent = [], []
+
+    def at_step_3(place):
+        if within == place and len(done) == 2 and not sent:
+            sent.append(place)
+            send(number)
+
+    def load(at):
+        at_step_3("load")
+
+    problem, begin = scene(in_time, load)
+    solve = problem.system.solve
+
+    def interrupted_solve(*what):
+        at_step_3("solve")
+        return solve(*what)
+
+    monkeypatch.setattr(problem.system, "solve", interrupted_solve)
+    checkpoint = uem.Checkpoint(folder / "run", every=100) if kept else None
+    with pytest.raises(ENDS[number]) as end:
+        for step in begin(checkpoint):
+            done.append(step)
+            committed = problem.u.x.array.copy()
+            at_step_3("body")
+    assert number == signal.SIGINT or end.value.code == 143
+    assert {signal.getsignal(n) for n in ENDS} == set(handlers[0].values()) and handlers[1] == []
+    assert set(COMM.allgather(len(done))) == {2} and problem.progress.steps == 2
+    # not what the iteration had come to
+    assert np.array_equal(problem.u.x.array, committed)
+    if kept:
+        again, begin = scene(in_time, nothing)
+        assert len(list(begin(uem.Checkpoint(folder / "run")))) == 3
+        whole, begin = scene(in_time, nothing)
+        list(begin(None))
+        np.testing.assert_allclose(again.u.x.array, whole.u.x.array, rtol=0, atol=1e-9 * np.abs(whole.u.x.array).max())
+
+
+def test_once_more(handlers):
+    """Ctrl-C after a signal acts at once; SIGTERM twice, as some senders send it, is one."""
+    problem, begin = scene(False, nothing)
+    with pytest.raises(SystemExit):
+        for _ in begin(None):
+            send(signal.SIGTERM)
+            send(signal.SIGTERM)
+    steps = begin(None)
+    next(steps)
+    os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        # Python's handlers run between its instructions
+        signal.getsignal(signal.SIGINT)
+    steps.close()
+    assert handlers[1] == []
+
+
+def test_what_nobody_has_acted_on(handlers):
+    """A signal in the last pass of a loop that is left is handed on to whoever had it before."""
+    _, begin = scene(False, nothing)
+    steps = begin(None)
+    next(steps)
+    send(signal.SIGTERM, COMM.rank)
+    assert handlers[1] == []
+    steps.close()
+    assert handlers[1] == [signal.SIGTERM]
+
+
+def test_handlers_of_others(handlers):
+    """What is ignored stays ignored, what others install meanwhile stays theirs, and problems may step within each other's steps."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _, begin = scene(False, nothing)
+    for _ in begin(None):
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    signal.signal(signal.SIGINT, handlers[0][signal.SIGINT])
+    outer = begin(None)
+    next(outer)
+    ours = signal.getsignal(signal.SIGTERM)
+    assert ours not in (handlers[0][signal.SIGTERM], signal.SIG_DFL)
+    _, begin_other = scene(False, nothing)
+    for _ in begin_other(None):
+        pass
+    assert signal.getsignal(signal.SIGTERM) == ours
+    for number, handler in handlers[0].items():
+        signal.signal(number, handler)
+    outer.close()
+
+
+def test_outside_the_main_thread():
+    """Python allows handlers in the main thread only; elsewhere steps run without."""
+    found, before = [], signal.getsignal(signal.SIGTERM)
+    problem, begin = scene(False, nothing)
+
+    def run():
+        found.extend(signal.getsignal(signal.SIGTERM) for _ in begin(None))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert found == [before] * 5
+
+
+RUN = """
+import time
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from ramp_scenes import COMM, RAMPS
+import uem_dolfinx as uem
+
+ramps = RAMPS["ramped"](COMM)
+try:
+    for step in ramps.steps({checkpoint}):
+        print(ramps.problem.progress.steps, flush=True)
+        time.sleep(0.2)
+finally:
+    print("at", ramps.problem.progress.steps, flush=True)
+"""
+
+
+@serial
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
+def test_status(number, status, folder):
+    """What a shell sees of a run that was ended, and what is in its checkpoint."""
+    process = start_process(RUN.format(checkpoint=f"uem.Checkpoint({str(folder / 'run')!r})"))
+    process.stdout.readline()
+    process.send_signal(number)
+    last = process.stdout.read().split()[-1]
+    assert process.wait() == status
+    process = start_process(RUN.format(checkpoint=f"uem.Checkpoint({str(folder / 'run')!r})"))
+    lines = process.stdout.read().split()
+    assert process.wait() == 0 and int(lines[0]) == int(last) + 1 and lines[-1] == "6"
