@@ -5,6 +5,7 @@ What is known of a bar that hits a rigid wall and of a block that hits a plate a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -109,6 +110,26 @@ def through(passes: float, trial: Trial) -> None:
         trial.check("block behind the plate", min(0.0, above / n - below / m) / h, 0.5)
 
 
+def pushed(thickness: float, trial: Trial) -> None:
+    """A block is pushed by 0.7 through a thin held plate in one load step, whose whole boundary is the target: as in 20 steps."""
+    h, forces = 0.08, []
+    for steps in (20, 1):
+        boxes = [Box((-1.0, -thickness), (1.0, 0.0), (20, 1)), Box((-0.2, 0.05), (0.2, 0.35), (5, 3), 10.0)]
+        scene = BoxScene(boxes)
+        for end in (0, 1):
+            scene.hold(scene.side(0, 0, end))
+        scene.hold(top := scene.side(1, 1, 1), value=(0.0, -0.7))
+        sides = [scene.side(0, axis, end) for axis in (0, 1) for end in (0, 1)]
+        whole = replace(sides[0], name="plate", entities=np.unique(np.concatenate([side.entities for side in sides])))
+        scene.unite(scene.side(1, 1, 0), whole)
+        problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts)
+        # steps that are cut are what is asked for here
+        trial.iterations += sum(step.newton_iterations for step in uem.load_steps(problem, steps))
+        forces.append(scene.reaction(top)[1])
+    trial.check("force in one step over that in many", forces[1] / forces[0] - 1, FORCE)
+    trial.check("overlap", overlap(scene, h), OVERLAP)
+
+
 CASES = [
     *(
         Case(f"{c:g} CFL", "a bar hits a rigid wall", partial(bar_on_wall, c, EVENT), quick=c >= 1, moving=True)
@@ -118,5 +139,11 @@ CASES = [
     *(
         Case(f"{p:g} thickness a step", "a block flies at a thin plate", partial(through, p), quick=p == 1, moving=True)
         for p in (0.1, 1.0, 10.0)
+    ),
+    *(
+        Case(
+            f"pushed through {t:g}", "a block is pushed through a thin plate in one load step", partial(pushed, t), quick=t == 0.1
+        )
+        for t in (0.02, 0.1)
     ),
 ]

@@ -49,7 +49,9 @@ def plate_and_block(cell="quadrilateral", thick=0.1, gap=0.05, push=(0.0, -0.7),
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     wide, n = [0.3] * (g - 2), [2] * (g - 2)
     plate = box(cell, [-1.0, *(-w for w in wide), -thick], [1.0, *wide, 0.0], [20 if g == 2 else 10, *n, layers])
-    block = box(cell, [-0.2, *(-0.5 * w for w in wide), gap], [0.2, *(0.5 * w for w in wide), gap + 0.3], [5, *n, 3])
+    block = box(
+        cell, [-0.2, *(-0.5 * w for w in wide), gap], [0.2, *(0.5 * w for w in wide), gap + 0.3], [5, 3] if g == 2 else [3, 2, 2]
+    )
     s = scene(comm, cell, [plate, block])
     V = compat.function_space(s.mesh, degree, (g,))
     u = fem.Function(V)
@@ -63,15 +65,13 @@ def plate_and_block(cell="quadrilateral", thick=0.1, gap=0.05, push=(0.0, -0.7),
 
 PLATES = [
     {"cell": "triangle", "thick": 0.02},
-    {"cell": "triangle", "thick": 0.2, "lift": 0.2},
+    {"cell": "triangle", "thick": 0.2, "lift": 0.1, "push": (0.0, -0.5)},
     {"cell": "triangle", "thick": 0.1, "degree": 2, "push": (0.0, -0.5)},
-    {"thick": 0.1},
     {"thick": 0.1, "push": (0.3, -0.7)},
     {"thick": 0.1, "push": (-0.3, -0.7), "layers": 2},
     {"thick": 0.02, "lift": 0.2},
-    {"thick": 0.2, "layers": 3},
-    {"cell": "tetrahedron", "thick": 0.05, "push": (0.1, -0.7)},
-    {"cell": "hexahedron", "thick": 0.2, "lift": 0.2},
+    {"cell": "tetrahedron", "thick": 0.05, "push": (0.1, -0.4)},
+    {"cell": "hexahedron", "thick": 0.1, "lift": 0.1, "push": (0.0, -0.4)},
 ]
 
 
@@ -79,7 +79,7 @@ PLATES = [
 def test_a_plate_is_not_passed(how):
     """One load step of several times the thickness is cut, and gives the force that many steps give."""
     forces, cuts = [], []
-    for steps in (1, 16):
+    for steps in (1, 10):
         problem, contact = plate_and_block(**how)
         cuts.append(sum(step.cuts for step in run(problem, steps)))
         forces.append(contact.resultant().force)
@@ -224,8 +224,8 @@ def test_small_ways_are_not_looked_at(monkeypatch):
     from uem_dolfinx.solve import passages
 
     monkeypatch.setattr(passages, "find_crossings", None)
-    problem, contact = plate_and_block(gap=0.0, push=(0.0, -0.6))
-    run(problem, 30)
+    problem, contact = plate_and_block(gap=0.0, push=(0.0, -0.08))
+    run(problem, 4)
     assert contact.n_active > 0
 
 
