@@ -25,11 +25,11 @@ def test_failed_remainder_is_halved(monkeypatch):
     problem, tried = pressed_blocks(), []
     solve = problem.solve
 
-    def fails_on_long_ways(*, start, fraction, ratio):
+    def fails_on_long_ways(*, start, fraction):
         tried.append(fraction)
         if len(tried) in (1, 3):
             raise uem.ConvergenceError("too long")
-        return solve(start=start, fraction=fraction, ratio=ratio)
+        return solve(start=start, fraction=fraction)
 
     monkeypatch.setattr(problem, "solve", fails_on_long_ways)
     done = [step.factor for step in uem.load_steps(problem, 1)]
