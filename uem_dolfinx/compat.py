@@ -19,7 +19,7 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
-from uem_dolfinx.errors import MissingBackendError
+from uem_dolfinx.errors import InputError, MissingBackendError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -78,6 +78,11 @@ def belongs_to(meshtags: Any, domain: Any) -> bool:
     return getattr(topology, "_cpp_object", topology) is getattr(domain.topology, "_cpp_object", domain.topology)
 
 
+def communicator_of(meshtags: Any) -> MPI.Comm | None:
+    """Communicator of the mesh of MeshTags, None if they do not tell it."""
+    return getattr(meshtags.mesh if hasattr(meshtags, "mesh") else meshtags.topology, "comm", None)
+
+
 def shared_by_ranks(index_map: Any, indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Local indices, ghosts included, of all that any rank names by its own local index, ascending (collective)."""
     named = la.vector(index_map)
@@ -102,11 +107,11 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
         The function space.
 
     Raises:
-        ValueError: for another element.
+        InputError: for another element.
     """
     given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
     if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
-        raise ValueError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
+        raise InputError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
     return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
 
 
@@ -224,6 +229,22 @@ def create_vector(V: Any) -> PETSc.Vec:
     with b.localForm() as local:
         local.set(0.0)
     return b
+
+
+def is_dirichlet(bc: Any) -> bool:
+    """Whether this is a Dirichlet condition."""
+    return hasattr(bc, "dof_indices") and hasattr(bc, "function_space")
+
+
+def is_condition_of(bc: Any, V: Any) -> bool:
+    """Whether a Dirichlet condition belongs to a space or to a part of it, and not to a collapsed or another one."""
+    return bool(V._cpp_object.contains(getattr(bc.function_space, "_cpp_object", bc.function_space)))
+
+
+def is_on(V: Any, domain: Any) -> bool:
+    """Whether a space, perhaps as DOLFINx's C++ layer knows it, lives on a mesh."""
+    topologies = [getattr(m.topology, "_cpp_object", m.topology) for m in (V.mesh, domain)]
+    return topologies[0] is topologies[1]
 
 
 def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:

@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.log import timed
-from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.output.tables import Closing, CsvTable, given_path
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_steps import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
@@ -32,6 +34,7 @@ class HistoryWriter(Closing):
     """
 
     def __init__(self, path: str | Path, problem: UnitedProblem, *, resume: bool = False):
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         columns = ["factor" if dynamics is None else "time", "newton_iterations"]
@@ -46,7 +49,7 @@ class HistoryWriter(Closing):
         Args:
             step: a converged step; or its factor or time alone, which leaves the number of iterations empty.
         """
-        row: list[object] = [clock(step), "" if isinstance(step, (int, float)) else step.newton_iterations]
+        row: list[object] = [clock(step), step.newton_iterations if isinstance(step, (LoadStep, TimeStep)) else ""]
         for contact in self.problem.contacts:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
@@ -71,14 +74,19 @@ class ResultsWriter(Closing):
         vtx: whether to write VTX; None does where DOLFINx can.
 
     Raises:
+        InputError, InputTypeError: for no path, no problem, or fields that are no UFL expressions by name.
         MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
     """
 
     def __init__(
         self, path: str | Path, problem: UnitedProblem, *, fields: Mapping[str, Any] | None = None, vtx: bool | None = None
     ):
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
-        stem = Path(path)
+        stem = given_path("path", path, comm)
+        with agreed(comm):
+            _check_fields(fields)
+            vtx = None if vtx is None else given.flag("vtx", vtx)
         if comm.rank == 0:
             stem.parent.mkdir(parents=True, exist_ok=True)
         comm.barrier()
@@ -136,8 +144,22 @@ class ResultsWriter(Closing):
         self._vtx = []
 
 
+def _check_fields(fields: Any) -> None:
+    """Refuse fields that are no UFL expressions by name.
+
+    Raises:
+        InputTypeError, InputError: naming the first bad one.
+    """
+    given.kind("fields", fields, fields is None or isinstance(fields, Mapping), "UFL expressions by name, as a dict, or None")
+    for name, field in (fields or {}).items():
+        given.name("the name of a field", name, "write _ for a blank")
+        given.kind(f"fields[{name!r}]", field, hasattr(field, "ufl_shape"), "a UFL expression")
+
+
 def clock(step: LoadStep | TimeStep | float) -> float:
-    """Load factor or time of a step."""
+    """Load factor or time of a step; InputTypeError for what has none."""
+    known = isinstance(step, (TimeStep, LoadStep, int, float, np.number))
+    given.kind("step", step, known, "a step of load_steps or time_steps, or its factor or time")
     return float(step.time if isinstance(step, TimeStep) else step.factor if isinstance(step, LoadStep) else step)
 
 

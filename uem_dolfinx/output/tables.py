@@ -5,13 +5,26 @@ from __future__ import annotations
 import csv
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import IO, Any, Protocol, Self
 
 from mpi4py import MPI
 
-from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx import given
+from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agreed
+
+
+def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
+    """A path, the same on all ranks; InputTypeError or InputError if it is none (collective)."""
+    with agreed(comm):
+        given.kind(what, value, isinstance(value, (str, PathLike)), "the path of a file", "None is none")
+        if not Path(value).name:
+            raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
+    given.alike(comm, "files", **{what: str(value)})
+    return Path(value)
 
 
 class Clock(Protocol):
@@ -53,7 +66,7 @@ class CsvTable(Closing):
     """
 
     def __init__(self, path: str | Path, comm: MPI.Comm, columns: Sequence[str], resume_at: float | Clock | None = None):
-        self.columns, self.comm, self.path = list(columns), comm, Path(path)
+        self.columns, self.comm, self.path = list(columns), comm, given_path("path", path, comm)
         #: First and last row kept, by column, as numbers; empty in a new file.
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from dolfinx import fem
 
+from uem_dolfinx import given
 from uem_dolfinx.errors import UEMError
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
@@ -47,9 +49,13 @@ def load_steps(problem: UnitedProblem, steps: int = 1) -> Iterator[LoadStep]:
         Every converged step.
 
     Raises:
+        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
     """
+    with agreed(problem.comm):
+        steps = given.count("steps", steps)
+    given.alike(problem.comm, "load_steps", steps=steps)
     control, done, last = StepControl(1.0 / steps), 0.0, 0.0
     start = np.array(problem.u.x.array)
     ramped = isinstance(problem.load, fem.Constant) or problem.load is None
