@@ -5,8 +5,10 @@ The package, its demos and its tests call DOLFINx, UFL and Gmsh through these fu
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
+import re
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +190,26 @@ def petsc_vector(u: Any) -> PETSc.Vec:
     return u.x.petsc_vec if hasattr(u.x, "petsc_vec") else u.vector
 
 
+@contextmanager
+def named_for_code(*expressions: Any) -> Iterator[None]:
+    """Within this block the Functions of UFL expressions and forms have names that can stand in code, into which FFCx 0.5 writes them."""
+    functions = {f for e in expressions for f in ufl.algorithms.extract_coefficients(e) if isinstance(f, fem.Function)}
+    names = {f: f.name for f in functions if re.search(r"\W", f.name)}
+    for f, name in names.items():
+        f.name = re.sub(r"\W+", "_", name)
+    try:
+        yield
+    finally:
+        for f, name in names.items():
+            f.name = name
+
+
+def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.Expression:
+    """A UFL expression compiled for its values at points ``(n, tdim)`` of the reference cell."""
+    with named_for_code(expression):
+        return fem.Expression(expression, points)
+
+
 def interpolate_expression(u: Any, expression: Any) -> None:
     """Interpolate a UFL expression into a Function of a Lagrange or DG0 space, ghosts included (collective)."""
     V = u.function_space
@@ -197,7 +219,7 @@ def interpolate_expression(u: Any, expression: Any) -> None:
     points = V.element.interpolation_points
     if callable(points):
         points = points()
-    compiled = fem.Expression(expression, points)
+    compiled = compile_expression(expression, points)
     if DOLFINX_VERSION >= (0, 6) and hasattr(compiled, "_cpp_object"):
         u.interpolate(compiled)
     else:
@@ -211,6 +233,16 @@ def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
 
 
 # ---------------------------------------------------------------------------------------------- forms, matrices, vectors
+
+
+def petsc_option_used(name: str) -> bool | None:
+    """Whether PETSc has asked for an option of its database; None where that cannot be told, as petsc4py does not pass it on."""
+    used = ctypes.c_int(0)
+    try:
+        ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
+    except (OSError, AttributeError):
+        return None
+    return bool(used.value)
 
 
 def petsc_forms() -> Any:

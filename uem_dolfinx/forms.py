@@ -103,7 +103,10 @@ def sum_ghosts(u: Any) -> None:
 
 def form(integrals: Any) -> Any:
     """Compile a UFL form, or a nested sequence of them, for real arithmetic."""
-    return fem.form(_of_one_subdomain_data(integrals) if isinstance(integrals, ufl.Form) else integrals, dtype=np.float64)
+    if not isinstance(integrals, ufl.Form):
+        return fem.form(integrals, dtype=np.float64)
+    with compat.named_for_code(integrals):
+        return fem.form(_of_one_subdomain_data(integrals), dtype=np.float64)
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:

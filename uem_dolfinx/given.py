@@ -19,6 +19,10 @@ import numpy.typing as npt
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, InputTypeError
 
+#: Values are shown with so many letters.
+#: [format; letters; -]
+LONGEST = 80
+
 
 @dataclass(frozen=True)
 class Range:
@@ -40,15 +44,20 @@ def between(low: float, high: float, remedy: str = "") -> Range:
     return Range(f"a number between {low:g} and {high:g}", lambda x: (low < x) & (x < high), remedy)
 
 
-def shown(value: object) -> str:
-    """A value in a message: short, in one line, and the same on all ranks."""
+def described(value: object) -> str:
+    """A value in one line, the same on all ranks: without addresses of memory."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (str, int, float, complex, list, tuple, dict, set, np.ndarray)):
-        text = re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))
-        return text if len(text) <= 80 else f"{text[:76]} ..."
+        return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))
     name = type(value).__name__
     return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
+def shown(value: object) -> str:
+    """A value in a message, in short."""
+    text = described(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."
 
 
 def sentence(what: str, value: object, expected: str, remedy: str = "") -> str:
@@ -168,12 +177,11 @@ def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
     """
     if comm.size == 1:
         return
-    texts = {what: shown(value) for what, value in values.items()}
-    of_ranks = comm.allgather(texts)
-    for what, first in of_ranks[0].items():
-        for rank, others in enumerate(of_ranks):
-            if others.get(what) != first:
+    of_ranks = comm.allgather([described(value) for value in values.values()])
+    for rank, others in enumerate(of_ranks):
+        for what, first, other in zip(values, of_ranks[0], others):
+            if other != first:
                 raise InputError(
-                    f"{where}: {what} = {first} on rank 0, but {others.get(what)} on rank {rank}: expected the same on all ranks; "
+                    f"{where}: {what} = {first} on rank 0, but {other} on rank {rank}: expected the same on all ranks; "
                     "compute it alike on all of them, or send it to all"
                 )
