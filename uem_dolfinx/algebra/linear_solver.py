@@ -105,14 +105,22 @@ def check_options(options: Any, prefix: Any) -> None:
                     f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
                     + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
                 )
-    for key, of in (("ksp_type", PETSc.KSP), ("pc_type", PETSc.PC)):
-        if key in options and not _knows(of, options[key]):
-            known = [name for name in vars(of.Type).values() if isinstance(name, str) and _knows(of, name)]
-            given.word(f"petsc_options[{key!r}]", options[key], sorted(known))
+    for key, of, example in (("ksp_type", PETSc.KSP, "'cg' or 'gmres'"), ("pc_type", PETSc.PC, "'gamg' or 'lu'")):
+        if key in options and not _knows(of, value := options[key]):
+            near = difflib.get_close_matches(str(value), _type_names(of), n=1)
+            remedy = f"did you mean {near[0]!r}?" if near else ""
+            raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
+
+
+def _type_names(of: Any) -> list[str]:
+    """Types of KSP or PC that petsc4py knows by name."""
+    return [name for name in vars(of.Type).values() if isinstance(name, str)]
 
 
 def _knows(of: Any, name: Any) -> bool:
-    """Whether PETSc has a type of KSP or PC."""
+    """Whether there is a type of KSP or PC of this name, built in or registered since."""
+    if name in _type_names(of):
+        return True
     try:
         of().create(PETSc.COMM_SELF).setType(name)
     except (PETSc.Error, TypeError):
