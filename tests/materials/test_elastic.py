@@ -5,6 +5,8 @@ Worth reading first: ``test_stress_is_derivative_of_energy`` and ``test_uniaxial
 
 from __future__ import annotations
 
+import re
+
 from mpi4py import MPI
 
 import numpy as np
@@ -96,3 +98,35 @@ def test_wrong_kind_is_refused():
         uem.LinearElastic(E, NU, "plain_strain")
     with pytest.raises(ValueError, match="components"):
         uem.LinearElastic(E, NU, "3d").stress(displacement(np.zeros((2, 2))))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "E, nu, words",
+    [
+        *((E, 0.3, f"E = {E!r}: expected a positive number") for E in (0, -1.0, np.inf, np.nan, "steel", None, (1.0, 2.0))),
+        *((1.0, nu, f"nu = {nu!r}: expected a number between -1 and 0.5") for nu in (0.5, 0.7, -1, np.nan, "a", None)),
+    ],
+)
+@pytest.mark.parametrize("kind", ["3d", "plane_strain", "plane_stress"])
+def test_parameters_out_of_range(law, E, nu, words, kind):
+    bad = E if words.startswith("E") else nu
+    with pytest.raises(uem.InputError if isinstance(bad, (int, float)) else uem.InputTypeError, match=re.escape(words)):
+        law(E, nu, kind)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_parameters_out_of_range_in_constants_and_functions(comm, law):
+    """Alike on all ranks, also where one cell of one rank is wrong; what is yet to be filled is left alone."""
+    square = mesh.create_unit_square(comm, 4, 4)
+    with pytest.raises(uem.InputError, match="nu = 0.5: expected a number between -1 and 0.5; a body that hardly changes"):
+        law(1.0, fem.Constant(square, 0.5), "plane_strain")
+    E = fem.Function(compat.function_space(square, ("DG", 0)))
+    law(E, fem.Constant(square, 0.3), "plane_strain")
+    E.x.array[:] = 1.0
+    law(E, E - 0.7, "plane_strain")
+    E.x.array[:1] = -2.0 if comm.rank == comm.size - 1 else 1.0
+    with pytest.raises(uem.InputError, match="the Function E = -2.0: expected a positive number"):
+        law(E, 0.3, "plane_strain")
+    with pytest.raises(uem.InputTypeError, match="E = .*expected a scalar expression"):
+        law(ufl.SpatialCoordinate(square), 0.3, "plane_strain")
