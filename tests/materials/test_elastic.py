@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, mesh
+from helpers import blocks
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -130,3 +131,41 @@ def test_parameters_out_of_range_in_constants_and_functions(comm, law):
         law(E, 0.3, "plane_strain")
     with pytest.raises(uem.InputTypeError, match="E = .*expected a scalar expression"):
         law(ufl.SpatialCoordinate(square), 0.3, "plane_strain")
+
+
+@pytest.mark.parametrize("cell,degree", [("quadrilateral", 1), ("quadrilateral", 2), ("hexahedron", 1)])
+def test_quadrature_of_what_is_no_polynomial(cell, degree, monkeypatch):
+    """Forces of a block, compressed by 30 % and sheared, are those of a fine rule; with a tenth of the points they are not."""
+
+    def force(rule):
+        b = blocks(MPI.COMM_WORLD, cell, 1, 2, degree=degree)
+        g, law = b.gdim, uem.NeoHooke(1.0, 0.4, "3d" if b.gdim == 3 else "plane_strain")
+        b.u.interpolate(
+            lambda x: np.stack([0.2 * x[0] * x[g - 1], *([0.1 * x[1]] * (g - 2)), -0.3 * x[g - 1] * (1 + 0.2 * x[0])])
+        )
+        F = law.residual(b.u, ufl.TestFunction(b.V)) * (ufl.dx if rule is None else ufl.dx(metadata={"quadrature_degree": rule}))
+        parts = MPI.COMM_WORLD.allgather(np.linalg.norm(forms.assemble_array(b.V, forms.form(F))) ** 2)
+        return np.sqrt(sum(parts))
+
+    fine = force(12)
+    assert force(None) == pytest.approx(fine, rel=1e-6)
+    monkeypatch.setattr(forms, "DEGREES_ENOUGH", 0.4)
+    assert force(None) != pytest.approx(fine, rel=1e-4)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("degree", [1, 2])
+def test_degrees_that_are_asked_for(law, degree):
+    """A rational law gets a sensible rule, also in its tangent; a polynomial one, and a rule that is named, stay as they are."""
+    b = blocks(MPI.COMM_WORLD, "quadrilateral", 1, 1, degree=degree)
+    v = ufl.TestFunction(b.V)
+
+    def degrees(F):
+        return [i.metadata().get("quadrature_degree") for i in forms._of_sensible_degree(F).integrals()]
+
+    residual = law(1.0, 0.3, "plane_strain").residual(b.u, v)
+    energy = law(1.0, 0.3, "plane_strain").energy(b.u) * ufl.dx
+    wanted = [4 * degree] if law is uem.NeoHooke else [None]
+    assert degrees(residual * ufl.dx) == degrees(ufl.derivative(residual * ufl.dx, b.u)) == wanted
+    assert degrees(ufl.derivative(energy, b.u, v)) == wanted
+    assert degrees(residual * ufl.dx(metadata={"quadrature_degree": 6})) == [6]

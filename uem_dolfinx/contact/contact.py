@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.bernstein import Bernstein
+from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
@@ -25,7 +26,7 @@ from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
-from uem_dolfinx.geometry.tags import Part, as_tag, communicator_of, name_of
+from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
 from uem_dolfinx.parallel import agreed
 
 #: Default bound on the initial penetration, as part of the model's size.
@@ -134,7 +135,20 @@ class Contact:
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
             thickness=thickness,
         )
+        warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def begin(self) -> None:
+        """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
+        self.taken, self._slipped = True, False
+        self._off_at_start = self.pair.off.copy()
+        warn_of_sagging_facets(self.pair)
+
+    def look_at_ends(self) -> None:
+        """Warn, once, if contactors have slid off the target's end since the start (collective)."""
+        gone = self.pair.off & ~self._off_at_start
+        if not self._slipped and self.pair.target.n_nodes and self.config.comm.allreduce(gone.any(), op=MPI.LOR):
+            self._slipped = warn_of_slipped(self.pair, self._off_at_start, self._areas)
 
     @property
     def pair(self) -> ContactPair:

@@ -143,7 +143,7 @@ class UnitedProblem:
         self._last = np.array(u.x.array)
         self._largest_forces = 0.0
         for contact in self.contacts:
-            contact.taken = True
+            contact.begin()
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -213,6 +213,8 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
+        for contact in self.contacts:
+            contact.look_at_ends()
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
