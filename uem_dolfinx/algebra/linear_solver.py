@@ -184,15 +184,15 @@ class UnitedSolver:
         self.ksp = self._create_ksp()
 
     @contextmanager
-    def _in_database(self) -> Iterator[None]:
-        """Show PETSc the options; levels of a multigrid read theirs only when they are set up."""
-        database, prefix = PETSc.Options(), self._prefix
-        for key, value in self.options.items():
+    def _in_database(self, **instead: Any) -> Iterator[None]:
+        """Show PETSc the options, some with another value; levels of a multigrid read theirs only when they are set up."""
+        database, prefix, options = PETSc.Options(), self._prefix, self.options | instead
+        for key, value in options.items():
             database[prefix + key] = value
         try:
             yield
         finally:
-            for key in self.options:
+            for key in options:
                 if self._unused and compat.petsc_option_used(prefix + key) is not False:
                     self._unused.discard(key)
                 del database[prefix + key]
@@ -270,8 +270,9 @@ class UnitedSolver:
             self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
             if self._types[1] == "cholesky":
                 pc.setType("lu")
-        with self._in_database():
-            pc.setFromOptions()
+        # the other KSP has options of its own
+        with self._in_database(ksp_type=self.ksp.getType()):
+            self.ksp.setFromOptions()
         if not symmetric and pc.getType() == "cholesky":
             pc.setType("lu")
 

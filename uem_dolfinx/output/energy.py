@@ -80,7 +80,7 @@ class EnergyBook(Closing):
             given.kind(what, work, work is None or isinstance(work, ufl.Form), "a UFL form, or None", "multiply it by ufl.dx")
             if work is not None and len(work.arguments()) != arguments:
                 expected = "a functional, without" if arguments == 0 else "a form linear in a"
-                raise InputError(f"{what} has {len(work.arguments())} arguments: expected {expected} test function")
+                raise InputError(f"{what} has {len(work.arguments())} argument(s): expected {expected} test function")
         works = stored, external, self.dynamics.damping_form
         self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
         #: Rows written, in order.
