@@ -362,6 +362,15 @@ class SharedTarget:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._target, name)
 
+    @property
+    def motion(self) -> Any:
+        """The target's own, which a checkpoint sets."""
+        return self._target.motion
+
+    @motion.setter
+    def motion(self, motion: Any) -> None:
+        self._target.motion = motion
+
     def project(self, points: Array) -> Projection:
         """Where points stand relative to it (collective)."""
         return ask_together(self._comm, self._words, self._target.project, points)
