@@ -19,14 +19,15 @@ from __future__ import annotations
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Energies",
-    "EnergyBook", "FloatingBodyError", "HistoryWriter", "InvertedElementError", "LinearElastic", "LinearSolveError",
-    "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
-    "OrientationError", "OutputError", "PenetrationError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
-    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
-    "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "VonMises", "consistent_mass", "dirichlet", "ds",
-    "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps", "lumped_mass",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh",
-    "time_steps", "timing", "write_checkpoint",
+    "EnergyBook", "FloatingBodyError", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError",
+    "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError",
+    "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError",
+    "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere",
+    "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags",
+    "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "consistent_mass",
+    "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
+    "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene",
+    "read_checkpoint", "read_gmsh", "time_steps", "timing", "write_checkpoint",
 ]  # fmt: skip
 
 from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
@@ -43,6 +44,8 @@ from uem_dolfinx.errors import (
     ConflictError,
     ConvergenceError,
     FloatingBodyError,
+    InputError,
+    InputTypeError,
     InvertedElementError,
     LinearSolveError,
     MassError,
@@ -58,6 +61,7 @@ from uem_dolfinx.errors import (
     TagError,
     TunnellingError,
     UEMError,
+    UserFunctionError,
 )
 from uem_dolfinx.geometry.gmsh import read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface

@@ -5,8 +5,10 @@ The package, its demos and its tests call DOLFINx, UFL and Gmsh through these fu
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
+import re
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
-from uem_dolfinx.errors import MissingBackendError
+from uem_dolfinx.errors import InputError, MissingBackendError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -85,6 +87,11 @@ def belongs_to(meshtags: Any, domain: Any) -> bool:
     return getattr(topology, "_cpp_object", topology) is getattr(domain.topology, "_cpp_object", domain.topology)
 
 
+def communicator_of(meshtags: Any) -> MPI.Comm | None:
+    """Communicator of the mesh of MeshTags, None if they do not tell it."""
+    return getattr(meshtags.mesh if hasattr(meshtags, "mesh") else meshtags.topology, "comm", None)
+
+
 def shared_by_ranks(index_map: Any, indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Local indices, ghosts included, of all that any rank names by its own local index, ascending (collective)."""
     named = la.vector(index_map)
@@ -109,11 +116,11 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
         The function space.
 
     Raises:
-        ValueError: for another element.
+        InputError: for another element.
     """
     given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
     if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
-        raise ValueError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
+        raise InputError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
     return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
 
 
@@ -190,6 +197,26 @@ def petsc_vector(u: Any) -> PETSc.Vec:
     return u.x.petsc_vec if hasattr(u.x, "petsc_vec") else u.vector
 
 
+@contextmanager
+def named_for_code(*expressions: Any) -> Iterator[None]:
+    """Within this block the Functions of UFL expressions and forms have names that can stand in code, into which FFCx 0.5 writes them."""
+    functions = {f for e in expressions for f in ufl.algorithms.extract_coefficients(e) if isinstance(f, fem.Function)}
+    names = {f: f.name for f in functions if re.search(r"\W", f.name)}
+    for f, name in names.items():
+        f.name = re.sub(r"\W+", "_", name)
+    try:
+        yield
+    finally:
+        for f, name in names.items():
+            f.name = name
+
+
+def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.Expression:
+    """A UFL expression compiled for its values at points ``(n, tdim)`` of the reference cell."""
+    with named_for_code(expression):
+        return fem.Expression(expression, points)
+
+
 def interpolate_expression(u: Any, expression: Any) -> None:
     """Interpolate a UFL expression into a Function of a Lagrange or DG0 space, ghosts included (collective)."""
     V = u.function_space
@@ -199,7 +226,7 @@ def interpolate_expression(u: Any, expression: Any) -> None:
     points = V.element.interpolation_points
     if callable(points):
         points = points()
-    compiled = fem.Expression(expression, points)
+    compiled = compile_expression(expression, points)
     if DOLFINX_VERSION >= (0, 6) and hasattr(compiled, "_cpp_object"):
         u.interpolate(compiled)
     else:
@@ -213,6 +240,16 @@ def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
 
 
 # ---------------------------------------------------------------------------------------------- forms, matrices, vectors
+
+
+def petsc_option_used(name: str) -> bool | None:
+    """Whether PETSc has asked for an option of its database; None where that cannot be told, as petsc4py does not pass it on."""
+    used = ctypes.c_int(0)
+    try:
+        ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
+    except (OSError, AttributeError):
+        return None
+    return bool(used.value)
 
 
 def petsc_forms() -> Any:
@@ -231,6 +268,22 @@ def create_vector(V: Any) -> PETSc.Vec:
     with b.localForm() as local:
         local.set(0.0)
     return b
+
+
+def is_dirichlet(bc: Any) -> bool:
+    """Whether this is a Dirichlet condition."""
+    return hasattr(bc, "dof_indices") and hasattr(bc, "function_space")
+
+
+def is_condition_of(bc: Any, V: Any) -> bool:
+    """Whether a Dirichlet condition belongs to a space or to a part of it, and not to a collapsed or another one."""
+    return bool(V._cpp_object.contains(getattr(bc.function_space, "_cpp_object", bc.function_space)))
+
+
+def is_on(V: Any, domain: Any) -> bool:
+    """Whether a space, perhaps as DOLFINx's C++ layer knows it, lives on a mesh."""
+    topologies = [getattr(m.topology, "_cpp_object", m.topology) for m in (V.mesh, domain)]
+    return topologies[0] is topologies[1]
 
 
 def bc_dofs(bc: Any) -> tuple[npt.NDArray[np.int32], int]:

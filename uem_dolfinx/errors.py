@@ -12,6 +12,18 @@ class UEMError(Exception):
     """Root of every error this package raises on purpose."""
 
 
+class InputError(UEMError, ValueError):
+    """Something handed over is out of its range, or not what it is handed over as."""
+
+
+class InputTypeError(InputError, TypeError):
+    """Something handed over is of another type than was expected."""
+
+
+class UserFunctionError(UEMError, RuntimeError):
+    """A function of the user's has raised an error, which is the cause of this one on the rank where it happened."""
+
+
 class TagError(UEMError, KeyError):
     """A physical group is unknown, empty or of the wrong dimension."""
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import pickle
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 
 import numpy as np
 
 from uem_dolfinx.arrays import AnyArray, Ints
+from uem_dolfinx.errors import UEMError, UserFunctionError
+
+T = TypeVar("T")
 
 
 def agree(comm: MPI.Comm, error: Exception | None) -> None:
@@ -26,33 +31,63 @@ def agree(comm: MPI.Comm, error: Exception | None) -> None:
         error: what this rank found wrong, or None.
 
     Raises:
-        Exception: the same error on all ranks, if any rank had one.
+        Exception: the same error on all ranks, if any rank had one; a RuntimeError with its words if it cannot be sent as it is.
     """
-    if comm.size > 1:
-        errors = comm.allgather(error)
-        error = next((e for e in errors if e is not None), None)
+    if comm.size > 1 and comm.allreduce(error is not None, op=MPI.LOR):
+        errors = comm.allgather(_sendable(error))
+        first = next(rank for rank, e in enumerate(errors) if e is not None)
+        if first != comm.rank or errors[first].__class__ is not error.__class__:
+            raise errors[first] from error
     if error is not None:
         raise error
 
 
+def _sendable(error: Exception | None) -> Any:
+    """The error, or one with its words if other ranks could not read it."""
+    try:
+        return error if type(pickle.loads(pickle.dumps(error))) is type(error) else RuntimeError(str(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+
+
 @contextmanager
 def agreed(comm: MPI.Comm) -> Iterator[None]:
-    """What one rank raises within a ``with`` block is raised on all at its end (collective).
-
-    Raises:
-        Exception: the error itself, on several ranks a RuntimeError with its words if it cannot be sent as it is.
-    """
-    found: Exception | None = None
+    """What is raised in this block on one rank, at its end is raised on all; the block itself must not be collective (collective)."""
+    error: Exception | None = None
     try:
         yield
+    except Exception as found:
+        error = found
+    agree(comm, error)
+
+
+def ask(what: str, f: Callable[..., T], *args: Any) -> T:
+    """What a function of the user's returns.
+
+    Args:
+        what: it is, for messages.
+        f: called with ``args``.
+        args: of the function.
+
+    Raises:
+        UserFunctionError: naming it, and what it raised where; an error of the package's own passes as it is.
+    """
+    try:
+        return f(*args)
+    except UEMError:
+        raise
     except Exception as error:
-        found = error
-        if comm.size > 1:
-            try:
-                pickle.loads(pickle.dumps(error))
-            except Exception:
-                found = RuntimeError(f"{type(error).__name__}: {error}")
-    agree(comm, found)
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise UserFunctionError(
+            f"{what} raised {type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno}); mend the function"
+        ) from error
+
+
+def ask_together(comm: MPI.Comm, what: str, f: Callable[..., T], *args: Any) -> T:
+    """``ask`` on every rank; what it raises on one is raised on all (collective)."""
+    with agreed(comm):
+        return ask(what, f, *args)
+    raise AssertionError("an error that nobody raised")
 
 
 def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:

@@ -10,10 +10,10 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx import compat, forms
-from uem_dolfinx.errors import SpaceError
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agreed
 
 
 def dirichlet(
@@ -37,14 +37,11 @@ def dirichlet(
     Raises:
         SpaceError: ``V`` is no Lagrange space, or the tag or the Function does not belong to it.
         TagError: the tag is empty, or cannot be read.
-        ValueError: no such component, or a value of another shape or not finite.
+        InputError, InputTypeError: no such component, or a value of another shape or not finite.
     """
-    mesh, error = V.mesh, None
-    try:
+    mesh = given.kind("V", V, hasattr(V, "dofmap"), "a function space, as u.function_space").mesh
+    with agreed(mesh.comm):
         value = _checked(V, component, value)
-    except ValueError as found:
-        error = found
-    agree(mesh.comm, error)
     tdim = mesh.topology.dim
     tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
     mesh.topology.create_connectivity(tag.dim, tdim)
@@ -62,22 +59,28 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
     if degree is None or V.dofmap.bs != size:
         raise SpaceError("a Dirichlet condition needs a whole Lagrange space: give that of the displacement, and a component")
     if component is not None and component not in range(size):
-        raise ValueError(f"component = {component!r}: expected one of 0 to {size - 1}, or None for all")
+        raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
     if isinstance(value, fem.Function):
-        given, array = value.function_space, value.x.array
-        scalar = given.dofmap.index_map_bs == 1 and compat.lagrange_degree(given) == degree and given.mesh is V.mesh
-        if not (given == V if n == size else scalar):
+        own, array = value.function_space, value.x.array
+        scalar = own.dofmap.index_map_bs == 1 and compat.lagrange_degree(own) == degree and own.mesh is V.mesh
+        if not (own == V if n == size else scalar):
             wanted = "the condition's space" if n == size else f"a scalar Lagrange space of degree {degree} on its mesh"
             raise SpaceError(f"the value '{value.name}' of a Dirichlet condition is no Function of {wanted}")
     else:
-        array = np.asarray(value.value if isinstance(value, fem.Constant) else value, dtype=PETSc.ScalarType)
+        try:
+            array = np.asarray(value.value if isinstance(value, fem.Constant) else value, dtype=PETSc.ScalarType)
+        except (TypeError, ValueError):
+            array = None
+        expected = "a number, or a Constant or a Function, or numbers for all components"
+        given.kind("the value of a Dirichlet condition", value, array is not None and value is not None, expected)
         if array.ndim == 0 and n > 1 and not isinstance(value, fem.Constant):
             array = np.full(n, array)
         if array.shape != ((n,) if n > 1 else ()):
-            raise ValueError(f"a Dirichlet condition for {n} components has a value of the shape {array.shape}")
+            words = f"{n} numbers" if n > 1 else "a number"
+            raise InputError(f"a Dirichlet condition for {n} components has a value of the shape {array.shape}: expected {words}")
     if not np.isfinite(array).all():
-        raise ValueError(f"the value {value} of a Dirichlet condition is not finite")
+        raise InputError(given.sentence("the value of a Dirichlet condition", value, "finite numbers"))
     return value if isinstance(value, (fem.Function, fem.Constant)) else array if n > 1 else array[()]
 
 
@@ -104,7 +107,9 @@ def dx(tag: Part, mesh: Any = None, **metadata: Any) -> ufl.Measure:
 def _mesh_of(part: Part, mesh: Any) -> Any:
     known = [one.mesh for one in (part if isinstance(part, (list, tuple)) else [part]) if isinstance(one, Tag)]
     if mesh is None and not known:
-        raise ValueError(f"a measure of {part!r:.60} needs the mesh as its second argument: only tags of read_gmsh know theirs")
+        raise InputError(
+            f"a measure of {given.shown(part)} needs the mesh as its second argument: only tags of read_gmsh know theirs"
+        )
     return known[0] if mesh is None else mesh
 
 
@@ -113,6 +118,16 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
 
     Args:
         integrals: in UFL, or compiled by ``fem.form``, which saves time where it is asked for again and again.
+
+    Raises:
+        InputError, InputTypeError: for anything else, or a form with a test function.
     """
+    if not isinstance(integrals, ufl.Form):
+        remedy = "multiply an expression by ufl.dx or uem.ds(tag)"
+        given.kind(
+            "integrals", integrals, hasattr(integrals, "function_spaces"), "a UFL form, or one compiled by fem.form", remedy
+        )
+    elif integrals.arguments():
+        raise InputError("integrals hold a test function: expected a functional; leave the test function out")
     M = forms.form(integrals) if isinstance(integrals, ufl.Form) else integrals
     return forms.assemble_scalar(M, M.mesh.comm)

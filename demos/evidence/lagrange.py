@@ -15,7 +15,6 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
-from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed

@@ -140,12 +140,12 @@ def test_motion_that_is_none(what, motion):
 
 
 def test_reference_and_about_must_be_finite():
-    with pytest.raises(ValueError, match=r"rigid sphere: reference .* is not finite"):
+    with pytest.raises(ValueError, match=r"rigid sphere: center .* is not finite"):
         uem.RigidSphere((0.0, np.inf), 1.0)
     _, contact, _ = slab("triangle", uem.RigidPlane((0.0, 1.0), (0.0, -1.0)))
     with pytest.raises(ValueError, match="about .* is not finite"):
         contact.resultant(about=(0.0, np.nan))
-    with pytest.raises(ValueError, match="'tool' is not known here: expected one of contactor, target"):
+    with pytest.raises(ValueError, match="on = 'tool': expected one of 'contactor' or 'target'"):
         contact.resultant(on="tool")
 
 

@@ -5,12 +5,15 @@ Worth reading first: ``test_stress_is_derivative_of_energy`` and ``test_uniaxial
 
 from __future__ import annotations
 
+import re
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, mesh
+from helpers import blocks
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -96,3 +99,73 @@ def test_wrong_kind_is_refused():
         uem.LinearElastic(E, NU, "plain_strain")
     with pytest.raises(ValueError, match="components"):
         uem.LinearElastic(E, NU, "3d").stress(displacement(np.zeros((2, 2))))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "E, nu, words",
+    [
+        *((E, 0.3, f"E = {E!r}: expected a positive number") for E in (0, -1.0, np.inf, np.nan, "steel", None, (1.0, 2.0))),
+        *((1.0, nu, f"nu = {nu!r}: expected a number between -1 and 0.5") for nu in (0.5, 0.7, -1, np.nan, "a", None)),
+    ],
+)
+@pytest.mark.parametrize("kind", ["3d", "plane_strain", "plane_stress"])
+def test_parameters_out_of_range(law, E, nu, words, kind):
+    bad = E if words.startswith("E") else nu
+    with pytest.raises(uem.InputError if isinstance(bad, (int, float)) else uem.InputTypeError, match=re.escape(words)):
+        law(E, nu, kind)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_parameters_out_of_range_in_constants_and_functions(comm, law):
+    """Alike on all ranks, also where one cell of one rank is wrong; what is yet to be filled is left alone."""
+    square = mesh.create_unit_square(comm, 4, 4)
+    with pytest.raises(uem.InputError, match="nu = 0.5: expected a number between -1 and 0.5; a body that hardly changes"):
+        law(1.0, fem.Constant(square, 0.5), "plane_strain")
+    E = fem.Function(compat.function_space(square, ("DG", 0)))
+    law(E, fem.Constant(square, 0.3), "plane_strain")
+    E.x.array[:] = 1.0
+    law(E, E - 0.7, "plane_strain")
+    E.x.array[:1] = -2.0 if comm.rank == comm.size - 1 else 1.0
+    with pytest.raises(uem.InputError, match="the Function E = -2.0: expected a positive number"):
+        law(E, 0.3, "plane_strain")
+    with pytest.raises(uem.InputTypeError, match="E = .*expected a scalar expression"):
+        law(ufl.SpatialCoordinate(square), 0.3, "plane_strain")
+
+
+@pytest.mark.parametrize("cell,degree", [("quadrilateral", 1), ("quadrilateral", 2), ("hexahedron", 1)])
+def test_quadrature_of_what_is_no_polynomial(cell, degree, monkeypatch):
+    """Forces of a block, compressed by 30 % and sheared, are those of a fine rule; with a tenth of the points they are not."""
+
+    def force(rule):
+        b = blocks(MPI.COMM_WORLD, cell, 1, 2, degree=degree)
+        g, law = b.gdim, uem.NeoHooke(1.0, 0.4, "3d" if b.gdim == 3 else "plane_strain")
+        b.u.interpolate(
+            lambda x: np.stack([0.2 * x[0] * x[g - 1], *([0.1 * x[1]] * (g - 2)), -0.3 * x[g - 1] * (1 + 0.2 * x[0])])
+        )
+        F = law.residual(b.u, ufl.TestFunction(b.V)) * (ufl.dx if rule is None else ufl.dx(metadata={"quadrature_degree": rule}))
+        parts = MPI.COMM_WORLD.allgather(np.linalg.norm(forms.assemble_array(b.V, forms.form(F))) ** 2)
+        return np.sqrt(sum(parts))
+
+    fine = force(12)
+    assert force(None) == pytest.approx(fine, rel=1e-6)
+    monkeypatch.setattr(forms, "DEGREES_ENOUGH", 0.4)
+    assert force(None) != pytest.approx(fine, rel=1e-4)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("degree", [1, 2])
+def test_degrees_that_are_asked_for(law, degree):
+    """A rational law gets a sensible rule, also in its tangent; a polynomial one, and a rule that is named, stay as they are."""
+    b = blocks(MPI.COMM_WORLD, "quadrilateral", 1, 1, degree=degree)
+    v = ufl.TestFunction(b.V)
+
+    def degrees(F):
+        return [i.metadata().get("quadrature_degree") for i in forms._of_sensible_degree(F).integrals()]
+
+    residual = law(1.0, 0.3, "plane_strain").residual(b.u, v)
+    energy = law(1.0, 0.3, "plane_strain").energy(b.u) * ufl.dx
+    wanted = [4 * degree] if law is uem.NeoHooke else [None]
+    assert degrees(residual * ufl.dx) == degrees(ufl.derivative(residual * ufl.dx, b.u)) == wanted
+    assert degrees(ufl.derivative(energy, b.u, v)) == wanted
+    assert degrees(residual * ufl.dx(metadata={"quadrature_degree": 6})) == [6]

@@ -370,7 +370,7 @@ def test_parameters_differ_from_cell_to_cell(comm):
     "given, says",
     [
         ({"kind": "plain_strain"}, "plane_strain"), ({"strain": "finite"}, "green_lagrange"), ({"kind": "3d"}, "2 components"),
-        ({"E": 0.0}, "E = 0 in the cell"), ({"nu": 0.5}, "nu = 0.5"), ({"yield_stress": 0.0}, "yield_stress"),
+        ({"E": 0.0}, "E = 0.0: expected a positive number"), ({"nu": 0.5}, "nu = 0.5"), ({"yield_stress": 0.0}, "yield_stress"),
         ({"yield_stress": np.nan}, "yield_stress = nan"), ({"hardening": -1.0}, "hardening = -1"), ({"quadrature_degree": 1}, "expected 2"),
     ],
 )  # fmt: skip

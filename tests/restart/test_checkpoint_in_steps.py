@@ -60,7 +60,7 @@ def test_interval_and_end(folder, caplog):
     assert COMM.rank > 0 or any("going on from the checkpoint" in r.message for r in caplog.records)
     COMM.barrier()
     assert [f.name for f in path.parent.iterdir()] == ["run"]
-    with pytest.raises(ValueError, match="every = 0: expected a number of steps"):
+    with pytest.raises(ValueError, match="every = 0: expected a whole number, 1 or more"):
         uem.Checkpoint(path, every=0)
 
 

@@ -237,8 +237,8 @@ def test_terminated(folder):
 @pytest.mark.parametrize(
     "dt, end, match",
     [
-        (np.nan, 1.0, "dt = nan.*expected dt > 0"),
-        (np.inf, 1.0, "dt = inf.*expected dt > 0"),
+        (np.nan, 1.0, "dt = nan.*expected a positive number"),
+        (np.inf, 1.0, "dt = inf.*expected a positive number"),
         (0.1, np.nan, "end = nan: expected a time that is not before the start, 3"),
         (0.1, np.inf, "end = inf"),
         (0.1, 2.9, "end = 2.9: expected a time that is not before the start, 3"),

@@ -5,20 +5,24 @@ Any KSP and PC can be chosen through ``petsc_options``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import difflib
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
+from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import LinearSolveError, MissingBackendError
+from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agreed
 
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
 #: [convention; bodies; test_thresholds_algebra.py::test_few_bodies_have_modes_of_their_own]
@@ -38,6 +42,13 @@ KEPT_SLOWER = 2.0
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 #: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+#: Errors of PETSc that say that it has no such type, or no such factorisation.
+NO_SUCH_TYPE = (86, 92)
+#: Options that misspelt ones are likely to mean.
+OFTEN_USED = (
+    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_norm_type", "ksp_gmres_restart", "ksp_monitor", "ksp_view", "pc_type",
+    "pc_factor_mat_solver_type", "pc_hypre_type", "pc_gamg_threshold", "mg_levels_ksp_type", "mg_levels_pc_type", "sub_pc_type",
+)  # fmt: skip
 
 
 def has_hypre() -> bool:
@@ -71,15 +82,55 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
 
 
-def check_options(options: dict[str, Any]) -> None:
-    """Raise MissingBackendError, naming the option, where one asks for a library PETSc was built without."""
+def check_options(options: Any, prefix: Any) -> None:
+    """Refuse options and a prefix that PETSc could not read, and types of KSP and PC that it does not know.
+
+    Raises:
+        InputTypeError, InputError: naming the option.
+        MissingBackendError: where one asks for a library PETSc was built without.
+    """
+    given.kind("petsc_options_prefix", prefix, isinstance(prefix, str), "a text, as 'uem_'")
+    if not re.fullmatch(r"(?!-)\S*", prefix):
+        raise InputError(given.sentence("petsc_options_prefix", prefix, "a text without blanks, and no hyphen before it"))
+    example = "options by name without prefix, as {'ksp_type': 'cg', 'pc_type': 'gamg'}, or None"
+    given.kind("petsc_options", options, isinstance(options, Mapping), example)
     for key, value in options.items():
+        if not isinstance(key, str) or not re.fullmatch(r"[A-Za-z]\S*", key):
+            raise InputError(given.sentence("a name in petsc_options", key, "an option's name without blanks, hyphen and prefix"))
+        plain = value is None or isinstance(value, (str, bool, int, float, list, tuple, np.generic))
+        given.kind(f"petsc_options[{key!r}]", value, plain, "a text or a number")
         for name, there in (("hypre", has_hypre), ("mumps", has_mumps)):
             if str(value).lower() == name and not there():
                 raise MissingBackendError(
                     f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
                     + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
                 )
+    for key, of, example in (("ksp_type", PETSc.KSP, "'cg' or 'gmres'"), ("pc_type", PETSc.PC, "'gamg' or 'lu'")):
+        if key in options and not _knows(of, value := options[key]):
+            near = difflib.get_close_matches(str(value), _type_names(of), n=1)
+            remedy = f"did you mean {near[0]!r}?" if near else ""
+            raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
+
+
+def _type_names(of: Any) -> list[str]:
+    """Types of KSP or PC that petsc4py knows by name."""
+    return [name for name in vars(of.Type).values() if isinstance(name, str)]
+
+
+def _knows(of: Any, name: Any) -> bool:
+    """Whether there is a type of KSP or PC of this name, built in or registered since."""
+    if name in _type_names(of):
+        return True
+    try:
+        of().create(PETSc.COMM_SELF).setType(name)
+    except (PETSc.Error, TypeError):
+        return False
+    return True
+
+
+def _last_words(error: PETSc.Error) -> str:
+    """What PETSc says about an error, without where in its sources."""
+    return str(error).splitlines()[-1].partition("] ")[2] or str(error)
 
 
 class UnitedSolver:
@@ -92,9 +143,13 @@ class UnitedSolver:
     def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
         self.config = config
         size = config.gdim * config.index_map.size_global
+        with agreed(config.comm):
+            check_options({} if options is None else options, prefix)
+        given.alike(config.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
         self.options = default_options(size, config.gdim) if options is None else dict(options)
-        check_options(self.options)
         self._prefix = prefix
+        #: Options of the user's that PETSc has not asked for yet; None once the user was told.
+        self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
         self.ksp = self._create_ksp()
         self._key: object = None
@@ -114,7 +169,12 @@ class UnitedSolver:
         ksp.setOptionsPrefix(self._prefix)
         ksp.setErrorIfNotConverged(False)
         with self._in_database():
-            ksp.setFromOptions()
+            try:
+                ksp.setFromOptions()
+            except PETSc.Error as error:
+                raise InputError(
+                    f"PETSc refuses petsc_options = {given.shown(self.options)}: {_last_words(error)}; correct them"
+                ) from error
         return ksp
 
     def forget(self) -> None:
@@ -124,15 +184,17 @@ class UnitedSolver:
         self.ksp = self._create_ksp()
 
     @contextmanager
-    def _in_database(self) -> Iterator[None]:
-        """Show PETSc the options; levels of a multigrid read theirs only when they are set up."""
-        database, prefix = PETSc.Options(), self._prefix
-        for key, value in self.options.items():
+    def _in_database(self, **instead: Any) -> Iterator[None]:
+        """Show PETSc the options, some with another value; levels of a multigrid read theirs only when they are set up."""
+        database, prefix, options = PETSc.Options(), self._prefix, self.options | instead
+        for key, value in options.items():
             database[prefix + key] = value
         try:
             yield
         finally:
-            for key in self.options:
+            for key in options:
+                if self._unused and compat.petsc_option_used(prefix + key) is not False:
+                    self._unused.discard(key)
                 del database[prefix + key]
 
     @property
@@ -208,8 +270,9 @@ class UnitedSolver:
             self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
             if self._types[1] == "cholesky":
                 pc.setType("lu")
-        with self._in_database():
-            pc.setFromOptions()
+        # the other KSP has options of its own
+        with self._in_database(ksp_type=self.ksp.getType()):
+            self.ksp.setFromOptions()
         if not symmetric and pc.getType() == "cholesky":
             pc.setType("lu")
 
@@ -286,10 +349,16 @@ class UnitedSolver:
                 with timed("linear solve"):
                     self.ksp.solve(rhs, dq)
             except PETSc.Error as error:
+                kinds = f"{self.ksp.getType()} and {self.ksp.getPC().getType()}"
+                if error.ierr in NO_SUCH_TYPE:
+                    raise InputError(
+                        f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {_last_words(error)}; choose others"
+                    ) from error
                 raise LinearSolveError(
-                    f"PETSc error {error.ierr} in the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()}: "
+                    f"PETSc error {error.ierr} in the united solve with {kinds} ({_last_words(error)}): "
                     "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
                 ) from error
+        self._tell_unused()
         reason = self.ksp.getConvergedReason()
         if reason < 0 or not np.isfinite(dq.norm()):
             raise LinearSolveError(
@@ -301,6 +370,17 @@ class UnitedSolver:
         self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
         self._first_pace = self._first_pace or self._pace
         return dq, iterations
+
+    def _tell_unused(self) -> None:
+        """Warn, once, of options that PETSc has had no use for."""
+        for key in sorted(self._unused or ()):
+            near = difflib.get_close_matches(key, OFTEN_USED, n=1)
+            logger.warning(
+                "petsc_options[%r] = %s was not used by PETSc with %s and %s: %s",
+                key, given.shown(self.options[key]), self.ksp.getType(), self.ksp.getPC().getType(),
+                f"did you mean {near[0]!r}?" if near else "check its spelling, or leave it out",
+            )  # fmt: skip
+        self._unused = None
 
 
 def _stiffen_idle(A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> None:

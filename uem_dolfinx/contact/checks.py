@@ -1,4 +1,4 @@
-"""What is refused about a contact pair: deep overlaps at the start, contactors that are stuck inside the target.
+"""What is refused about a contact pair: deep overlaps at the start, contactors that are stuck inside the target; what is warned of.
 
 Every check speaks on all ranks or on none.
 """
@@ -8,16 +8,32 @@ from __future__ import annotations
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
 
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import ConflictError, PenetrationError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree
 
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 #: [heuristic; the model's size; -]
 LEFT_OUT = 1e-6
+#: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
+#: [convention; slope; test_warnings.py::test_corners_are_no_curves]
+CORNER = 0.5
+#: Surfaces that come nearer than their facets sag on more facets than this, in every direction, conform.
+#: [convention; facets; test_warnings.py::test_surfaces_that_conform]
+CONFORMING = 4
+#: Contactors that have slid off the target's end are told of if they have more than this part of the surface in contact.
+#: [convention; area; test_warnings.py::test_contactors_that_slip_off]
+SLIPPED = 0.05
 
 
 def check_initial(pair: ContactPair) -> None:
@@ -65,3 +81,91 @@ def check_prescribed(pair: ContactPair) -> None:
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
         )
     agree(pair.config.comm, error)
+
+
+def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -> None:
+    """Tell that a displacement of degree 1 makes straight facets of surfaces that the mesh has curved (collective).
+
+    Args:
+        config: configuration of the displacement.
+        name: of the contact.
+        tags: its meshed surfaces.
+    """
+    mesh, g = config.mesh, config.gdim
+    n_vertices = len(forms.reference_topology(compat.cell_name(mesh))[0])
+    if config.degree > 1 or compat.geometry_dofs(mesh).shape[1] == n_vertices:
+        return
+    V = compat.function_space(mesh, 2, (g,))
+    straight, X = fem.Function(V), fem.Function(config.V)
+    X.x.array[:] = config.X.ravel()
+    straight.interpolate(X)
+    curved = V.tabulate_dof_coordinates()[:, :g]
+    on = np.concatenate([fem.locate_dofs_topological(V, tag.dim, tag.entities) for tag in tags]).astype(np.int64)
+    off = np.linalg.norm(curved[on] - straight.x.array.reshape(-1, g)[on], axis=1).max(initial=0.0)
+    off = config.comm.allreduce(float(off), op=MPI.MAX)
+    if off > TOUCHING * config.size:
+        logger.warning(
+            "%s: a displacement of degree 1 makes straight facets of the curved ones of this mesh, up to %.3g off them: take one of "
+            "degree 2, uem.function_space(mesh, 2, (%d,))",
+            name, off, g,
+        )  # fmt: skip
+
+
+def facet_curvatures(target: MeshTarget) -> Array:
+    """How the normal of the surface behind each of this rank's facets changes along it, and the facet's does not ``(m, gdim, gdim)``.
+
+    Positive where the target is convex; zero at corners and on facets that are curved themselves (collective).
+    """
+    data = target.facets.current()
+    arms, turns = data.x - data.x.mean(axis=1, keepdims=True), data.nodal_normals - target.facets.normals()
+    turns[np.linalg.norm(turns, axis=2) > CORNER] = 0.0
+    # turn = B arm in the mean
+    squares = np.einsum("mag,mah->mgh", arms, arms)
+    return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)
+
+
+def warn_of_sagging_facets(pair: ContactPair) -> None:
+    """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
+    target, p = pair.target, pair.projection
+    if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
+        return
+    arms = p.x - p.foot[:, None]
+    sag = 0.5 * np.einsum("na,nag,ngh,nah->n", p.weights, arms, target.of_facets(p.facet, facet_curvatures(target)), arms)
+    clearance, rounding = np.abs(p.gap - sag), TOUCHING * pair.config.size
+    close = (clearance < np.abs(sag)) & (np.abs(sag) > rounding) & (np.abs(p.beyond).max(axis=1) < rounding)
+    comm = pair.config.comm
+    facets = len(set().union(*comm.allgather(set(p.facet[close].tolist()))))
+    if facets > CONFORMING ** (pair.config.gdim - 1):
+        worst = comm.allgather((float(np.abs(sag[close]).max(initial=0.0)), float(clearance[close].max(initial=0.0))))
+        logger.warning(
+            "%s: the surfaces conform, but %d straight facets of the target sag by up to %.3g, more than the clearance of %.3g there: who "
+            "touches is up to the facets; refine the target, give both surfaces the same nodes, or take mesh and displacement of degree 2",
+            pair.name, facets, *np.max(worst, axis=0),
+        )  # fmt: skip
+
+
+def warn_of_slipped(pair: ContactPair, before: Bools, areas: Array) -> bool:
+    """Tell that contactors have slid off the end of the target, and their share of the surface with them (collective).
+
+    Args:
+        pair: in equilibrium.
+        before: contactors that were past an end at the start ``(n,)``.
+        areas: tributary areas ``(n,)``.
+
+    Returns:
+        Whether there was something to tell.
+    """
+    p = pair.projection
+    near = np.linalg.norm(p.beyond, axis=1) < 0.5 * p.facet_size
+    slipped = pair.off & ~before & near & (p.gap < 0.0)
+    lost, held, count = pair.config.comm.allreduce(
+        np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
+    )
+    if lost <= SLIPPED * (lost + held):
+        return False
+    logger.warning(
+        "%s: %d contactors have slid off the end of the target, and with them %.0f %% of the surface in contact carry no force: let the "
+        "target reach farther, swap contactor and target, or refine the surfaces at the end",
+        pair.name, int(count), 100.0 * lost / (lost + held),
+    )  # fmt: skip
+    return True

@@ -12,24 +12,28 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.bernstein import Bernstein
+from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
-from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.errors import SpaceError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.geometry.rigid import finite_point
+from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
-from uem_dolfinx.geometry.tags import Part, as_tag, name_of
+from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
+from uem_dolfinx.parallel import agreed
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
 MAX_PENETRATION = 0.05
+BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
+THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
 class Contact:
@@ -49,7 +53,8 @@ class Contact:
         name: for messages and files; None takes the names of the tags.
 
     Raises:
-        ValueError: for an unknown word, or a thickness that is not positive.
+        InputError, InputTypeError: for an unknown word, a bound or thickness out of its range, a rigid contactor; on all ranks where
+            a tag tells which they are.
     """
 
     def __init__(
@@ -64,17 +69,25 @@ class Contact:
         chords: bool = False,
         name: str | None = None,
     ):
-        for value, known in ((sliding, ("finite", "small", "fixed")), (normals, ("facet", "averaged"))):
-            if value not in known:
-                raise ValueError(f"'{value}' is not known here: expected one of {', '.join(known)}")
-        if thickness is not None and not thickness > 0.0:
-            raise ValueError(f"thickness = {thickness}: expected a positive length, or None")
+        with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
+            rigid = hasattr(target, "project")
+            swap = "a rigid surface can only be the target: swap the two"
+            given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
+            sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
+            normals = given.word("normals", normals, ("facet", "averaged"))
+            if max_penetration is not None:
+                max_penetration = given.number("max_penetration", max_penetration, BOUND)
+            if thickness is not None:
+                thickness = given.number("thickness", thickness, THICKNESS)
+            chords = given.flag("chords", chords)
+            given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
-        rigid = hasattr(target, "project")
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
+        #: Whether a problem has been made of it.
+        self.taken = False
         self._pair: ContactPair | None = None
         self._fields: dict[str, fem.Function] = {}
 
@@ -88,15 +101,22 @@ class Contact:
         Raises:
             TagError: if a tag is empty or of the wrong dimension.
             SpaceError: if a tag belongs to another mesh.
-            SurfaceError: if contactor and target share nodes.
+            SurfaceError: if contactor and target share nodes, or a rigid target is of another dimension.
+            UserFunctionError: of a rigid target's functions.
             OrientationError: if a target facet lies inside a body.
         """
         self.config, facets = config, config.tdim - 1
+        # of a problem that could not be made
+        self._fields, _ = {}, self.__dict__.pop("_areas", None)
+        given.alike(
+            config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
+            max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
+        )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
         target: Target
         if hasattr(self.target, "project"):
-            target = self.target
+            target = shared_target(self.target, config.comm, config.gdim)
         else:
             self.target = as_tag(self.target, config.mesh, (facets,), "target")
             surface = TargetFacets(config, self.target)
@@ -115,7 +135,20 @@ class Contact:
             max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
             thickness=thickness,
         )
+        warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def begin(self) -> None:
+        """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
+        self.taken, self._slipped = True, False
+        self._off_at_start = self.pair.off.copy()
+        warn_of_sagging_facets(self.pair)
+
+    def look_at_ends(self) -> None:
+        """Warn, once, if contactors have slid off the target's end since the start (collective)."""
+        gone = self.pair.off & ~self._off_at_start
+        if not self._slipped and self.pair.target.n_nodes and self.config.comm.allreduce(gone.any(), op=MPI.LOR):
+            self._slipped = warn_of_slipped(self.pair, self._off_at_start, self._areas)
 
     @property
     def pair(self) -> ContactPair:
@@ -195,12 +228,11 @@ class Contact:
                 which has no nodes, where the contactors are.
 
         Raises:
-            ValueError: for an unknown body, or a point that is not finite.
+            InputError, InputTypeError: for an unknown body, or a point that is not finite.
         """
-        if on not in ("contactor", "target"):
-            raise ValueError(f"'{on}' is not known here: expected one of contactor, target")
+        given.word("on", on, ("contactor", "target"))
         target, p, g = self.pair.target, self.pair.projection, self.config.gdim
-        centre = np.zeros(g) if about is None else finite_point(about, "about", g)
+        centre = np.zeros(g) if about is None else given.vector("about", about, g)
         x, f = self.pair.points, self.pair.trial.force
         if on == "target":
             x, f = p.foot, -f
@@ -229,6 +261,18 @@ class Contact:
         f.x.array[self.pair.nodes] = values
         f.x.scatter_forward()
         return f
+
+
+def check_new(contacts: list[Contact]) -> None:
+    """Refuse contacts that belong to a problem already, or stand in the list twice.
+
+    Raises:
+        SpaceError: naming the first such contact.
+    """
+    for i, contact in enumerate(contacts):
+        if contact.taken or any(contact is other for other in contacts[:i]):
+            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and stands in the list before"
+            raise SpaceError(f"contact '{contact.name}' {where}: expected new ones; make a new Contact for every problem")
 
 
 def _identifier(text: str) -> str:

@@ -15,7 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.dynamics.mass import Mass
@@ -23,7 +23,7 @@ from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, agreed, ask_together
 
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
@@ -68,10 +68,15 @@ class Dynamics:
         contactors: str = "massless",
         time: float = 0.0,
     ):
-        if contactors not in ("massless", "massy"):
-            raise ValueError(f"contactors = '{contactors}': expected 'massless' or 'massy'")
-        if not np.isfinite(time):
-            raise ValueError(f"time = {time}: expected a number")
+        given.kind(
+            "mass", mass, isinstance(mass, Mass), "a Mass", "make it by uem.lumped_mass(V, density) or uem.consistent_mass"
+        )
+        given.kind("scheme", scheme, scheme is None or isinstance(scheme, Scheme), "a Scheme, as uem.newmark(), or None")
+        given.kind(
+            "damping", damping, damping is None or callable(damping), "a function of the velocity that makes a form, or None"
+        )
+        given.word("contactors", contactors, ("massless", "massy"))
+        given.number("time", time)
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
@@ -98,16 +103,18 @@ class Dynamics:
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
         self._set_velocity()
-        self._down = np.zeros(g) if self.gravity is None else np.asarray(self.gravity, dtype=float)
-        if self._down.shape != (g,) or not np.isfinite(self._down).all():
-            raise ValueError(f"gravity = {self.gravity!r}: expected {g} finite numbers")
+        with agreed(config.comm):
+            self._down = np.zeros(g) if self.gravity is None else given.vector("gravity", self.gravity, g)
+        given.alike(
+            config.comm, "Dynamics", gravity=self._down, time=self.time, contactors=self.contactors, scheme=str(self.scheme)
+        )
         self._copy_committed()
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
         if self.damping is not None:
             self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
             self._past.x.array[:] = self.velocity.x.array
-            self.damping_form = self.damping(self._rate * config.u + self._past)
+            self.damping_form = ask_together(config.comm, "damping", self.damping, self._rate * config.u + self._past)
         return self.damping_form
 
     def _set_velocity(self) -> None:
@@ -118,9 +125,10 @@ class Dynamics:
             agree(self.config.comm, SpaceError(words) if other else None)
             self.velocity.x.array[:] = v.x.array
         elif v is not None:
-            if np.shape(v) != (g,):
-                raise ValueError(f"velocity = {v!r}: expected a Function of the displacement's space or {g} numbers")
-            self.velocity.x.array.reshape(-1, g)[:] = v
+            with agreed(self.config.comm):
+                expected = f"a Function of the displacement's space or {g} numbers"
+                given.kind("velocity", v, np.shape(v) == (g,), expected)
+                self.velocity.x.array.reshape(-1, g)[:] = v
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from uem_dolfinx import given
+from uem_dolfinx.errors import InputError
+
 
 @dataclass(frozen=True)
 class Scheme:
@@ -24,8 +27,10 @@ class Scheme:
     alpha_f: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("beta", "gamma", "alpha_m", "alpha_f"):
+            given.number(name, getattr(self, name))
         if not (self.beta > 0.0 and self.gamma >= 0.5):
-            raise ValueError(
+            raise InputError(
                 f"beta = {self.beta:g}, gamma = {self.gamma:g}: beta must be positive, since contact needs an implicit rule, and gamma "
                 "at least 1/2, since less makes every motion grow"
             )
@@ -39,7 +44,7 @@ def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:
         gamma: the same in the velocity; more than 1/2 damps, at the price of first order.
 
     Raises:
-        ValueError: if beta is not positive or gamma below 1/2.
+        InputError, InputTypeError: if beta is not positive or gamma below 1/2.
     """
     return Scheme(beta, gamma)
 
@@ -51,9 +56,9 @@ def generalised_alpha(rho_inf: float) -> Scheme:
         rho_inf: what a step leaves of the fastest motions, from 0 to 1 (none lost).
 
     Raises:
-        ValueError: if ``rho_inf`` is not between 0 and 1.
+        InputError, InputTypeError: if ``rho_inf`` is not between 0 and 1.
     """
-    if not 0.0 <= rho_inf <= 1.0:
-        raise ValueError(f"rho_inf = {rho_inf:g}: expected the part of the fastest motions that a step keeps, from 0 to 1")
+    kept = given.Range("the part of the fastest motions that a step keeps, from 0 to 1", lambda part: 0.0 <= part <= 1.0)
+    rho_inf = given.number("rho_inf", rho_inf, kept)
     alpha_m, alpha_f = (2 * rho_inf - 1) / (rho_inf + 1), rho_inf / (rho_inf + 1)
     return Scheme((1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, alpha_m, alpha_f)

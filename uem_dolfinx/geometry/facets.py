@@ -105,6 +105,12 @@ class TargetFacets:
         """Nodes of the facets where they are now ``(m, nn, gdim)``."""
         return self.config.X[self.dofs] + self.config.displacement[self.dofs]
 
+    def normals(self) -> Array:
+        """Outward unit normals of the facets at their nodes, each its own ``(m, nn, gdim)``."""
+        x = self.x
+        at_nodes = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
+        return np.stack([self.sign[:, None] * unit_normals(tab, x) for tab in at_nodes], axis=1)
+
     def current(self) -> FacetData:
         """Facets where they are now (collective: the nodal normals are summed over ranks)."""
         gdim, x = self.config.gdim, self.x

@@ -7,11 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, cast
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.errors import InputError, SurfaceError
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.parallel import ask, ask_together
 
 
 @dataclass(frozen=True)
@@ -96,8 +103,10 @@ class RigidSurface:
         reference: point about which it turns and its moment is taken ``(gdim,)``; None is the origin.
         stride: how far a contactor may move past it in a time step unseen, a length; infinite if it has no other side.
 
+    The functions are called on each rank with the contactors there, and not at all where there are none.
+
     Raises:
-        ValueError: if ``reference`` is not finite.
+        InputError, InputTypeError: naming what is no function, no finite point or no positive length.
     """
 
     n_nodes = 0
@@ -114,10 +123,16 @@ class RigidSurface:
         reference: npt.ArrayLike | None = None,
         stride: float = np.inf,
     ):
-        self.stride = stride
-        self.distance, self.gradient, self.hessian, self.name = distance, gradient, hessian, name
+        self.name = given.kind("name", name, isinstance(name, str), "a text")
+        self.stride = given.number(f"{name}: stride", stride, given.POSITIVE_OR_INFINITE)
+        for what, f in (("distance", distance), ("gradient", gradient), ("hessian", hessian)):
+            optional = f is None and what == "hessian"
+            given.kind(f"{name}: {what}", f, optional or callable(f), "a function of points (n, gdim)")
+        self.distance, self.gradient, self.hessian = distance, gradient, hessian
         self.motion: Motion | None = None
-        self._reference = None if reference is None else finite_point(reference, f"{name}: reference")
+        self._reference = None if reference is None else given.vector(f"{name}: reference", reference)
+        #: Dimension that it is given in, None if its functions alone know.
+        self.gdim = None if self._reference is None else len(self._reference)
 
     def move(
         self, translation: npt.ArrayLike, rotation: npt.ArrayLike | None = None, about: npt.ArrayLike | None = None
@@ -138,16 +153,16 @@ class RigidSurface:
             The surface itself.
 
         Raises:
-            ValueError: naming what is not finite, or not of the surface's dimension.
+            InputError, InputTypeError: naming what is not finite, or not of the surface's dimension.
         """
-        t = finite_point(translation, f"{self.name}: translation", None if self._reference is None else len(self._reference))
+        t = given.vector(f"{self.name}: translation", translation, self.gdim)
         g = len(t)
-        centre = self._reference if about is None else finite_point(about, f"{self.name}: about", g)
+        centre = self._reference if about is None else given.vector(f"{self.name}: about", about, g)
         centre = np.zeros(g) if centre is None else centre
-        turn = np.zeros(1 if g == 2 else 3) if rotation is None else _finite(rotation, f"{self.name}: rotation")
-        if turn.shape != ((1,) if g == 2 else (3,)):
-            expected = "an angle" if g == 2 else "a rotation vector of 3 numbers"
-            raise ValueError(f"{self.name}: rotation {rotation!r} in {g}D: expected {expected}")
+        turn = np.zeros(1 if g == 2 else 3)
+        if rotation is not None:
+            of = "an angle in 2D" if g == 2 else "a rotation vector in 3D"
+            turn = given.vector(f"{self.name}: rotation ({of})", rotation, len(turn))
         self.motion = Motion(t, rotation_matrix(turn), centre)
         return self
 
@@ -161,18 +176,19 @@ class RigidSurface:
         """Gap and normal at ``points (n, gdim)``.
 
         Raises:
-            ValueError: if the points are not of the dimension in which the surface was moved.
+            InputError: if the points are not of the dimension in which the surface was moved, or a function returns another shape.
+            UserFunctionError: if a function raises.
         """
         n, g = points.shape
         motion = self.motion
         if motion is not None and len(motion.translation) != g:
-            raise ValueError(f"{self.name} was moved in {len(motion.translation)}D but is met by points in {g}D: move it in {g}D")
+            raise InputError(f"{self.name} was moved in {len(motion.translation)}D but is met by points in {g}D: move it in {g}D")
         X = points if motion is None else motion.back(points)
-        slope = np.asarray(self.gradient(X), dtype=float).reshape(n, g)
+        slope = self._asked("gradient", self.gradient, X, (n, g))
         length = np.linalg.norm(slope, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             normal = slope / length[:, None]
-            gap = np.asarray(self.distance(X), dtype=float).reshape(n) / length
+            gap = self._asked("distance", self.distance, X, (n,)) / length
         bend = self._bend(X, normal, length)
         if motion is not None:
             normal, bend = normal @ motion.Q.T, motion.Q @ bend @ motion.Q.T
@@ -213,14 +229,29 @@ class RigidSurface:
         """``t . grad^2 phi . t / |grad phi|`` in the tangent plane."""
         n, g = points.shape
         if self.hessian is not None:
-            H = np.asarray(self.hessian(points), dtype=float).reshape(n, g, g)
+            H = self._asked("hessian", self.hessian, points, (n, g, g))
         else:
             extent = np.abs(points).max(initial=0.0)
             h = np.cbrt(np.finfo(float).eps) * (extent if extent > 0 else 1.0)
-            H = np.stack([(self.gradient(points + h * e) - self.gradient(points - h * e)) / (2 * h) for e in np.eye(g)], axis=2)
+            ahead, behind = (
+                [self._asked("gradient", self.gradient, points + side * h * e, (n, g)) for e in np.eye(g)] for side in (1, -1)
+            )
+            H = (np.stack(ahead, axis=2) - np.stack(behind, axis=2)) / (2 * h)
             H = 0.5 * (H + H.transpose(0, 2, 1))
         T = np.eye(g) - normal[:, :, None] * normal[:, None, :]
         return T @ H @ T / length[:, None, None]
+
+    def _asked(self, what: str, f: Callable[[Array], Array], points: Array, shape: tuple[int, ...]) -> Array:
+        """What a function of the surface says about ``points (n, gdim)``, which must have this shape; it is not asked about none."""
+        if not len(points):
+            return np.zeros(shape)
+        values = ask(f"{self.name}: {what}", lambda: np.asarray(f(points), dtype=float))
+        if values.shape != shape:
+            raise InputError(
+                f"{self.name}: {what} returned the shape {values.shape} for points of the shape {points.shape}: expected {shape}, "
+                "one row for each point"
+            )
+        return values
 
 
 class RigidPlane(RigidSurface):
@@ -232,7 +263,8 @@ class RigidPlane(RigidSurface):
     """
 
     def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike):
-        p, n = np.asarray(point, dtype=float), _unit(normal)
+        p = given.vector("rigid plane: point", point)
+        n = given.direction("rigid plane: normal", normal, len(p))
         super().__init__(
             lambda x: (x - p) @ n, lambda x: np.tile(n, (len(x), 1)), lambda x: np.zeros((len(x), len(n), len(n))),
             name="rigid plane", reference=p,
@@ -249,7 +281,8 @@ class RigidSphere(RigidSurface):
     """
 
     def __init__(self, center: npt.ArrayLike, radius: float, inside: bool = False):
-        c, side = np.asarray(center, dtype=float), -1.0 if inside else 1.0
+        c, radius = given.vector("rigid sphere: center", center), given.length("rigid sphere: radius", radius)
+        side = -1.0 if given.flag("rigid sphere: inside", inside) else 1.0
 
         def arm(x: Array) -> tuple[Array, Array]:
             r = np.linalg.norm(x - c, axis=1)
@@ -276,7 +309,8 @@ class RigidCylinder(RigidSurface):
     """
 
     def __init__(self, point: npt.ArrayLike, axis: npt.ArrayLike, radius: float, inside: bool = False):
-        a, p = _unit(axis), np.asarray(point, dtype=float)
+        a, p = given.direction("rigid cylinder: axis", axis, 3), given.vector("rigid cylinder: point", point, 3)
+        radius, inside = given.length("rigid cylinder: radius", radius), given.flag("rigid cylinder: inside", inside)
         across = np.eye(3) - np.outer(a, a)
         # in the plane across the axis it is a sphere
         ball = RigidSphere(np.zeros(3), radius, inside)
@@ -301,7 +335,8 @@ class RigidParaboloid(RigidSurface):
     """
 
     def __init__(self, apex: npt.ArrayLike, axis: npt.ArrayLike, radius: float):
-        o, a = np.asarray(apex, dtype=float), _unit(axis)
+        o, radius = given.vector("rigid paraboloid: apex", apex), given.length("rigid paraboloid: radius", radius)
+        a = given.direction("rigid paraboloid: axis", axis, len(o))
         across = np.eye(len(o)) - np.outer(a, a)
 
         def distance(x: Array) -> Array:
@@ -333,25 +368,49 @@ def rotation_vector(Q: Array) -> Array:
     return np.array([np.arctan2(Q[1, 0], Q[0, 0])])
 
 
-def finite_point(value: npt.ArrayLike, what: str, gdim: int | None = None) -> Array:
-    """A point or vector ``(gdim,)``, by default of 2 or 3 numbers; raises ValueError, with ``what`` it is, if it is not, or not finite."""
-    a = _finite(value, what)
-    if a.shape not in (((2,), (3,)) if gdim is None else ((gdim,),)):
-        raise ValueError(f"{what} {value!r} has shape {a.shape}: expected {'2 or 3' if gdim is None else gdim} numbers")
-    return a
+class SharedTarget:
+    """A target of the user's in a problem: what its functions raise on one rank is raised on all; else it is that target.
+
+    Args:
+        target: not a mesh.
+        comm: of the problem.
+    """
+
+    def __init__(self, target: Target, comm: MPI.Comm):
+        self._target, self._comm = target, comm
+        self._words = f"the target '{getattr(target, 'name', type(target).__name__)}'"
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._target, name)
+
+    @property
+    def motion(self) -> Any:
+        """The target's own, which a checkpoint sets."""
+        return self._target.motion
+
+    @motion.setter
+    def motion(self, motion: Any) -> None:
+        self._target.motion = motion
+
+    def project(self, points: Array) -> Projection:
+        """Where points stand relative to it (collective)."""
+        return ask_together(self._comm, self._words, self._target.project, points)
+
+    def follow(self, points: Array, old: Any) -> Projection:
+        """Gaps with the feet, normals and weights of an earlier projection (collective)."""
+        return ask_together(self._comm, self._words, self._target.follow, points, old)
 
 
-def _finite(value: npt.ArrayLike, what: str) -> Array:
-    """Copy as an array of at least one dimension."""
-    a = np.array(value, dtype=float, ndmin=1)
-    if not np.isfinite(a).all():
-        raise ValueError(f"{what} {value!r} is not finite: give finite numbers")
-    return a
+def shared_target(target: Target, comm: MPI.Comm, gdim: int) -> Target:
+    """A target of the user's for a problem in ``gdim`` dimensions (collective).
 
-
-def _unit(v: npt.ArrayLike) -> Array:
-    a = np.asarray(v, dtype=float)
-    length = np.linalg.norm(a)
-    if not length > 0:
-        raise ValueError(f"direction {a} has no length: give a non-zero vector")
-    return a / length
+    Raises:
+        SurfaceError: if it is given in another dimension.
+        InputError: if it is not the same on all ranks.
+    """
+    own, name = getattr(target, "gdim", None), getattr(target, "name", type(target).__name__)
+    if own not in (None, gdim):
+        remedy = f"give it points and directions of {gdim} numbers"
+        raise SurfaceError(f"{name} is given in {own}D, but the displacement in {gdim}D: {remedy}")
+    given.alike(comm, name, stride=target.stride, place=getattr(target, "_reference", None))
+    return cast(Target, SharedTarget(target, comm))

@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Indices, Ints
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
@@ -108,11 +108,15 @@ class MeshTarget:
 
     def keys_of(self, facet: Ints) -> Ints:
         """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
+        return self.of_facets(facet, self.facets.keys)
+
+    def of_facets(self, facet: Ints, values: AnyArray) -> Any:
+        """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
         exchange = self._to_owners(facet)
         (asked,) = exchange.send(facet)
-        keys = np.full(len(facet), -1, dtype=np.int64)
-        (keys[exchange.rows],) = exchange.back(self.facets.keys[asked - self.first[self.comm.rank]])
-        return keys
+        found = np.full((len(facet), *values.shape[1:]), -1, dtype=values.dtype)
+        (found[exchange.rows],) = exchange.back(values[asked - self.first[self.comm.rank]])
+        return found
 
     def facets_of(self, keys: Ints) -> Ints:
         """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""

@@ -7,12 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import SpaceError, TagError
+from uem_dolfinx.given import shown
 from uem_dolfinx.parallel import agree
 
 Key: TypeAlias = "str | int | tuple[int, str | int]"
@@ -121,6 +124,16 @@ def name_of(part: Part) -> str:
     return " and ".join(map(name_of, part)) if _is_list(part) else "by index"
 
 
+def communicator_of(part: Any) -> MPI.Comm | None:
+    """Communicator of the mesh of a part, None where it does not tell its mesh."""
+    if isinstance(part, Tag):
+        return part.mesh.comm
+    if _with_value(part):
+        return compat.communicator_of(part[0])
+    known = (communicator_of(one) for one in part) if _is_list(part) else ()
+    return next((comm for comm in known if comm is not None), None)
+
+
 def as_tag(part: Part, mesh: Any, dims: Sequence[int], role: str) -> Tag:
     """The tag of what a user names a part of the mesh by, with its ghosts (collective).
 
@@ -165,8 +178,9 @@ def _read(part: Part, mesh: Any, dims: Sequence[int], role: str) -> list[Tag]:
         n = index_map.size_local + index_map.num_ghosts
         if local.shape != np.shape(part) or (len(local) and local.dtype.kind not in "iu"):
             raise TagError(
-                f"{role} is {part!r:.60}: expected a tag of read_gmsh, (meshtags, value), local indices of "
+                f"{role} = {shown(part)}: expected a tag of read_gmsh, (meshtags, value), local indices of "
                 f"{_word(mesh, dims[0])}, or a list of these"
+                + (f"; a name alone tells no mesh: give tags[{part!r}]" if isinstance(part, str) else "")
             )
         if len(local) and not 0 <= local.min() <= local.max() < n:
             raise TagError(f"{role} has the indices {local.min()} to {local.max()}: expected local ones, 0 to {n - 1}")

@@ -9,10 +9,18 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import ufl
+from dolfinx import fem
 from ufl.core.expr import Expr
 
+from uem_dolfinx import given
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import agree
+
 KINDS = ("3d", "plane_strain", "plane_stress")
+#: Poisson's ratios of bodies that resist every strain.
+POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.49")
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,10 @@ class Elastic(ABC):
         E: Young's modulus, a force per area: a number, a Constant, a Function or any UFL expression.
         nu: Poisson's ratio, likewise.
         kind: ``"3d"``, ``"plane_strain"`` or ``"plane_stress"``.
+
+    Raises:
+        InputError, InputTypeError: for an unknown kind, E that is not positive and finite, or nu that is not between -1 and 1/2. Values
+            of Constants and Functions are looked at here and now; a Function that is still zero is taken to be filled later.
     """
 
     E: Any
@@ -30,8 +42,9 @@ class Elastic(ABC):
     kind: str = "3d"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind = '{self.kind}': expected one of {', '.join(KINDS)}")
+        given.word("kind", self.kind, KINDS)
+        check_parameter("E", self.E, given.POSITIVE)
+        check_parameter("nu", self.nu, POISSON)
 
     @property
     def mu(self) -> Any:
@@ -52,7 +65,8 @@ class Elastic(ABC):
         """Identity of the displacement's dimension, which must fit the kind."""
         gdim = len(u)
         if (gdim == 3) != (self.kind == "3d"):
-            raise ValueError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components")
+            fitting = "'3d'" if gdim == 3 else "'plane_strain' or 'plane_stress'"
+            raise InputError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components: expected {fitting}")
         return ufl.Identity(gdim)
 
     @abstractmethod
@@ -145,6 +159,25 @@ class NeoHooke(Elastic):
         return 2 * self.mu * C_inverse * E + self.lam / 2 * self._volume_change(u) * C_inverse
 
 
+def check_parameter(what: str, value: Any, within: given.Range) -> None:
+    """Refuse a material parameter out of its range: a number, or values that a Constant or Function has now (collective for Functions).
+
+    Raises:
+        InputTypeError, InputError: naming it and the first bad value.
+    """
+    if isinstance(value, fem.Function):
+        values, comm = value.x.array, value.function_space.mesh.comm
+        bad = values[~within.holds(values)] if values.any() else values[:0]
+        words = given.sentence(what, bad[0] if len(bad) else None, within.words, within.remedy)
+        agree(comm, InputError(f"the Function {words}") if len(bad) else None)
+    elif isinstance(value, fem.Constant):
+        given.number(what, np.asarray(value.value)[()], within)
+    elif isinstance(value, Expr):
+        given.kind(what, value.ufl_shape, value.ufl_shape == (), "a scalar expression")
+    else:
+        given.number(what, value, within)
+
+
 def green_lagrange(u: Any) -> Expr:
     """Green-Lagrange strain; ``F'F - I`` would lose strains below the rounding of 1."""
     G = ufl.grad(u)
@@ -171,3 +204,8 @@ class HistoryMaterial(Protocol):
 
     def dissipation(self) -> float:
         """Energy dissipated since the start (collective)."""
+
+
+def is_history_material(material: object) -> bool:
+    """Whether this is a law with history, and not one whose stress is an expression of the displacement alone."""
+    return all(hasattr(material, name) for name in ("history", "stiffness", "update", "commit"))

@@ -66,7 +66,7 @@ class QuadraturePoints:
     def compile(self, expression: Any) -> fem.Expression:
         """Prepare a scalar or vector UFL expression for ``evaluate``; once, as it takes a compiler."""
         with compiling("stresses at the quadrature points"):
-            return fem.Expression(expression, self.points)
+            return compat.compile_expression(expression, self.points)
 
     def evaluate(self, compiled: fem.Expression) -> Array:
         """Present values ``(n_cells * n_points, size)``."""

@@ -13,12 +13,12 @@ import ufl
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import NotFiniteError, SpaceError
+from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
-from uem_dolfinx.materials.elastic import KINDS, green_lagrange
+from uem_dolfinx.materials.elastic import KINDS, POISSON, green_lagrange
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
 from uem_dolfinx.parallel import agree
@@ -73,7 +73,7 @@ class VonMises:
         history: the committed Functions by name, all that the material remembers.
 
     Raises:
-        ValueError: for an unknown word, or a parameter out of its range.
+        InputError, InputTypeError: for an unknown word, or a parameter out of its range.
         SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or the mesh of ``cells`` is another.
         TagError: if ``cells`` are not cells, or none on any rank.
     """
@@ -91,9 +91,9 @@ class VonMises:
         cells: Part | None = None,
         quadrature_degree: int | None = None,
     ):
-        for name, word, words in (("kind", kind, KINDS), ("strain", strain, STRAINS)):
-            if word not in words:
-                raise ValueError(f"{name} = '{word}': expected one of {', '.join(words)}")
+        given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
+        given.word("kind", kind, KINDS)
+        given.word("strain", strain, STRAINS)
         V = u.function_space
         self.u, self.kind, self.strain = u, kind, strain
         self.mesh, self.comm = V.mesh, V.mesh.comm
@@ -119,15 +119,16 @@ class VonMises:
                 f"dimension {gdim}: got size {V.dofmap.index_map_bs}, degree {degree}, dimension {self.mesh.topology.dim}"
             )
         if (gdim == 3) != (self.kind == "3d"):
-            raise ValueError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components")
+            fitting = "'3d'" if gdim == 3 else "'plane_strain' or 'plane_stress'"
+            raise InputError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components: expected {fitting}")
         cell = compat.cell_name(self.mesh)
         simplex = cell in ("triangle", "tetrahedron")
         affine = simplex and compat.geometry_dofs(self.mesh).shape[1] == gdim + 1
         # one point is for constant strains
         lowest = 1 if affine and degree == 1 else 2
-        if quadrature_degree is not None and quadrature_degree < lowest:
+        if quadrature_degree is not None and given.count("quadrature_degree", quadrature_degree) < lowest:
             expected = f"expected {lowest} or more for degree {degree} on {cell} cells"
-            raise ValueError(f"quadrature_degree = {quadrature_degree}: {expected}")
+            raise InputError(f"quadrature_degree = {quadrature_degree}: {expected}")
         stress, pressure = (SIMPLEX_DEGREES if simplex else TENSOR_DEGREES)[degree]
         stress = max(stress, lowest) if quadrature_degree is None else quadrature_degree
         return stress, min(stress, max(pressure, lowest) if simplex else pressure)
@@ -145,32 +146,30 @@ class VonMises:
 
     def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
         """Take the parameters of every cell, and repeat them for its points."""
-        E = self._cellwise("E", E, lambda value: (value > 0) & np.isfinite(value), "a positive number")
-        most = 1.0 if self.kind == "plane_stress" else 0.5
-        nu = self._cellwise("nu", nu, lambda value: (value > -1) & (value < most), f"a number between -1 and {most}")
-        yield_stress = self._cellwise("yield_stress", yield_stress, lambda value: value > 0, "a positive number")
-        zero_or_more = "0 or a positive number"
-        hardening = self._cellwise("hardening", hardening, lambda value: (value >= 0) & np.isfinite(value), zero_or_more)
+        E = self._cellwise("E", E, given.POSITIVE)
+        nu = self._cellwise("nu", nu, given.between(-1.0, 1.0) if self.kind == "plane_stress" else POISSON)
+        yield_stress = self._cellwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE)
+        hardening = self._cellwise("hardening", hardening, given.NOT_NEGATIVE)
         self._E, self._nu, self._yield_stress, self._hardening = (
             np.repeat(values, len(self._points.points)) for values in (E, nu, yield_stress, hardening)
         )
         self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
 
-    def _cellwise(self, name: str, given: Any, good: Any, expected: str) -> Array:
+    def _cellwise(self, name: str, value: Any, within: given.Range) -> Array:
         """Values of a parameter in ``cells``, refused on all ranks if they are out of range on any (collective)."""
-        if isinstance(given, fem.Function):
-            V = given.function_space
-            dofs = compat.cell_dofs(V)
-            if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
-                expected = "expected a number, or a scalar DG0 Function of the displacement's mesh"
-                raise SpaceError(f"{name} is a Function of {V}: {expected}")
-            values = np.array(given.x.array[dofs[self.cells, 0]])
-        else:
-            values = np.full(len(self.cells), float(given))
-        bad, found = np.flatnonzero(~good(values)), None
+        if not isinstance(value, fem.Function):
+            number = np.asarray(value.value)[()] if isinstance(value, fem.Constant) else value
+            return np.full(len(self.cells), given.number(name, number, within))
+        V = value.function_space
+        dofs = compat.cell_dofs(V)
+        if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
+            expected = "expected a number, or a scalar DG0 Function of the displacement's mesh"
+            raise SpaceError(f"{name} is a Function of {V}: {expected}")
+        values = np.array(value.x.array[dofs[self.cells, 0]])
+        bad, found = np.flatnonzero(~within.holds(values)), None
         if len(bad):
             where = self._points.where(bad[0] * len(self._points.points))
-            found = ValueError(f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {expected}")
+            found = InputError(f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {within.words}")
         agree(self.comm, found)
         return values
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import ufl
 
-from uem_dolfinx import forms
+from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
@@ -58,6 +58,7 @@ class EnergyBook(Closing):
         resume: keep what a file that is there says about the time up to now, and go on after it.
 
     Raises:
+        InputError, InputTypeError: for what is no problem, or no form of its kind.
         SpaceError: if the problem has no dynamics.
         CheckpointError, OSError: see ``CsvTable``.
     """
@@ -71,9 +72,15 @@ class EnergyBook(Closing):
         path: str | Path | None = None,
         resume: bool = False,
     ):
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         if problem.dynamics is None:
             raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
         self.problem, self.dynamics = problem, problem.dynamics
+        for what, work, arguments in (("stored", stored, 0), ("external", external, 1)):
+            given.kind(what, work, work is None or isinstance(work, ufl.Form), "a UFL form, or None", "multiply it by ufl.dx")
+            if work is not None and len(work.arguments()) != arguments:
+                expected = "a functional, without" if arguments == 0 else "a form linear in a"
+                raise InputError(f"{what} has {len(work.arguments())} argument(s): expected {expected} test function")
         works = stored, external, self.dynamics.damping_form
         self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
         #: Rows written, in order.

@@ -16,7 +16,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.errors import MissingBackendError, OutputError
+from uem_dolfinx.errors import InputError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.parallel import agree, agreed
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -112,11 +112,11 @@ def plot_scene(
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
-        ValueError: if the scene is not 2D.
+        InputError: if the scene is not 2D.
     """
     if problem.config.gdim != 2:
         dimension = f"this one has dimension {problem.config.gdim}"
-        raise ValueError(f"plot_scene draws 2D scenes, {dimension}: open the XDMF file in ParaView")
+        raise InputError(f"plot_scene draws 2D scenes, {dimension}: open the XDMF file in ParaView")
     config, comm = problem.config, problem.comm
     if field is None:
         field, label = ufl.sqrt(ufl.dot(problem.u, problem.u)), label or "|u|"

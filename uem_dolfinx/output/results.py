@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.files import aside, keep_aside, on_rank_0
 from uem_dolfinx.log import timed
-from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.output.tables import Closing, CsvTable, given_path
 from uem_dolfinx.output.xdmf import XdmfSeries, geometry_degree
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_steps import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
@@ -41,6 +43,7 @@ class HistoryWriter(Closing):
     """
 
     def __init__(self, path: str | Path, problem: UnitedProblem, *, resume: bool = False):
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         columns = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
@@ -61,7 +64,8 @@ class HistoryWriter(Closing):
         self.table.check()
         if self._progress.steps <= self._known:
             return
-        row: list[object] = [clock(step), self._progress.steps, "" if isinstance(step, (int, float)) else step.newton_iterations]
+        iterations = step.newton_iterations if isinstance(step, (LoadStep, TimeStep)) else ""
+        row: list[object] = [clock(step), self._progress.steps, iterations]
         for contact in self.problem.contacts:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
@@ -98,6 +102,7 @@ class ResultsWriter(Closing):
             checkpoint was read, begin anew.
 
     Raises:
+        InputError, InputTypeError: for no path, no problem, or fields that are no UFL expressions by name.
         MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
         OutputError: if the files cannot be written; the steps before stay.
         CheckpointError: if the files to go on with are of another run.
@@ -112,7 +117,12 @@ class ResultsWriter(Closing):
         vtx: bool | None = None,
         resume: bool = False,
     ):
-        self.problem, self._stem, mesh = problem, Path(path), problem.config.mesh
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+        self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
+        self._stem = given_path("path", path, comm)
+        with agreed(comm):
+            _check_fields(fields)
+            vtx = None if vtx is None else given.flag("vtx", vtx)
         if vtx:
             compat.require_vtx(path)
         self._expressions = dict(fields or {})
@@ -219,8 +229,22 @@ class ResultsWriter(Closing):
         self._vtx = []
 
 
+def _check_fields(fields: Any) -> None:
+    """Refuse fields that are no UFL expressions by name.
+
+    Raises:
+        InputTypeError, InputError: naming the first bad one.
+    """
+    given.kind("fields", fields, fields is None or isinstance(fields, Mapping), "UFL expressions by name, as a dict, or None")
+    for name, field in (fields or {}).items():
+        given.name("the name of a field", name, "write _ for a blank")
+        given.kind(f"fields[{name!r}]", field, hasattr(field, "ufl_shape"), "a UFL expression")
+
+
 def clock(step: LoadStep | TimeStep | float) -> float:
-    """Load factor or time of a step."""
+    """Load factor or time of a step; InputTypeError for what has none."""
+    known = isinstance(step, (TimeStep, LoadStep, int, float, np.number))
+    given.kind("step", step, known, "a step of load_steps or time_steps, or its factor or time")
     return float(step.time if isinstance(step, TimeStep) else step.factor if isinstance(step, LoadStep) else step)
 
 

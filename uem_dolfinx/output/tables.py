@@ -7,14 +7,27 @@ import io
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 from mpi4py import MPI
 
-from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx import given
+from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.files import aside, keep_aside, on_rank_0, replace_end
 from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agreed
+
+
+def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
+    """A path, the same on all ranks; InputTypeError or InputError if it is none (collective)."""
+    with agreed(comm):
+        given.kind(what, value, isinstance(value, (str, PathLike)), "the path of a file", "None is none")
+        if not Path(value).name:
+            raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
+    given.alike(comm, "files", **{what: str(value)})
+    return Path(value)
 
 
 class Clock(Protocol):
@@ -72,7 +85,7 @@ class CsvTable(Closing):
         *,
         key: str | None = None,
     ):
-        self.columns, self.comm, self.path = list(columns), comm, Path(path)
+        self.columns, self.comm, self.path = list(columns), comm, given_path("path", path, comm)
         self._key = 0 if key is None else self.columns.index(key)
         self._clock = None if resume_at is None or isinstance(resume_at, (int, float)) else resume_at
         self._resumed = 0 if self._clock is None else self._clock.resumed

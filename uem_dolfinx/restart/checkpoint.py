@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError
 from uem_dolfinx.files import REMEDY, Trouble, flush, read_at, write_at
@@ -252,13 +253,11 @@ class Checkpoint:
         every: number of steps from one writing to the next.
 
     Raises:
-        ValueError: if ``every`` is no positive number of steps.
+        InputError, InputTypeError: if ``every`` is no positive number of steps.
     """
 
     def __init__(self, path: str | Path, *, every: int = 100):
-        if every != int(every) or every < 1:
-            raise ValueError(f"every = {every}: expected a number of steps, 1 or more")
-        self.path, self.every = Path(path), int(every)
+        self.path, self.every = Path(path), given.count("every", every)
         self._state: State | None = None
         #: Signals that ask the run to end.
         self.interruption = Interruption()

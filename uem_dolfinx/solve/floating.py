@@ -96,7 +96,7 @@ class FloatingBodies:
 
     @property
     def adrift(self) -> bool:
-        """Whether loads drive a body along a motion that nothing but supports holds, so that no active set is its equilibrium (collective)."""
+        """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
         if self.motions is None:
             return False
         force = self.motions.load(self._open, self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))

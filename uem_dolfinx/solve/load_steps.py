@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from dolfinx import fem
 
+from uem_dolfinx import given
 from uem_dolfinx.errors import UEMError
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -56,11 +58,15 @@ def load_steps(problem: UnitedProblem, steps: int = 1, *, checkpoint: Checkpoint
         An iterator of converged steps.
 
     Raises:
+        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
+    with agreed(problem.comm):
+        steps = given.count("steps", steps)
+    given.alike(problem.comm, "load_steps", steps=steps)
     if checkpoint is not None and not checkpoint.begun:
         checkpoint.begin(problem.state())
     return between_steps(problem.comm, problem.progress, _load_steps(problem, steps), checkpoint)

@@ -12,7 +12,6 @@ from typing import Protocol
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 

@@ -9,9 +9,9 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.contact import Contact, check_new
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
@@ -19,15 +19,18 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
-from uem_dolfinx.materials.elastic import HistoryMaterial
-from uem_dolfinx.parallel import agree_on_call
+from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material
+from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.checks import check_conditions, check_load, check_residual, check_values
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
+
+ACCURACY = given.between(0.0, 1.0)
 
 
 class UnitedProblem:
@@ -62,7 +65,9 @@ class UnitedProblem:
         verbose: print one line per iteration.
 
     Raises:
-        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, or F does not depend on it.
+        InputError, InputTypeError: for what is of another type or out of its range, named with its value; on all ranks.
+        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, F does not depend on it, a Dirichlet condition
+            or the test function is of another space, or a contact belongs to another problem.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
@@ -88,14 +93,32 @@ class UnitedProblem:
         method: Callable[..., UnitedSystem] = BodySystem,
         verbose: bool = False,
     ):
-        if newton not in ("full", "modified"):
-            raise ValueError(f"newton = '{newton}': expected 'full' or 'modified'")
-        self.u, self.load = u, load
-        self.line_search, self.rtol, self.max_iterations, self.verbose = line_search, rtol, max_iterations, verbose
+        self.u = given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
         self.config = Configuration(u)
         self.comm = self.config.comm
-        self.contacts, self.dynamics, self.materials = list(contacts), dynamics, list(materials)
+        with agreed(self.comm):
+            check_residual(F, u)
+            check_load(load)
+            self.load = load
+            bcs = check_conditions(self.config, bcs)
+            self.contacts = given.items("contacts", contacts, lambda one: isinstance(one, Contact), "a Contact")
+            check_new(self.contacts)
+            self.materials = given.items("materials", materials, is_history_material, "a material with history, as VonMises")
+            still = dynamics is None
+            self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
+            newton = given.word("newton", newton, ("full", "modified"))
+            self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
+            self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
+            consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
+            check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
+        given.alike(
+            self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in self.contacts], materials=len(self.materials),
+            newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
+            consistent_tangent=consistent_tangent, check_inversion=check_inversion,
+        )  # fmt: skip
         damping = dynamics.attach(self.config) if dynamics is not None else None
+        if damping is not None:
+            check_residual(damping, u, "the damping form")
         #: What the bodies do without contact.
         self.forces = BodyForces(
             self.config,
@@ -120,15 +143,17 @@ class UnitedProblem:
         self.committed = np.array(u.x.array)
         self._motions = self._rigid_motions()
         self._largest_forces = 0.0
+        for contact in self.contacts:
+            contact.begin()
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
     def set_load(self, at: float) -> None:
-        """Set loads, and what else ``load`` sets, of a load factor or a time; what it raises is raised on all ranks (collective)."""
+        """Set loads, and what else ``load`` sets, of a load factor or a time; a UserFunctionError if it raises (collective)."""
         if isinstance(self.load, fem.Constant):
             self.load.value = at
         elif self.load is not None:
-            agree_on_call(self.comm, self.load, at)
+            ask_together(self.comm, f"load({at:.6g})", self.load, at)
 
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
@@ -151,11 +176,13 @@ class UnitedProblem:
 
         Raises:
             ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
-            TunnellingError: after the committed state has been restored.
+            TunnellingError, UserFunctionError: after the committed state has been restored.
         """
         start = self.committed if start is None else start
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.forces.bcs)
+        with agreed(self.comm):
+            check_values(self.config, self.forces.bcs, wanted)
         self.forces.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
         try:
             self.system.begin_step()
@@ -188,6 +215,8 @@ class UnitedProblem:
             pair.project()
         self._motions = self._rigid_motions()
         self.progress.steps += 1
+        for contact in self.contacts:
+            contact.look_at_ends()
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""

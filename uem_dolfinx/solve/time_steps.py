@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import SpaceError, UEMError
+from uem_dolfinx.errors import InputError, SpaceError, UEMError
 from uem_dolfinx.log import progress
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -96,8 +98,8 @@ def time_steps(
         An iterator of converged steps.
 
     Raises:
-        ValueError: if ``dt`` is not positive, or too short to be told from rounding of the time, ``end`` before the start or not
-            finite, or ``event_tolerance`` not between 0 and 1.
+        InputError, InputTypeError: if ``dt`` is not positive, or too short to be told from rounding of the time, ``end`` before the
+            start or not finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
@@ -108,12 +110,14 @@ def time_steps(
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
-    if not 0.0 < dt < np.inf or not (event_tolerance is None or 0.0 < event_tolerance < 1.0):
-        raise ValueError(f"dt = {dt}, event_tolerance = {event_tolerance}: expected dt > 0 and a tolerance between 0 and 1")
-    if not dynamics.start <= end < np.inf:
-        raise ValueError(f"end = {end}: expected a time that is not before the start, {dynamics.start:.6g}")
+    with agreed(problem.comm):
+        dt, end = given.number("dt", dt, given.POSITIVE), given.number("end", end, _not_before(dynamics.start))
+        if event_tolerance is not None:
+            event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
+        given.kind("checkpoint", checkpoint, checkpoint is None or isinstance(checkpoint, Checkpoint), "a Checkpoint, or None")
+    given.alike(problem.comm, "time_steps", dt=dt, end=end, event_tolerance=event_tolerance)
     if _rounding(dynamics, dt, end) > SHORTEST_LENGTH * dt:
-        raise ValueError(
+        raise InputError(
             f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
         )
@@ -227,6 +231,11 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
 def _touching(problem: UnitedProblem) -> list[bool]:
     """Which contacts have active contactors (collective)."""
     return [contact.n_active > 0 for contact in problem.contacts]
+
+
+def _not_before(start: float) -> given.Range:
+    """Times that steps can end at."""
+    return given.Range(f"a time that is not before the start, {start:.6g}", lambda t: start <= t < np.inf)
 
 
 def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:

@@ -1,0 +1,150 @@
+"""What is handed to materials, dynamics, writers and helpers of scripts is looked at as ``test_inputs`` tells of problems."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from bar_scenes import Bar
+from dolfinx import fem
+from helpers import blocks, clamp, linear
+
+import uem_dolfinx as uem
+from uem_dolfinx.parallel import agreed
+
+COMM = MPI.COMM_WORLD
+nan, inf = np.nan, np.inf
+
+
+def refused(error, words, call):
+    """The same named error on all ranks, with all these words in its message."""
+    with pytest.raises(error) as caught:
+        call()
+    message = str(caught.value)
+    assert isinstance(caught.value, uem.UEMError)
+    for text in words:
+        assert text in message, message
+    assert len(set(COMM.allgather(f"{type(caught.value).__name__}: {message}"))) == 1
+
+
+def steel(b, **parameters):
+    given = {"E": 1.0, "nu": 0.3, "yield_stress": 0.01, "hardening": 0.0, "kind": "plane_strain"} | parameters
+    return uem.VonMises(given.pop("u", b.u), **given)
+
+
+@pytest.mark.parametrize(
+    "parameters, error, words",
+    [
+        *(({"E": x}, uem.InputError, (f"E = {x}", "a positive number")) for x in (0, -1, inf, nan)),
+        *(({"nu": x}, uem.InputError, (f"nu = {x}", "between -1 and 0.5", "0.49")) for x in (0.5, 0.7, -1, nan)),
+        ({"nu": 1.0, "kind": "plane_stress"}, uem.InputError, ("nu = 1.0", "between -1 and 1")),
+        *(({"yield_stress": x}, uem.InputError, (f"yield_stress = {x}", "a positive number, or infinity")) for x in (0, -1, nan)),
+        *(({"hardening": x}, uem.InputError, (f"hardening = {x}", "0 or a positive number")) for x in (-1, inf, nan)),
+        ({"E": "steel"}, uem.InputTypeError, ("E = 'steel'", "a positive number")),
+        ({"u": None}, uem.InputTypeError, ("u = None", "a Function")),
+        ({"strain": "large"}, uem.InputError, ("strain = 'large'", "'small' or 'green_lagrange'")),
+        ({"kind": "3d"}, uem.InputError, ("kind = '3d'", "2 components", "'plane_strain' or 'plane_stress'")),
+        ({"quadrature_degree": 2.5}, uem.InputError, ("quadrature_degree = 2.5", "a whole number")),
+    ],
+)
+def test_plasticity(parameters, error, words):
+    b = blocks(COMM, "triangle", 2, 2)
+    refused(error, words, lambda: steel(b, **parameters))
+
+
+@pytest.mark.parametrize(
+    "options, error, words",
+    [
+        ({"mass": 1.0}, uem.InputTypeError, ("mass = 1.0", "a Mass", "uem.lumped_mass")),
+        ({"scheme": "newmark"}, uem.InputTypeError, ("scheme = 'newmark'", "a Scheme")),
+        ({"damping": 0.1}, uem.InputTypeError, ("damping = 0.1", "a function of the velocity")),
+        ({"contactors": "light"}, uem.InputError, ("contactors = 'light'", "'massless' or 'massy'")),
+        ({"time": nan}, uem.InputError, ("time = nan", "a finite number")),
+        ({"time": "now"}, uem.InputTypeError, ("time = 'now'", "a finite number")),
+        ({"gravity": 9.81}, uem.InputError, ("gravity = 9.81", "2 finite numbers")),
+        ({"gravity": (0.0, nan)}, uem.InputError, ("gravity = (0.0, nan)", "2 finite numbers")),
+        ({"velocity": 1.0}, uem.InputTypeError, ("velocity = 1.0", "2 numbers")),
+        ({"damping": lambda v: broken()}, uem.UserFunctionError, ("damping raised KeyError", "mend the function")),
+        ({"damping": lambda v: v}, uem.InputTypeError, ("the damping form = ", "a UFL form", "ufl.dx")),
+    ],
+)
+def test_dynamics(options, error, words):
+    b = blocks(COMM, "triangle", 2, 2)
+
+    def make():
+        dynamics = uem.Dynamics(**({"mass": uem.lumped_mass(b.V, 1.0)} | options))
+        uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), dynamics=dynamics)
+
+    refused(error, words, make)
+
+
+def broken():
+    raise KeyError("no damping")
+
+
+@pytest.mark.parametrize("rho", [-0.1, 1.1, nan, "high"])
+def test_schemes(rho):
+    error = uem.InputTypeError if rho == "high" else uem.InputError
+    refused(error, (f"rho_inf = {rho!r}", "from 0 to 1"), lambda: uem.generalised_alpha(rho))
+    refused(uem.InputError, ("beta = nan", "a finite number"), lambda: uem.newmark(nan))
+
+
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda p: uem.ResultsWriter(None, p), uem.InputTypeError, ("path = None", "the path of a file")),
+        (lambda p: uem.ResultsWriter("", p), uem.InputError, ("path = ''", "the path of a file")),
+        (lambda p: uem.ResultsWriter("out", None), uem.InputTypeError, ("problem = None", "a UnitedProblem")),
+        (lambda p: uem.ResultsWriter("out", p, fields=p.u), uem.InputTypeError, ("fields = a Function", "by name")),
+        (lambda p: uem.ResultsWriter("out", p, fields={"s": 1.0}), uem.InputTypeError, ("fields['s'] = 1.0", "a UFL expression")),
+        (lambda p: uem.ResultsWriter("out", p, fields={"a b": p.u}), uem.InputError, ("'a b'", "without blanks")),
+        (lambda p: uem.HistoryWriter(3, p), uem.InputTypeError, ("path = 3", "the path of a file")),
+        (lambda p: uem.EnergyBook(None), uem.InputTypeError, ("problem = None", "a UnitedProblem")),
+        (lambda p: uem.EnergyBook(p, p.u[0]), uem.InputTypeError, ("stored = ", "a UFL form", "ufl.dx")),
+        (lambda p: uem.EnergyBook(p, linear(p.u, 1.0)), uem.InputError, ("stored has 1 argument(s)", "without test function")),
+        (lambda p: uem.EnergyBook(p, external=p.u[0] * ufl.dx), uem.InputError, ("external has 0 argument(s)", "in a test function")),
+        (lambda p: uem.Checkpoint("run.uem", every=0), uem.InputError, ("every = 0", "a whole number")),
+        (lambda p: uem.integrate(p.u[0]), uem.InputTypeError, ("integrals = ", "ufl.dx")),
+        (lambda p: uem.integrate(linear(p.u, 1.0)), uem.InputError, ("a test function", "a functional")),
+        (lambda p: uem.dirichlet(p.u, None), uem.InputTypeError, ("V = a Function", "u.function_space")),
+        (lambda p: uem.dirichlet(p.config.V, [0], "x"), uem.InputError, ("component = 'x'", "one of 0 to 1")),
+        (lambda p: uem.dirichlet(p.config.V, [0], 0, "fast"), uem.InputTypeError, ("= 'fast'", "a number")),
+        (lambda p: uem.dirichlet(p.config.V, [0], 0, inf), uem.InputError, ("= inf", "finite numbers")),
+        (lambda p: p.contacts[0].resultant(on="tool"), uem.InputError, ("on = 'tool'", "'contactor' or 'target'")),
+        (lambda p: p.contacts[0].resultant(about=0.0), uem.InputError, ("about = 0.0", "2 finite numbers")),
+    ],
+)  # fmt: skip
+def test_writers_and_scripts(call, error, words):
+    problem = Bar(4).problem
+    refused(error, words, lambda: call(problem))
+
+
+@pytest.mark.parametrize("name", ["my u", "Δ u/2", "a-b"])
+def test_functions_of_any_name(name):
+    """Form compilers take names over into their code, where a blank is an error of the C compiler."""
+    b = blocks(COMM, "triangle", 2, 2)
+    b.u.name = name
+    E = fem.Function(uem.function_space(b.scene.mesh, ("DG", 0)), name=f"{name} of steel")
+    E.x.array[:] = 1.0 + len(name)
+    contact = uem.Contact(b.high, b.low)
+    problem = uem.UnitedProblem(linear(b.u, E), b.u, bcs=b.oedometer(0.01), contacts=[contact])
+    problem.solve()
+    assert (b.u.name, E.name) == (name, f"{name} of steel") and contact.n_active == 3
+    uem.interpolate(E, b.u[0] * len(name))
+
+
+def test_agreed_blocks():
+    """The error of the first rank that has one, with its class, or its words where it cannot be sent."""
+
+    class LocalError(Exception):
+        pass
+
+    with agreed(COMM):
+        pass
+    for kind in (uem.InputError, LocalError):
+        with pytest.raises(Exception, match=f"from rank {COMM.size // 2}") as caught, agreed(COMM):
+            if COMM.rank >= COMM.size // 2:
+                raise kind(f"from rank {COMM.rank}")
+        assert len(set(COMM.allgather(type(caught.value).__name__))) == 1

@@ -1,0 +1,187 @@
+"""What users hand over, looked at before it is used: numbers, words, vectors, lists, functions; and the same on all ranks.
+
+Every check names the thing, its value, what was expected and, where that is not plain, what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import InputError, InputTypeError
+
+#: Values are shown with so many letters.
+#: [format; letters; -]
+LONGEST = 80
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers that will do, what they are called, and what to do about others."""
+
+    words: str
+    holds: Callable[[Any], Any]  # of a number or an array of them
+    remedy: str = ""
+
+
+FINITE = Range("a finite number", np.isfinite)
+POSITIVE = Range("a positive number", lambda x: (x > 0) & np.isfinite(x))
+POSITIVE_OR_INFINITE = Range("a positive number, or infinity", lambda x: x > 0)
+NOT_NEGATIVE = Range("0 or a positive number", lambda x: (x >= 0) & np.isfinite(x))
+
+
+def between(low: float, high: float, remedy: str = "") -> Range:
+    """Numbers between two bounds, which do not belong to them."""
+    return Range(f"a number between {low:g} and {high:g}", lambda x: (low < x) & (x < high), remedy)
+
+
+def described(value: object) -> str:
+    """A value in one line, the same on all ranks: without addresses of memory."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (str, int, float, complex, list, tuple, dict, set, np.ndarray)):
+        return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
+def shown(value: object) -> str:
+    """A value in a message, in short."""
+    text = described(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."
+
+
+def sentence(what: str, value: object, expected: str, remedy: str = "") -> str:
+    """The message of a refusal."""
+    return f"{what} = {shown(value)}: expected {expected}{'; ' if remedy else ''}{remedy}"
+
+
+def number(what: str, value: Any, within: Range = FINITE) -> float:
+    """A number of a range.
+
+    Raises:
+        InputTypeError: if it is no real number.
+        InputError: if it is out of the range.
+    """
+    words = sentence(what, value, within.words, within.remedy)
+    if isinstance(value, (str, bytes, bool, np.bool_)) or np.ndim(value):
+        raise InputTypeError(words)
+    try:
+        x = float(value)
+    except (TypeError, ValueError):
+        raise InputTypeError(words) from None
+    if not within.holds(x):
+        raise InputError(words)
+    return x
+
+
+def length(what: str, value: Any, none: str = "") -> float:
+    """A positive finite length; ``none`` says what None would do where it is allowed; raises as ``number`` does."""
+    words = "a positive length" + (f", or None {none}" if none else "")
+    return number(what, value, Range(words, POSITIVE.holds))
+
+
+def count(what: str, value: Any, remedy: str = "") -> int:
+    """A whole number, 1 or more; raises as ``number`` does."""
+    whole = Range("a whole number, 1 or more", lambda x: np.isfinite(x) and x >= 1 and x == np.floor(x), remedy)
+    return int(number(what, value, whole))
+
+
+def flag(what: str, value: Any) -> bool:
+    """True or False; InputTypeError for anything else."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputTypeError(sentence(what, value, "True or False"))
+    return bool(value)
+
+
+def word(what: str, value: Any, known: Sequence[str]) -> str:
+    """One of the words known here; InputError for others, InputTypeError for what is no word."""
+    if not isinstance(value, str) or value not in known:
+        near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
+        some = " or ".join(filter(None, [", ".join(map(repr, known[:-1])), repr(known[-1])]))
+        error = InputError if isinstance(value, str) else InputTypeError
+        raise error(sentence(what, value, f"one of {some}", f"did you mean {near[0]!r}?" if near else ""))
+    return value
+
+
+def name(what: str, value: Any, remedy: str = "") -> str:
+    """A text without blanks that is not empty; raises as ``word`` does."""
+    if not isinstance(value, str) or not re.fullmatch(r"\S+", value):
+        error = InputError if isinstance(value, str) else InputTypeError
+        raise error(sentence(what, value, "a text without blanks", remedy))
+    return value
+
+
+def vector(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
+    """Copy of finite numbers ``(size,)``, by default 2 or 3 of them.
+
+    Raises:
+        InputTypeError: if they are no numbers.
+        InputError: if there are more or less of them, or one is not finite.
+    """
+    expected = f"{'2 or 3' if size is None else size} finite numbers"
+    try:
+        a = np.array(value, dtype=float, ndmin=1)
+    except (TypeError, ValueError):
+        raise InputTypeError(sentence(what, value, expected)) from None
+    if value is None:
+        raise InputTypeError(sentence(what, value, expected))
+    if a.shape not in (((2,), (3,)) if size is None else ((size,),)) or not np.isfinite(a).all():
+        fault = f"has shape {a.shape}" if np.isfinite(a).all() else "is not finite"
+        raise InputError(f"{what} = {shown(value)} {fault}: expected {expected}")
+    return a
+
+
+def direction(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
+    """A vector of length one along a given one; raises as ``vector`` does, and InputError if it has no length."""
+    a = vector(what, value, size)
+    # hypot neither overflows nor underflows where squares would
+    largest = np.abs(a).max()
+    if not largest > 0:
+        raise InputError(sentence(what, value, "a direction", "give a non-zero vector"))
+    a = a / largest
+    return a / np.linalg.norm(a)
+
+
+def kind(what: str, value: Any, fits: bool, expected: str, remedy: str = "") -> Any:
+    """The value if it fits what is expected; InputTypeError if not."""
+    if not fits:
+        raise InputTypeError(sentence(what, value, expected, remedy))
+    return value
+
+
+def items(what: str, value: Any, fits: Callable[[Any], bool], one: str) -> list[Any]:
+    """A list of things that are each ``one`` of a kind, as ``"a Dirichlet condition"``; InputTypeError for anything else."""
+    if not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
+        remedy = f"put it in brackets: {what}=[...]" if fits(value) else f"each item must be {one}"
+        raise InputTypeError(sentence(what, value, "a list", remedy))
+    for i, item in enumerate(value):
+        kind(f"{what}[{i}]", item, fits(item), one)
+    return list(value)
+
+
+def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
+    """Refuse values that differ from rank to rank, which would have the ranks wait for each other for ever (collective).
+
+    Raises:
+        InputError: on all ranks, naming the first such value and two ranks.
+    """
+    if comm.size == 1:
+        return
+    of_ranks = comm.allgather([described(value) for value in values.values()])
+    for rank, others in enumerate(of_ranks):
+        for what, first, other in zip(values, of_ranks[0], others):
+            if other != first:
+                raise InputError(
+                    f"{where}: {what} = {first} on rank 0, but {other} on rank {rank}: expected the same on all ranks; "
+                    "compute it alike on all of them, or send it to all"
+                )

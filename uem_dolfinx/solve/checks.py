@@ -1,0 +1,115 @@
+"""What a problem is handed, looked at before anything is made of it: residual, load, Dirichlet conditions and their values.
+
+Each check looks at this rank's part; whoever asks has the ranks agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
+from ufl.constantvalue import ScalarValue
+from ufl.core.expr import Expr
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from uem_dolfinx import compat, given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
+
+
+def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
+    """Refuse what is no residual: no form, an energy, one of another space, or not linear in its test function.
+
+    Args:
+        F: a UFL form.
+        u: displacement.
+        what: F is, for messages.
+
+    Raises:
+        InputTypeError, InputError, SpaceError: each with the remedy.
+    """
+    if not isinstance(F, ufl.Form):
+        remedy = "integrate it: multiply it by ufl.dx" if isinstance(F, Expr) else "write it with ufl, and do not compile it"
+        given.kind(what, F, False, "a UFL form", remedy)
+    try:
+        arguments = F.arguments()
+        check_form_arity(ufl.algorithms.expand_derivatives(F), arguments)
+    except (ArityMismatch, ValueError) as error:
+        raise InputError(
+            f"{what} is not linear in its test function ({error}): expected every term to hold the test function once"
+        ) from error
+    if not arguments:
+        remedy = f"of an energy, take {what} = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))"
+        raise InputError(f"{what} is a functional, without test function: expected a form linear in one; {remedy}")
+    if len(arguments) > 1:
+        remedy = "put u in place of the TrialFunction"
+        raise InputError(f"{what} has {len(arguments)} arguments: expected a test function alone; {remedy}")
+    if arguments[0].ufl_function_space() != u.function_space:
+        raise SpaceError(
+            f"the test function of {what} belongs to another space than the displacement: expected ufl.TestFunction(u.function_space)"
+        )
+    for part in chain.from_iterable(traverse_unique_terminals(integral.integrand()) for integral in F.integrals()):
+        if isinstance(part, ScalarValue) and not np.isfinite(complex(part)):
+            raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
+
+
+def check_load(load: Any) -> None:
+    """Refuse a load that is neither a scalar Constant nor a function of the factor or the time.
+
+    Raises:
+        InputTypeError, InputError: naming what it is instead.
+    """
+    expected = "a scalar Constant, a function of the load factor or time, or None"
+    if isinstance(load, fem.Constant) and np.shape(load.value) != ():
+        raise InputError(
+            f"load is a Constant of the shape {np.shape(load.value)}: expected {expected}; multiply a scalar Constant by the vector in F, "
+            "or set the Constant in a function of the factor"
+        )
+    if load is not None and not isinstance(load, fem.Constant) and (isinstance(load, Expr) or not callable(load)):
+        raise InputTypeError(given.sentence("load", load, expected))
+
+
+def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
+    """The Dirichlet conditions as a list, all of them of the displacement's space or of a part of it.
+
+    Raises:
+        InputTypeError: if they are no list of Dirichlet conditions.
+        SpaceError: naming the first that belongs elsewhere.
+    """
+    bcs = given.items("bcs", bcs, compat.is_dirichlet, "a Dirichlet condition")
+    for i, bc in enumerate(bcs):
+        if not compat.is_condition_of(bc, config.V):
+            where = "another function space" if compat.is_on(bc.function_space, config.mesh) else "another mesh"
+            raise SpaceError(
+                f"the Dirichlet condition bcs[{i}] belongs to {where}: expected the displacement's space V or a component V.sub(i), not "
+                "a collapsed, scalar or second one; make it with V = u.function_space, as by uem.dirichlet(V, tag, component, value)"
+            )
+    return bcs
+
+
+def check_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> None:
+    """Refuse Dirichlet values that are not finite.
+
+    Args:
+        config: configuration of the displacement.
+        bcs: Dirichlet conditions.
+        wanted: displacement with their values ``(n_local * gdim,)``.
+
+    Raises:
+        NotFiniteError: naming condition, value and place.
+    """
+    for i, bc in enumerate(bcs):
+        dofs = compat.bc_dofs(bc)[0]
+        bad = dofs[~np.isfinite(wanted[dofs])]
+        if len(bad):
+            node, component = divmod(int(bad[0]), config.gdim)
+            raise NotFiniteError(
+                f"the Dirichlet condition bcs[{i}] prescribes {wanted[bad[0]]} in {'xyz'[component]} at {config.describe(node)}: "
+                "expected finite values; check its value and what the load sets"
+            )
