@@ -90,18 +90,6 @@ def ask_together(comm: MPI.Comm, what: str, f: Callable[..., T], *args: Any) -> 
     raise AssertionError("an error that nobody raised")
 
 
-def agree_on_call(comm: MPI.Comm, f: Callable[..., object], *args: Any) -> None:
-    """Call a function on every rank; what it raises on one is raised on all, as by ``agreed`` (collective).
-
-    Args:
-        comm: the communicator whose ranks have to agree.
-        f: called with ``args``.
-        args: of the function.
-    """
-    with agreed(comm):
-        f(*args)
-
-
 class Exchange:
     """Rows of arrays sent to other ranks, and answers to them sent back (making one is collective).
 

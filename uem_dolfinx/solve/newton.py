@@ -240,9 +240,7 @@ def solve_united(
         step = _solve_linearised(system, state, rtol * forces, passing)
         residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
         changed = state.changed or step.exchanges > 0
-        history.append(
-            Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges)
-        )
+        history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
         _report(history, verbose)
         if step.du is None:
             raise ConvergenceError(

@@ -186,7 +186,9 @@ class BodySystem:
             if moved:
                 for pair in pairs:
                     pair.place_again()
-            wrong = self._count([pair.wrong(pair.gap, pair.trial.lam, self._along(pair), rounding, 0.0, self._swept) for pair in pairs])
+            wrong = self._count(
+                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), rounding, 0.0, self._swept) for pair in pairs]
+            )
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
             fallen = self.floating.fall_again(lambda: self.place(returning=False), unsettled, at_rest)
