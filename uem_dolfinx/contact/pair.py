@@ -50,6 +50,7 @@ class ContactPair:
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
+        mutual: whether contactor and target follow each other (two-pass).
     """
 
     placement: Placement
@@ -68,7 +69,7 @@ class ContactPair:
         self.config, self.nodes, self.coupling, self.name = config, nodes, coupling, name
         self.sliding, self.max_penetration, self.thickness = sliding, max_penetration, thickness
         self.trial = self.committed = self.last_commit = PairState.initial(len(nodes), config.gdim)
-        self.initial_overlap = 0.0
+        self.initial_overlap, self.mutual = 0.0, False
         self.redundant: Bools = np.zeros(len(nodes), dtype=bool)
         self.reserved: Bools = np.zeros(len(nodes), dtype=bool)
 
@@ -158,9 +159,17 @@ class ContactPair:
     def activate_touching(self) -> None:
         """Start with the contactors that touch without force as active (collective)."""
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
+        state = replace(state, at_end=self._at_end(self.trial))
         # a first step that fails and is cut starts from here again
         self.committed = self.last_commit = state
         self._set_active(state)
+
+    def _at_end(self, state: PairState) -> Bools:
+        """Contactors that an end of the target holds in the next step ``(n,)``.
+
+        Where the surfaces follow each other none needs to be: past the end, it is the end that touches.
+        """
+        return self.coupling.at_end(self.placement, state) & (not self.mutual)
 
     def predict(self, ratio: float) -> None:
         """First active set of a step, extrapolated from the last one (collective).
@@ -271,6 +280,7 @@ class ContactPair:
         slips = np.where(self.trial.active, self.trial.slips, 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
+        fresh = replace(fresh, at_end=self._at_end(fresh))
         self.last_commit, self.committed = self.committed, fresh
         self.restore()
         self.coupling.commit()

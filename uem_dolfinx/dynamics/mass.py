@@ -203,7 +203,7 @@ class Mass:
                     break
                 step[stuck] *= 0.5
             alpha, missing = alpha + step, new
-        return s, (np.abs(missing) > MOMENTS_KEPT).any(axis=(1, 2))
+        return s, np.asarray((np.abs(missing) > MOMENTS_KEPT).any(axis=(1, 2)))
 
     def _coordinates(self, kept: Bools) -> Array:
         """1 and coordinates of the order of 1 at the nodes, for every component ``(n_owned, gdim, gdim + 1)`` (collective).

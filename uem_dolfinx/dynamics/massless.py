@@ -50,7 +50,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
         stiffness: returns the diagonal of K at the owned nodes ``(n_owned, gdim)``, without inertia (collective).
     """
     config, K = mass.config, None
-    massy = mass.of_nodes.any(axis=1)
+    massy: Bools = np.asarray(mass.of_nodes.any(axis=1))
     for contact in contacts:
         kept = _followed(config, contact)[: config.n_owned] & massy
         bare = not massy[contact.pair.nodes].any()
