@@ -24,6 +24,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.search import EQUALLY_NEAR
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
 
@@ -259,18 +260,21 @@ class Mass:
         """
         comm, body = self.config.comm, self._bodies[0]
         number = comm.allreduce(int(body[here].max(initial=-1)), op=MPI.MAX)
-        all_far = np.unique(np.concatenate(comm.allgather(distance[needed])))
-        low, high = -1, len(all_far) - 1
+        # equally near ones go together
+        unit = EQUALLY_NEAR * self.config.size
+        level = np.rint(distance / unit)
+        levels = np.unique(np.concatenate(comm.allgather(level[needed])))
+        low, high = -1, len(levels) - 1
         while high - low > 1:
             middle = (low + high) // 2
-            able = not self._scaling(~(needed & (distance <= all_far[middle])))[1][number]
+            able = not self._scaling(~(needed & (level <= levels[middle])))[1][number]
             low, high = (middle, high) if able else (low, middle)
         if low < 0:
             return ""
-        count = comm.allreduce(int((needed & (distance <= all_far[low])).sum()))
+        count = comm.allreduce(int((needed & (level <= levels[low])).sum()))
         return (
-            f"the {count} of them that are no farther than {all_far[low]:.4g} from what they may touch could be massless: make that part "
-            "of its surface the contactor, or "
+            f"the {count} of them that are no farther than {levels[low] * unit:.4g} from what they may touch could be massless: make that "
+            "part of its surface the contactor, or "
         )
 
     @property
