@@ -19,7 +19,7 @@ from __future__ import annotations
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Energies",
-    "EnergyBook", "FloatingBodyError", "HistoryWriter", "InvertedElementError", "LinearElastic", "LinearSolveError",
+    "EnergyBook", "EnergyGivenError", "FloatingBodyError", "HistoryWriter", "InvertedElementError", "LinearElastic", "LinearSolveError",
     "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
     "OrientationError", "PenetrationError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
     "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
@@ -42,6 +42,7 @@ from uem_dolfinx.errors import (
     CheckpointError,
     ConflictError,
     ConvergenceError,
+    EnergyGivenError,
     FloatingBodyError,
     InvertedElementError,
     LinearSolveError,

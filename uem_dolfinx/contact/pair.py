@@ -50,6 +50,8 @@ class ContactPair:
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
+        barred: contactors that came back into the target from beside it with a blow; they are left out until they are in front of it
+            again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
     """
 
@@ -72,6 +74,7 @@ class ContactPair:
         self.initial_overlap, self.mutual = 0.0, False
         self.redundant: Bools = np.zeros(len(nodes), dtype=bool)
         self.reserved: Bools = np.zeros(len(nodes), dtype=bool)
+        self.barred: Bools = np.zeros(len(nodes), dtype=bool)
 
     @property
     def target(self) -> Target:
@@ -115,8 +118,8 @@ class ContactPair:
 
     @property
     def off(self) -> Bools:
-        """Contactors that have slid past an end of the target ``(n,)``."""
-        return self.coupling.off(self.placement, self.trial)
+        """Contactors that have slid past an end of the target, and are not taken back yet ``(n,)``."""
+        return self.coupling.off(self.placement, self.trial) | self.barred
 
     @property
     def movable(self) -> Bools:
@@ -163,6 +166,12 @@ class ContactPair:
         # a first step that fails and is cut starts from here again
         self.committed = self.last_commit = state
         self._set_active(state)
+
+    def bar_returned(self) -> int:
+        """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
+        came = self.trial.active & ~self.committed.active & self.committed.passed
+        self.barred = self.barred | came
+        return int(self.config.comm.allreduce(int(came.sum())))
 
     def _at_end(self, state: PairState) -> Bools:
         """Contactors that an end of the target holds in the next step ``(n,)``.
@@ -278,6 +287,7 @@ class ContactPair:
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
         slips = np.where(self.trial.active, self.trial.slips, 0)
+        self.barred = self.barred & (self.projection.gap < 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
         fresh = replace(fresh, at_end=self._at_end(fresh))
@@ -293,7 +303,7 @@ class ContactPair:
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
-        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
         for when, state in (("committed", self.committed), ("last", self.last_commit)):
             kept |= {f"{when}_{name}": array for name, array in state.to_checkpoint(self.target.keys_of).items()}
         return kept
@@ -305,7 +315,7 @@ class ContactPair:
             mine = {name.removeprefix(f"{when}_"): array for name, array in kept.items() if name.startswith(f"{when}_")}
             return PairState.from_checkpoint(mine, self.target.facets_of)
 
-        self.reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
+        self.reserved, self.redundant, self.barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
         self.committed, self.last_commit = state("committed"), state("last")
         self.coupling.commit()
         self.restore()
