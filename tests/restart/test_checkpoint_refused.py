@@ -71,9 +71,9 @@ def test_another_format(folder):
     """Files of an older layout are refused, not misread."""
     uem.write_checkpoint(folder / "run", small())
     if COMM.rank == 0:
-        (folder / "run").write_bytes((folder / "run").read_bytes().replace(b"format 2", b"format 1", 1))
+        (folder / "run").write_bytes((folder / "run").read_bytes().replace(b"format 3", b"format 2", 1))
     COMM.barrier()
-    alike("run has format 1: expected format 2; read it with", lambda: uem.read_checkpoint(folder / "run", small()))
+    alike("run has format 2: expected format 3; read it with", lambda: uem.read_checkpoint(folder / "run", small()))
 
 
 @pytest.mark.parametrize(
