@@ -80,6 +80,10 @@ class InvertedElementError(UEMError, ArithmeticError):
     """The displacement turns a cell inside out."""
 
 
+class EnergyGivenError(UEMError, ArithmeticError):
+    """Contacts would give the bodies energy within a time step, however short it is."""
+
+
 class TunnellingError(UEMError, ArithmeticError):
     """A contactor passes through a target within a step, where no step ends."""
 

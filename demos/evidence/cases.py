@@ -287,13 +287,14 @@ class BoxScene(Scene):
     def weigh(self, body: int, force: Sequence[float]) -> None:
         """Load a body by a force per reference volume."""
         v = ufl.TestFunction(self.V)
-        self.F -= ufl.inner(ufl.as_vector(list(force)), v) * self._volume(body)
+        self.F -= ufl.inner(ufl.as_vector(list(force)), v) * self.part(body)
 
     def volume(self, body: int) -> float:
         """Reference volume of a body (collective)."""
-        return forms.assemble_scalar(forms.form(fem.Constant(self.mesh, 1.0) * self._volume(body)), COMM)
+        return forms.assemble_scalar(forms.form(fem.Constant(self.mesh, 1.0) * self.part(body)), COMM)
 
-    def _volume(self, body: int) -> Any:
+    def part(self, body: int) -> Any:
+        """Integration measure over a body."""
         return forms.cell_measure(self.mesh, np.flatnonzero(self.body == body).astype(np.int32))
 
     def unite(self, contactor: uem.Tag, target: Any, **options: Any) -> uem.Contact:

@@ -1,6 +1,7 @@
 """Cases of impact: steps from a hundredth of the Courant limit to a hundred times it, and speeds that cross the target in a step.
 
-What is known of a bar that hits a rigid wall and of a block that hits a plate are momentum, energy, and which side they are on.
+What is known of a bar that hits a rigid wall, of a block that hits a plate and of one that lands on a rod are momentum, energy, and which
+side they are on.
 """
 
 from __future__ import annotations
@@ -130,6 +131,40 @@ def pushed(thickness: float, trial: Trial) -> None:
     trial.check("overlap", overlap(scene, h), OVERLAP)
 
 
+def block_on_rod(ratio: float, trial: Trial) -> None:
+    """A block lands on a rod that stands on the ground, its face the contactor: mass and stiffness are ``ratio`` times the rod's.
+
+    Until the first wave is back the stress is that of two half-spaces, by their impedances. Both swell sideways, edge above edge.
+    """
+    n, w, nu = 20, 0.1, 0.3
+    dt = h = 1 / n
+    speed = 1e-3 * V0
+    gap = 0.3 * speed * dt
+    # waves run along both at speed 1
+    E = RHO * (1 - nu**2)
+    boxes = [Box((0.0, -1.0), (w, 0.0), (2, n), E), Box((0.0, gap), (w, gap + 1.0), (3, n), ratio * E)]
+    scene = BoxScene(boxes, nu=nu)
+    scene.hold(scene.side(0, 1, 0))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1))
+    v = fem.Function(scene.V)
+    v.x.array.reshape(-1, 2)[scene.nodes_of(1), 1] = -speed
+    dynamics = uem.Dynamics(uem.consistent_mass(scene.V, scene.E / (1 - nu**2)), velocity=v)
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts, dynamics=dynamics)
+    motion = Motion(problem, scene)
+    momentum = forms.form(ratio * RHO * dynamics.velocity[1] * scene.part(1))
+    start, touch, echo = forms.assemble_scalar(momentum, COMM), gap / speed, 2.0
+    stress = speed * RHO * ratio / (1 + ratio)
+    impulses = []
+    for step in trial.time_steps(problem, dt, touch + 3 * echo, EVENT):
+        trial.check("energy gained", max(0.0, motion.gained()), FORCE)
+        since = step.time - touch
+        if 0.5 * echo < since < 0.9 * echo:
+            impulses.append((forms.assemble_scalar(momentum, COMM) - start) / (stress * w * since))
+        if step.number % LOOK == 0:
+            trial.check("overlap", overlap(scene, h), OVERLAP)
+    trial.check("impulse", np.mean(impulses) - 1, WAVES)
+
+
 CASES = [
     *(
         Case(f"{c:g} CFL", "a bar hits a rigid wall", partial(bar_on_wall, c, EVENT), quick=c >= 1, moving=True)
@@ -145,5 +180,9 @@ CASES = [
             f"pushed through {t:g}", "a block is pushed through a thin plate in one load step", partial(pushed, t), quick=t == 0.1
         )
         for t in (0.02, 0.1)
+    ),
+    *(
+        Case(f"block {r:g}", "a block lands on a rod, face on face", partial(block_on_rod, r), quick=r < 10, moving=True)
+        for r in (1.5, 1e3)
     ),
 ]

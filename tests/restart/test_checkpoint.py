@@ -168,6 +168,7 @@ def random_state(pair, seed):
         counts[:, 0],
         counts[:, 1],
         r[:, 0] > 0,
+        r[:, 1] > 0,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.projection import gap_hessians
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.search import IN_PLANE, MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
 
 #: Facets whose slopes differ by less are one plane.
@@ -23,9 +23,6 @@ ON_PLANE = 1e-9
 #: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
 #: [heuristic; slope; -]
 STEEP = 0.05
-#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
-#: [bound; iterations; -]
-IN_PLANE = 4
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,9 @@ class Coupling(Protocol):
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""
 
+    def at_end(self, placement: Placement, state: PairState) -> Bools:
+        """Contactors that an end of the target holds in the next step ``(n,)``."""
+
     def movable(self, placement: Placement) -> Bools:
         """Contactors whose gap can be closed, for all the Dirichlet conditions on both sides ``(n,)``."""
 

@@ -24,7 +24,7 @@ from uem_dolfinx.geometry.projection import Projection, Target
 #: A contactor past an open end by more than this part of its facet has slid off.
 #: [heuristic; length of the facet; -]
 SLID_OFF = 1e-6
-#: A contactor that came back after it had slid off is held at the end of the target, up to this part of the facet beyond it.
+#: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
 #: [heuristic; length of the facet; -]
 END_HOLDS = 0.1
 #: Contactors nearer than this many facets keep a row in the sparsity of P.
@@ -152,7 +152,7 @@ class NodeToSurface:
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
-        i = np.flatnonzero(state.active & (state.slips > 1) & (nearest.beyond != 0).any(axis=1))
+        i = np.flatnonzero(state.active & _held_at_end(state) & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i) if len(i) else nearest
 
     def _target_moves(self, p: Projection) -> Bools | None:
@@ -181,9 +181,17 @@ class NodeToSurface:
         Round the end of a thin target they come behind it, where a negative gap is no penetration.
         """
         p = placement.projection
-        limit = np.where(state.slips > 1, END_HOLDS, SLID_OFF)
+        limit = np.where(_held_at_end(state), END_HOLDS, SLID_OFF)
         behind = state.passed & (p.gap < -self.thickness)
         return behind | (np.linalg.norm(p.beyond, axis=1) > limit * p.facet_size)
+
+    def at_end(self, placement: Placement, state: PairState) -> Bools:
+        """Contactors that come to the target at its end, where edges coincide, are held there until they slide away from it.
+
+        One that let go of the target as soon as it is the least bit past the end would sink into it, and come back with a blow.
+        """
+        near = (placement.projection.from_end <= END_HOLDS) & ~self.off(placement, state)
+        return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
     def movable(self, placement: Placement) -> Bools:
         """Contactors that can move along the normal, or whose target can."""
@@ -302,6 +310,10 @@ class NodeToSurface:
         """Small sliding finds its feet anew in every step."""
         if self.sliding == "small":
             self._anchor = None
+
+
+def _held_at_end(state: PairState) -> Bools:
+    return np.asarray(state.at_end | (state.slips > 1))
 
 
 def _closing(normal: Array, gap: Array, free: Bools) -> Array:

@@ -49,6 +49,9 @@ class ContactPair:
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
+        barred: contactors that came back into the target from beside it with a blow; they are left out until they are in front of it
+            again ``(n,)``.
+        mutual: whether contactor and target follow each other (two-pass).
     """
 
     placement: Placement
@@ -67,9 +70,10 @@ class ContactPair:
         self.config, self.nodes, self.coupling, self.name = config, nodes, coupling, name
         self.sliding, self.max_penetration, self.thickness = sliding, max_penetration, thickness
         self.trial = self.committed = PairState.initial(len(nodes), config.gdim)
-        self.initial_overlap = 0.0
+        self.initial_overlap, self.mutual = 0.0, False
         self.redundant: Bools = np.zeros(len(nodes), dtype=bool)
         self.reserved: Bools = np.zeros(len(nodes), dtype=bool)
+        self.barred: Bools = np.zeros(len(nodes), dtype=bool)
 
     @property
     def target(self) -> Target:
@@ -113,8 +117,8 @@ class ContactPair:
 
     @property
     def off(self) -> Bools:
-        """Contactors that have slid past an end of the target ``(n,)``."""
-        return self.coupling.off(self.placement, self.trial)
+        """Contactors that have slid past an end of the target, and are not taken back yet ``(n,)``."""
+        return self.coupling.off(self.placement, self.trial) | self.barred
 
     @property
     def movable(self) -> Bools:
@@ -157,9 +161,23 @@ class ContactPair:
     def activate_touching(self) -> None:
         """Start with the contactors that touch without force as active (collective)."""
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
+        state = replace(state, at_end=self._at_end(self.trial))
         # a first step that fails and is cut starts from here again
         self.committed = state
         self._set_active(state)
+
+    def bar_returned(self) -> int:
+        """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
+        came = self.trial.active & ~self.committed.active & self.committed.passed
+        self.barred = self.barred | came
+        return int(self.config.comm.allreduce(int(came.sum())))
+
+    def _at_end(self, state: PairState) -> Bools:
+        """Contactors that an end of the target holds in the next step ``(n,)``.
+
+        Where the surfaces follow each other none needs to be: past the end, it is the end that touches.
+        """
+        return self.coupling.at_end(self.placement, state) & (not self.mutual)
 
     def follow(self) -> bool:
         """Let go of contactors past an end of the target, follow the others from facet to facet (collective).
@@ -280,9 +298,10 @@ class ContactPair:
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
         slips = np.where(self.trial.active, self.trial.slips, 0)
+        self.barred = self.barred & (self.projection.gap < 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
-        self.committed = fresh
+        self.committed = replace(fresh, at_end=self._at_end(fresh))
         self.restore()
         self.coupling.commit()
         if not self.trial.active.any():
@@ -294,12 +313,12 @@ class ContactPair:
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
-        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
         return kept | self.committed.to_checkpoint(self.target.keys_of)
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
-        self.reserved, self.redundant = np.array(kept["reserved"]), np.array(kept["redundant"])
+        self.reserved, self.redundant, self.barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
         self.committed = PairState.from_checkpoint(kept, self.target.facets_of)
         self.coupling.commit()
         self.restore()

@@ -31,6 +31,7 @@ class PairState:
         changes: how often in this step it has changed facets across a bend ``(n,)``.
         slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
         passed: has been past the target's end since it was last in front of it ``(n,)``.
+        at_end: came to the target, or was drawn, at its end, which has held it since ``(n,)``.
     """
 
     active: Bools
@@ -42,6 +43,7 @@ class PairState:
     changes: Ints
     slips: Ints
     passed: Bools
+    at_end: Bools
 
     @property
     def in_corner(self) -> Bools:
@@ -67,6 +69,7 @@ class PairState:
             changes=np.zeros(n, np.int64),
             slips=np.zeros(n, np.int64),
             passed=np.zeros(n, bool),
+            at_end=np.zeros(n, bool),
         )
 
     def to_checkpoint(self, keys_of: Renumber) -> dict[str, npt.NDArray[Any]]:

@@ -5,7 +5,7 @@ They turn a static residual into a dynamic one: the solver adds these forces to 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,10 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
+from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -42,8 +44,8 @@ class Dynamics:
         velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
         gravity: acceleration of free fall ``(gdim,)``; every node weighs what its mass does, so that free fall strains nothing.
         damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual.
-        contactors: ``"massless"`` hands the contactors' mass on to the nodes around, so that impact itself loses no energy
-            [UEM, 5]; ``"massy"`` leaves it.
+        contactors: ``"massless"`` hands the mass of the contactors on to the nodes around [UEM, 5], and that of the nodes that they
+            follow in the bodies that can carry it, so that impact itself neither loses nor gives energy; ``"massy"`` leaves it.
         time: at the start.
 
     Attributes:
@@ -132,11 +134,16 @@ class Dynamics:
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 
-    def make_contactors_massless(self, contactors: Indices) -> None:
-        """Hand the mass of ``contactors (n,)``, owned local nodes, on as ``Mass.without`` does, or warn that they keep it (collective)."""
+    def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
+        """Hand the mass of contact surfaces on as ``massless.without_surfaces`` does, or warn that contactors keep it (collective).
+
+        Raises:
+            MassError: if a body cannot do without the mass of its contactors.
+        """
+        contactors = contactor_nodes(contacts)
         massy = int(self.config.comm.allreduce(int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
-        if massy and self.contactors == "massless":
-            self.mass = self.mass.without(contactors)
+        if self.contactors == "massless":
+            self.mass = without_surfaces(self.mass, contacts)
         elif massy:
             logger.warning(
                 "%d contactors have mass: impact will set them in vibration, and the trapezoidal rule then adds energy at every touch; "

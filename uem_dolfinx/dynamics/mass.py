@@ -24,6 +24,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.search import EQUALLY_NEAR
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
 
@@ -100,7 +101,9 @@ class Mass:
         modes = rigid_velocities(self._X - (sums[:, 1:] / sums[:, :1])[body]).transpose(0, 2, 1)
         return self._moments(modes, np.ones(modes.shape[:2]))[0].sum(axis=1)
 
-    def without(self, nodes: npt.ArrayLike) -> Mass:
+    def without(
+        self, nodes: npt.ArrayLike, *, where_possible: npt.ArrayLike = (), distance: Callable[[], Array] | None = None
+    ) -> Mass:
         """The same bodies with some nodes massless, whose mass goes to the other nodes of their body (collective).
 
         With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``, where S is diagonal and scales
@@ -113,38 +116,60 @@ class Mass:
 
         Args:
             nodes: owned local nodes ``(n,)``, e.g. the contactors; every rank names its own.
+            where_possible: owned local nodes ``(m,)`` that become massless as well in the bodies that can do without both.
+            distance: returns that of ``nodes`` from what they may touch ``(n,)``, a length, by which an error tells which part of
+                them could be massless (collective).
 
         Returns:
             The new mass; this object itself if none of the nodes has any.
 
         Raises:
-            MassError: if the other nodes of a body cannot take over the mass, or a node is not owned.
+            MassError: if the other nodes of a body cannot take over the mass of ``nodes``, or a node is not owned.
         """
-        config, named = self.config, np.asarray(nodes, dtype=np.int64).ravel()
-        wrong, error = named[(named < 0) | (named >= config.n_owned)], None
+        config = self.config
+        named, more = (np.asarray(a, dtype=np.int64).ravel() for a in (nodes, where_possible))
+        wrong, error = (all_named := np.append(named, more))[(all_named < 0) | (all_named >= config.n_owned)], None
         if len(wrong):
             error = MassError(
                 f"node {wrong[0]} is none of the {config.n_owned} nodes that rank {config.comm.rank} owns: "
                 "name nodes by their local block number, each on the rank that owns it"
             )
         agree(config.comm, error)
-        kept = np.ones(config.n_owned, dtype=bool)
-        kept[named] = False
-        if not config.comm.allreduce(int(self.of_nodes[~kept].any())):
+        needed = np.zeros(config.n_owned, dtype=bool)
+        needed[named] = True
+        bare = needed.copy()
+        bare[more] = True
+        if not config.comm.allreduce(int(self.of_nodes[bare].any())):
             return self
         with timed("redistribute mass"):
+            body, _ = self._bodies
+            s, unable = self._scaling(~bare)
+            if unable.any() and config.comm.allreduce(len(more)):
+                bare &= needed | ~unable[body]
+                s, unable = self._scaling(~bare)
+            if unable.any():
+                here = body == np.flatnonzero(unable)[0]
+                far = np.zeros(config.n_owned)
+                far[named] = 0.0 if distance is None else distance()
+                raise self._unable(here, needed, None if distance is None else far)
             M = self.M.copy()
             left, right = M.createVecs()
-            left.array[:] = right.array[:] = (self._scaling(kept) * kept[:, None]).ravel()
+            left.array[:] = right.array[:] = (s * ~bare[:, None]).ravel()
             M.diagonalScale(left, right)
             left.destroy()
             right.destroy()
         return Mass(M, config, self.diagonal)
 
-    def _scaling(self, kept: Bools) -> Array:
-        """Factors of the nodes that are kept with which these have the moments of all ``(n_owned, gdim)`` (collective).
+    def _scaling(self, kept: Bools) -> tuple[Array, Bools]:
+        """Factors of the nodes that are kept with which these have the moments of all, and bodies that have none (collective).
 
         Newton's method for the coefficients of the polynomials, for every component of every body at once.
+
+        Args:
+            kept: nodes that keep mass ``(n_owned,)``.
+
+        Returns:
+            Factors ``(n_owned, gdim)``, and in which bodies the moments are missed ``(n_bodies,)``.
         """
         g, xi = self.config.gdim, self._coordinates(kept)
         a, b = np.triu_indices(g + 1)
@@ -179,10 +204,7 @@ class Mass:
                     break
                 step[stuck] *= 0.5
             alpha, missing = alpha + step, new
-        lacking = np.flatnonzero((np.abs(missing) > MOMENTS_KEPT).any(axis=(1, 2)))
-        if len(lacking):
-            raise self._unable(body == lacking[0], kept)
-        return s
+        return s, np.asarray((np.abs(missing) > MOMENTS_KEPT).any(axis=(1, 2)))
 
     def _coordinates(self, kept: Bools) -> Array:
         """1 and coordinates of the order of 1 at the nodes, for every component ``(n_owned, gdim, gdim + 1)`` (collective).
@@ -212,16 +234,47 @@ class Mass:
         momenta = np.stack([self._times(fields[..., k]) for k in range(xi.shape[2])], axis=2)
         return self._products(fields, momenta), momenta
 
-    def _unable(self, here: Bools, kept: Bools) -> MassError:
-        """What to tell about a body that cannot do without some of its nodes' mass (collective)."""
+    def _unable(self, here: Bools, needed: Bools, distance: Array | None) -> MassError:
+        """What to tell about a body that cannot do without some of its nodes' mass (collective).
+
+        Args:
+            here: nodes of the body ``(n_owned,)``.
+            needed: nodes of any body that should be massless ``(n_owned,)``.
+            distance: of these from what they may touch ``(n_owned,)``, or None.
+        """
         heavy = self.of_nodes.any(axis=1) & here
-        sums = [here.sum(), (heavy & ~kept).sum(), (heavy & kept).sum(), *self._X[here].sum(axis=0)]
+        sums = [here.sum(), (heavy & needed).sum(), (heavy & ~needed).sum(), *self._X[here].sum(axis=0)]
         n, contactors, others, *x = self.config.comm.allreduce(np.array(sums, dtype=float))
         where = ", ".join(f"{c:.4g}" for c in np.array(x) / n)
+        part = "" if distance is None else self._possible_part(heavy & needed, here, distance)
         return MassError(
             f"the body with its middle at ({where}) cannot keep its mass, centre and inertia without the mass of "
             f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
-            "refine the mesh behind its contact surface, or give nodal masses that are zero at the contactors"
+            f"{part}refine the mesh behind its contact surface, or give nodal masses that are zero at the contactors"
+        )
+
+    def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:
+        """Which of the body's nodes could be massless, the nearest ones to what they may touch, in words (collective).
+
+        Arguments as those of ``_unable``.
+        """
+        comm, body = self.config.comm, self._bodies[0]
+        number = comm.allreduce(int(body[here].max(initial=-1)), op=MPI.MAX)
+        # equally near ones go together
+        unit = EQUALLY_NEAR * self.config.size
+        level = np.rint(distance / unit)
+        levels = np.unique(np.concatenate(comm.allgather(level[needed])))
+        low, high = -1, len(levels) - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            able = not self._scaling(~(needed & (level <= levels[middle])))[1][number]
+            low, high = (middle, high) if able else (low, middle)
+        if low < 0:
+            return ""
+        count = comm.allreduce(int((needed & (level <= levels[low])).sum()))
+        return (
+            f"the {count} of them that are no farther than {levels[low] * unit:.4g} from what they may touch could be massless: make that "
+            "part of its surface the contactor, or "
         )
 
     @property

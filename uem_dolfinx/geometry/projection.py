@@ -46,6 +46,10 @@ class Projection(Protocol):
     def beyond(self) -> Array:
         """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
 
+    @property
+    def from_end(self) -> Array:
+        """How far the foot is from an open end of the target on its facet, as part of the facet ``(n,)``; infinite without any."""
+
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
 
@@ -122,6 +126,7 @@ class FacetProjection:
     weights: Array
     facet: Ints
     beyond: Array
+    from_end: Array
     xi: Array
     foot: Array
     averaged: Array

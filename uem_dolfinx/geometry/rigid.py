@@ -80,6 +80,11 @@ class RigidProjection:
         """There are no facets."""
         return np.full(len(self.gap), np.inf)
 
+    @property
+    def from_end(self) -> Array:
+        """There is no end."""
+        return np.full(len(self.gap), np.inf)
+
     def with_gap(self, gap: Array) -> RigidProjection:
         """The same projection of points that have moved along the normal."""
         return replace(self, gap=gap)

@@ -27,6 +27,9 @@ LEAST_LEAN = 0.1
 #: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
 #: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
+#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+#: [bound; iterations; -]
+IN_PLANE = 4
 #: Facets whose distances or heights differ by less are equally near.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
 EQUALLY_NEAR = 1e-9
@@ -87,10 +90,14 @@ class MeshTarget:
         """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
         p, x = projection, projection.x[which]
         t = np.einsum("kaf,kag->kfg", p.dN[which], x)
-        m = np.einsum("kfg,keg->kfe", t, t)
-        xi = p.xi[which] + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, p.beyond[which])[..., None])[..., 0]
-        tab = self.shape.tabulate(xi)
-        foot = np.einsum("ka,kag->kg", tab.N, x)
+        xi, tab, foot = p.xi[which], self.shape.tabulate(p.xi[which]), p.foot[which]
+        end = foot + p.beyond[which]
+        for _ in range(IN_PLANE):
+            slope = np.einsum("kaf,kag->kfg", tab.dN, x)
+            missing = np.einsum("kfg,kg->kf", t, end - foot)
+            xi = xi + np.linalg.solve(np.einsum("kfg,keg->kfe", t, slope), missing[..., None])[..., 0]
+            tab = self.shape.tabulate(xi)
+            foot = np.einsum("ka,kag->kg", tab.N, x)
         return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     def chords(self, projection: FacetProjection) -> Array:
@@ -222,9 +229,11 @@ class MeshTarget:
         # a facet may touch the surface's end with a vertex alone
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
         beyond[~at_end] = 0.0
+        from_end = np.where(is_open, self.shape.side_distances(xi), np.inf).min(axis=1, initial=np.inf)
+        from_end[at_end] = 0.0
         number = facet + self.first[self.comm.rank]
         return FacetProjection(
-            gap, normal, data.nodes[facet], tab.N, number, beyond, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
+            gap, normal, data.nodes[facet], tab.N, number, beyond, from_end, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
         )
 
 

@@ -112,10 +112,20 @@ class BodyForces:
     def update_tangent(self) -> PETSc.Mat:
         """K at the present displacement, and its diagonal (collective)."""
         self.tangent.update()
-        diagonal = self.tangent.K.getDiagonal()
-        self.stiffness = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
-        diagonal.destroy()
+        self.stiffness = self._diagonal()
         return self.tangent.K
+
+    def initial_stiffness(self) -> Array:
+        """Diagonal of K at the present displacement ``(n_owned, gdim)``, which ``stiffness`` takes no notice of (collective)."""
+        self.assemble()
+        self.tangent.update()
+        return self._diagonal()
+
+    def _diagonal(self) -> Array:
+        diagonal = self.tangent.K.getDiagonal()
+        values = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
+        diagonal.destroy()
+        return values
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> float:
         """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).

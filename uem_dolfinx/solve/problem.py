@@ -14,6 +14,7 @@ from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.contact.contact import Contact, check_new
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion
@@ -132,7 +133,8 @@ class UnitedProblem:
         free = self.forces.free[: self.config.n_owned]
         pairs = [contact.attach(self.config, free) for contact in self.contacts]
         if dynamics is not None:
-            dynamics.make_contactors_massless(np.unique(np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])))
+            dynamics.make_contactors_massless(self.contacts)
+            warn_of_soft_targets(dynamics.mass, self.contacts, self.forces.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
         self.system = method(self.forces, pairs, solver, newton=newton, consistent_tangent=consistent_tangent)
         #: Length of time steps, and what is known of those before.

@@ -21,14 +21,10 @@ EASY = 6
 REMAINDER = 1e-9
 
 
-class EnergyGivenError(errors.UEMError):
-    """Contacts have given the bodies energy within a step; never leaves the time stepping."""
-
-
 #: What a shorter step may mend.
 MENDABLE = (
     errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
-    errors.TunnellingError, EnergyGivenError,
+    errors.TunnellingError, errors.EnergyGivenError,
 )  # fmt: skip
 
 

@@ -114,6 +114,8 @@ class BodySystem:
         self.shared = bool(found[-1])
         #: Pairs whose surfaces are contactor and target of each other (two-pass).
         self.mutual: Bools = (meets & meets.T).any(axis=1)
+        for pair, mutual in zip(pairs, self.mutual):
+            pair.mutual = bool(mutual)
         #: Whether a node that is followed may itself be eliminated.
         self.stacked = bool(meets.any()) or any(pair.coupling.chained for pair in pairs)
         #: Whether equations can get in each other's way.

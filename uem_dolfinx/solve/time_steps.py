@@ -13,13 +13,13 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import InputError, SpaceError, UEMError
-from uem_dolfinx.log import progress
+from uem_dolfinx.errors import EnergyGivenError, InputError, SpaceError, UEMError
+from uem_dolfinx.log import logger, progress
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH, EnergyGivenError
+from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import between_steps
 from uem_dolfinx.solve.tunnelling import check_tunnelling
 
@@ -29,7 +29,7 @@ TIME_ROUNDING = 4 * np.finfo(float).eps
 #: Contacts may give the bodies this part of the largest kinetic energy in a step.
 #: [convention; kinetic energy; test_thresholds_motion.py::test_energy_given]
 MOST_GIVEN = 2e-3
-#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted.
+#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
 #: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
 SHORTEST_GIVEN = 1.0 / 128
 
@@ -103,6 +103,7 @@ def time_steps(
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
+        EnergyGivenError: if contacts give the bodies energy by a blow even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
@@ -207,16 +208,21 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
     """Refuse a step within which contacts have given the bodies energy, by more than their share (collective).
 
-    The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along.
+    The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along, the
+    less the shorter the step. One that has sunk beside the target's end and is taken back gives a blow in however short a step; from the
+    next attempt on it is left out.
 
     Args:
         problem: at the end of the step.
         dynamics: of the problem.
         length: of the step.
         before: contact forces at its beginning.
+
+    Raises:
+        EnergyGivenError: if they have, and a shorter step or another attempt may be better.
     """
     control = problem.step_control
-    if length <= SHORTEST_GIVEN * control.nominal or not (forces := before + _contact_forces(problem)):
+    if not (forces := before + _contact_forces(problem)):
         return
     n = problem.config.gdim * problem.config.n_owned
     way = problem.u.x.array[:n] - problem.committed[:n]
@@ -224,8 +230,24 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     if given <= MOST_GIVEN * control.largest_energy:
         return
     control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
-    if given > MOST_GIVEN * control.largest_energy:
-        raise EnergyGivenError(f"contacts would give the bodies {given:.3g} of energy, which have {control.largest_energy:.3g}")
+    if given <= MOST_GIVEN * control.largest_energy:
+        return
+    barred = [pair.bar_returned() for pair in problem.pairs]
+    for pair, count in zip(problem.pairs, barred):
+        if count:
+            logger.warning(
+                "%s: %d contactors that had slid past the end of the target and sunk come back inside it at time %.6g; to put them "
+                "back onto it would be a blow, so they are left out until they are in front of it again",
+                pair.name,
+                count,
+                dynamics.time,
+            )
+    words = (
+        f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {control.largest_energy:.3g}"
+    )
+    if length > SHORTEST_GIVEN * control.nominal or any(barred):
+        raise EnergyGivenError(words)
+    logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:

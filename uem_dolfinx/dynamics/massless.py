@@ -1,0 +1,94 @@
+"""Which nodes of the contact surfaces are massless: the contactors, and the nodes that they follow wherever a body can carry it.
+
+A contactor and the nodes that it follows move as one. Mass on either side would sit on the cells of both surfaces as on a spring
+that is faster than anything else in the meshes: impact excites it, nothing takes its vibration away, and the trapezoidal rule turns
+it into energy whenever the contact opens. Without mass on both sides the contact force is static, the gap's own reaction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.dynamics.mass import Mass
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import followed_nodes, surface_nodes, tributary_areas
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import logger
+
+
+def contactor_nodes(contacts: Sequence[Contact]) -> Indices:
+    """Owned nodes that are contactors of any contact ``(n,)``."""
+    return np.unique(np.concatenate([np.zeros(0, np.int32), *(contact.pair.nodes for contact in contacts)]))
+
+
+def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
+    """The same bodies with massless contactors, and massless targets in the bodies that can do without both (collective).
+
+    Raises:
+        MassError: if a body cannot do without the mass of its contactors, with the part of them, if any, whose mass it could spare.
+    """
+    config, contactors = mass.config, contactor_nodes(contacts)
+    followed = [_followed(config, contact)[: config.n_owned] for contact in contacts]
+    targets = np.flatnonzero(np.any([np.zeros(config.n_owned, bool), *followed], axis=0))
+    return mass.without(contactors, where_possible=targets, distance=lambda: _distances(contactors, contacts))
+
+
+def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Callable[[], Array]) -> None:
+    """Warn of contactors that are stiffer than a target which has kept its mass (collective).
+
+    The mass of such a target vibrates on the surface cells of both sides, all the more the stiffer those of the contactor are.
+
+    Args:
+        mass: of the bodies, with massless contactors.
+        contacts: all of them.
+        stiffness: returns the diagonal of K at the owned nodes ``(n_owned, gdim)``, without inertia (collective).
+    """
+    config, K = mass.config, None
+    massy: Bools = np.asarray(mass.of_nodes.any(axis=1))
+    for contact in contacts:
+        kept = _followed(config, contact)[: config.n_owned] & massy
+        bare = not massy[contact.pair.nodes].any()
+        if not config.comm.allreduce(int(kept.any())) or not config.comm.allreduce(int(bare), op=MPI.MIN):
+            continue
+        K = stiffness() if K is None else K
+        sides = [_stiffness_per_area(config, tag, K) for tag in (contact.contactor, contact.target)]
+        if sides[0] > sides[1] > 0.0:
+            logger.warning(
+                "%s: the target's body is too thin, or its mesh too coarse, to do without the mass of its surface, and the contactor's "
+                "surface is stiffer (diagonal of K per area %.3g against %.3g): impact will set the target in vibration; swap contactor "
+                "and target, or refine the mesh behind the target",
+                contact.name,
+                *sides,
+            )
+
+
+def _followed(config: Configuration, contact: Contact) -> Bools:
+    """Local nodes of a contact's target ``(n_local,)`` (collective)."""
+    return followed_nodes(config, contact.pair.coupling.followed)
+
+
+def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:
+    """Of ``contactors (n,)`` from the targets, the nearest one that each of them may touch ``(n,)`` (collective)."""
+    found = np.full(len(contactors), np.inf)
+    for contact in contacts:
+        pair = contact.pair
+        pair.project()
+        # the foot on a rigid surface is the contactor itself
+        away = np.maximum(np.linalg.norm(pair.points - pair.projection.foot, axis=1), np.abs(pair.projection.gap))
+        np.minimum.at(found, np.searchsorted(contactors, pair.nodes), away)
+    return found
+
+
+def _stiffness_per_area(config: Configuration, part: object, K: Array) -> float:
+    """Mean diagonal of K at the nodes of a surface over their areas; 0 for points and where K is not known (collective)."""
+    if not isinstance(part, Tag):
+        return 0.0
+    nodes = surface_nodes(config, part)
+    total, area = config.comm.allreduce(np.array([K[nodes].sum(), tributary_areas(config, part)[nodes].sum()]))
+    return float(total / area) if area > 0.0 and np.isfinite(total) else 0.0
