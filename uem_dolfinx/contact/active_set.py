@@ -8,6 +8,7 @@ moves: its solution foretells gaps and forces, contactors that it shows on the w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,6 +129,7 @@ class Pivoting:
     def __init__(self) -> None:
         self._fewest: float = np.inf
         self._tries = PATIENCE
+        self._seen: set[tuple[int, ...]] = set()
 
     def all_at_once(self, count: int) -> bool:
         """Whether all ``count`` wrong contactors are exchanged."""
@@ -136,6 +138,12 @@ class Pivoting:
             return True
         self._tries -= 1
         return self._tries >= 0
+
+    def repeats(self, active: Sequence[int]) -> bool:
+        """Whether the worst has been exchanged alone in this active set before, told by a number of each rank."""
+        again = tuple(active) in self._seen
+        self._seen.add(tuple(active))
+        return again
 
 
 def touching(state: PairState, gap: Array, size: float, allowed: Bools) -> PairState:

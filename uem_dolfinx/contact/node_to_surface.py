@@ -171,7 +171,7 @@ class NodeToSurface:
         p = placement.projection
         move = du[self.nodes]
         if p.nodes.shape[1]:
-            followed = self.config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, -1)
+            followed = self.config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, self.config.gdim)
             move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
         return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
 

@@ -214,10 +214,12 @@ class ContactPair:
             off = off | (self.trial.slips > 0)
         # an equation that was left out as dependent and does not hold is no contact
         apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
+        # the facets of a corner are let go of one by one, which ``follow`` does
+        pulled = np.where(self.trial.in_corner, 0.0, lam)
         return active_set.find_wrong(
             self.trial,
             gap,
-            lam,
+            pulled,
             off,
             self.movable & ~apart,
             stiffness,

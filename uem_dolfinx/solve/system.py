@@ -269,6 +269,10 @@ class BodySystem:
         worst = max(w.worst for w in wrong)
         deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, worst))
         if not self._pivoting.all_at_once(count):
+            active = zlib.crc32(b"".join(pair.trial.active.tobytes() for pair in self.pairs))
+            if self._pivoting.repeats(self.comm.allgather(active)) and self._curvature is not None:
+                # with curvature the problem may have no solution, or several; without it there is one
+                self._curvature, self._pivoting = None, Pivoting()
             return [w.among_the_worst(worst) for w in wrong]
         if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
             return [w.on_first_touch(gap, deepest) for gap, w in zip(gaps, wrong)]
