@@ -57,6 +57,7 @@ from uem_dolfinx.errors import (
     OrientationError,
     OutputError,
     PenetrationError,
+    PrecisionError,
     SpaceError,
     SurfaceError,
     TagError,

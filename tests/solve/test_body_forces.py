@@ -4,9 +4,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import blocks, clamp, linear
+from helpers import blocks, clamp, linear, modulus
 
 import uem_dolfinx as uem
+from uem_dolfinx.geometry.bodies import find_bodies
 
 COMM = MPI.COMM_WORLD
 
@@ -47,3 +48,25 @@ def test_dirichlet_values_are_met(value):
     for units, met in ((0.0, True), (2.0, True), (12.0, False)):
         problem.config.displacement[:] = forces.wanted * (1.0 + units * np.finfo(float).eps)
         assert forces.dirichlet_met() == met
+
+
+@pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
+def test_forces_told_from_rounding(length):
+    """A body carried far without strain has none; strained by 1e-11 of its way it has, where the other body does not count."""
+    b = blocks(COMM, "triangle", 4, 5, gap=1.0, pose=lambda x: length * x)
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1e-3, 1e3)), b.u, bcs=clamp(b.V, b.bottom))
+    forces, config = problem.forces, problem.config
+    forces.update_tangent()
+    body, _ = find_bodies(config)
+    upper = config.X[:, 1] > 0.5 * length
+    for strain, told in ((0.0, False), (3e-14, False), (1e-11, True)):
+        config.displacement[:] = 0.0
+        config.displacement[upper] = length * np.array([1.0, 2.0]) * (1.0 + strain * np.sin(config.X[upper] / length))
+        b.u.x.scatter_forward()
+        forces.assemble()
+        assert (forces.told_apart(False) > 0.0) == told
+    # a soft body's forces are told from its own rounding, not from that of a stiff one
+    config.displacement[~upper, 1] = 1e-3 * (config.X[~upper, 1] + length)
+    b.u.x.scatter_forward()
+    forces.assemble()
+    assert forces.told_apart(False) > 1e-5 * length * 1e-3

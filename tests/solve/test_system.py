@@ -4,7 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import blocks, linear, run
+from helpers import blocks, clamp, linear, run
 
 import uem_dolfinx as uem
 
@@ -33,3 +33,23 @@ def test_gaps_that_count_as_closed(length):
         system.assemble_residual()
         state = system.unite(equilibrium)
         assert state.closed == closed and not state.changed
+
+
+@pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
+def test_what_a_solve_foretells(length):
+    """Contactors that the increment lets sink by 3e-9 of it stay open, since a solve foretells no more; by 3e-8 of it they close."""
+    b = blocks(COMM, "quadrilateral", 2, 4, gap=0.5, pose=lambda x: length * x)
+    contact = uem.Contact(b.high, b.low)
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=[contact])
+    system, config = problem.system, problem.config
+    system.place(returning=False)
+    system.assemble_residual()
+    for part, closes in ((3e-9, False), (3e-8, True)):
+        state = system.unite(equilibrium)
+        system.differentiate(first=True)
+        system.linearise(state)
+        du = problem.forces.vector()
+        way = np.zeros((config.n_owned, 2))
+        way[config.X[: config.n_owned, 1] > 0.25 * length, 1] = -0.5 * length * (1 + part)
+        du.array[:] = way.ravel()
+        assert (system.exchange(state, du, 0.0, 0.0) is not None) == closes
