@@ -44,7 +44,7 @@ def on_the_plane(x):
     return np.abs(x[:, -1]) < 1e-9
 
 
-@pytest.mark.parametrize(("ratio", "contactor"), [*product((1e6, 1e9, 1e11, 1e12, 1e13, 1e15), (0, 1))])
+@pytest.mark.parametrize(("ratio", "contactor"), [*product((1e6, 1e9, 1e12, 1e13, 1e15), (0, 1))])
 def test_converged_means_converged(ratio, contactor):
     """A stiff block carried far over a soft one: its forces drown in rounding, and then that is said; else they are right."""
     s = springs(([4 * (2 - contactor)] * 2, [4 * (1 + contactor)] * 2), (1.0, ratio))
@@ -64,7 +64,8 @@ def history(comm, cell, degree, law):
     """Active contactors and exchanges of every iteration, and the last force, of a round block on a flat one, symmetric to the bit."""
     b = blocks(comm, cell, 2, 3, degree=degree, gap=0.05, overhang=0.5, pose=rounded)
     g = b.gdim
-    contact = uem.Contact(b.high, b.low)
+    # moments of quadratic contactors in corners balance to the second order of their gaps only
+    contact = uem.Contact(b.high, b.low, sliding="finite" if degree == 1 or g == 2 else "fixed")
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0] * (g - 1) + [-0.2])]
     problem = uem.UnitedProblem(law(b.u, modulus(b.scene, 1.0, 3.0)), b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
     steps = run(problem, 2)

@@ -81,7 +81,7 @@ def find_wrong(
     movable: Bools,
     stiffness: Array,
     *,
-    force_rounding: float,
+    force_rounding: Array | float,
     gap_rounding: float,
 ) -> Wrong:
     """Find the contactors that break the conditions.
@@ -93,7 +93,7 @@ def find_wrong(
         off: contactors past the target's end, or that may not enter for another reason ``(n,)``.
         movable: contactors whose gap can be closed ``(n,)``.
         stiffness: of the contactors along the normal, a force per length ``(n,)``.
-        force_rounding: forces below it are zero.
+        force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
         gap_rounding: gaps below it are zero.
     """
     release = state.active & ((lam < -force_rounding) | ~movable)

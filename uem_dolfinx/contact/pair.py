@@ -197,7 +197,7 @@ class ContactPair:
         return self.coupling.foreseen(self.placement, du)
 
     def wrong(
-        self, gap: Array, lam: Array, stiffness: Array, force_rounding: float, gap_rounding: float, swept: bool
+        self, gap: Array, lam: Array, stiffness: Array, force_rounding: Array, gap_rounding: float, swept: bool
     ) -> active_set.Wrong:
         """Contactors that break the conditions of contact with such gaps and forces.
 
@@ -205,7 +205,7 @@ class ContactPair:
             gap: that decides on contact ``(n,)``.
             lam: force along the normal that decides on contact ``(n,)``.
             stiffness: of the contactors along the normal ``(n,)``.
-            force_rounding: forces below it are zero.
+            force_rounding: forces below it are zero ``(n,)``.
             gap_rounding: gaps below it are zero, and below rounding of positions.
             swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
         """

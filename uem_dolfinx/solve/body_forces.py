@@ -139,6 +139,14 @@ class BodyForces:
         np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
         return float(FORCE_ROUNDING * self.vector(rounded * self.stiffness).norm())
 
+    def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
+        """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""
+        if self.stiffness is None:
+            return np.zeros(len(nodes))
+        return np.asarray(
+            FORCE_ROUNDING * (np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])).max(axis=1, initial=0.0)
+        )
+
     def told_apart(self, positioned: bool) -> float:
         """Norm of the forces at those components where they are told from rounding (collective).
 

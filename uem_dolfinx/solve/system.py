@@ -31,8 +31,8 @@ from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.solve.tangent import contact_curvature
 
-#: A direct solve foretells gaps to this part of the increment, and forces to this part of its right-hand side.
-#: [convention; increment and right-hand side; test_system.py::test_what_a_solve_foretells]
+#: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
+#: [convention; the increment; test_system.py::test_what_a_solve_foretells]
 FORESEEN = 1e-8
 #: Part of the model's size that an active contactor's gap may be left with.
 #: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
@@ -188,8 +188,9 @@ class BodySystem:
             if moved:
                 for pair in pairs:
                     pair.place_again()
+            here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
             wrong = self._count(
-                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), rounding, 0.0, self._swept) for pair in pairs]
+                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), least, 0.0, self._swept) for pair, least in here]
             )
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
@@ -240,15 +241,15 @@ class BodySystem:
                 F.axpy(1.0, self._curvature * du)
             F.axpy(1.0, self.forces.residual)
             forces = self._read_forces(rows, rows.test.pass_on(F))
-            error = accuracy if self.solver.iterative else FORESEEN
             increment = du.array_r.reshape(-1, config.gdim)
-            near = error * np.abs(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            tension = max(state.rounding, error * driving)
+            left = accuracy if self.solver.iterative else 0.0
+            near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
             foreseen = [pair.foreseen(increment) for pair in self.pairs]
-            wrong = [
-                pair.wrong(gap, lam, self._along(pair), tension, near, self._swept)
-                for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces)
-            ]
+            wrong = []
+            for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
+                along = self._along(pair)
+                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
+                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept))
             count = self._count(wrong)
             if not count or self._adrift:
                 self._take(forces)
