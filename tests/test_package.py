@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from helpers import outside_mpi, serial
 
 REPO = Path(__file__).resolve().parent.parent
@@ -26,6 +27,7 @@ for name in names:
 
 
 @serial
+@pytest.mark.slow
 def test_wheel_elsewhere(tmp_path):
     source = tmp_path / "source"
     source.mkdir()

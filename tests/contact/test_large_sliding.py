@@ -80,6 +80,7 @@ def test_over_vertices_convex_and_concave(cell, normals):
 
 @pytest.mark.parametrize("normals", NORMALS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.slow
 def test_there_and_back(cell, normals):
     """Over half of a wave and back: each state on the way back is the one on the way there."""
     g, height = (3 if cell == "hexahedron" else 2), 0.03

@@ -152,6 +152,7 @@ def test_surfaces_of_any_degree_and_two_passes(ratio, degree, passes):
 
 
 @pytest.mark.parametrize(("width", "degree"), [((2, 3), 1), ((3, 2), 1), ((1, 2), 2)])
+@pytest.mark.slow
 def test_edges_that_coincide_do_not_slip_off(width, degree):
     """Both swell sideways, each its own way, and their corners slide past each other: they hold on, and no step is a blow."""
     past = []

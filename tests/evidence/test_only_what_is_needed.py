@@ -318,6 +318,7 @@ print(calls)
 
 
 @serial
+@pytest.mark.slow
 def test_import_takes_little_more_than_that_of_dolfinx(folder):
     """``import uem_dolfinx`` makes at most 1.1 times the calls of ``import dolfinx``, both compiled before."""
     cache = {"PYTHONPYCACHEPREFIX": str(folder), "PYTHONDONTWRITEBYTECODE": ""}

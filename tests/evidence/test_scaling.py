@@ -88,6 +88,7 @@ def test_plates_touch_all_over(comm):
 
 
 @serial
+@pytest.mark.slow
 def test_script(folder):
     """The demo on one and two ranks in a size that takes seconds: its file has all that is promised."""
     file = folder / "scaling.json"

@@ -170,6 +170,7 @@ def start(path, every):
 
 
 @serial
+@pytest.mark.slow
 def test_killed_without_warning(folder):
     """kill -9 at any instant, four times over: the file is whole, at most one interval old, and the run goes on from it."""
     last = 0

@@ -80,6 +80,7 @@ def uninterrupted(rho=None):
 
 
 @pytest.mark.parametrize("rho", [None, 0.6])
+@pytest.mark.slow
 def test_interrupted_is_uninterrupted(rho, folder):
     """Left twice in mid-run, in flight before the touch and in contact after steps that were cut, and gone on with each time."""
     scheme = None if rho is None else uem.generalised_alpha(rho)
@@ -106,6 +107,7 @@ def test_interrupted_is_uninterrupted(rho, folder):
     close(whole, last)
 
 
+@pytest.mark.slow
 def test_a_later_end(folder):
     """A run that has come to its end goes on if the end is later, as if that had been the end from the beginning."""
     Impact().run(folder, end=0.12)
@@ -190,6 +192,7 @@ def start(path, every):
 
 
 @serial
+@pytest.mark.slow
 def test_killed(folder):
     """kill -9 in mid-run, twice: no more than the interval is lost, and the run ends in the very state of one that was left alone."""
     _, steps, alone = uninterrupted()
@@ -212,6 +215,7 @@ def test_killed(folder):
 
 
 @serial
+@pytest.mark.slow
 def test_terminated(folder):
     """SIGTERM in mid-run: the step is finished and written, the status is 143, and the run goes on to the same end."""
     _, steps, alone = uninterrupted()

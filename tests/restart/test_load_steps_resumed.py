@@ -140,6 +140,7 @@ RAMPS[{kind!r}](COMM).run(Path({folder!r}), every=2)
 
 @serial
 @pytest.mark.parametrize("kind", ["sliding", "plastic"])
+@pytest.mark.slow
 def test_killed(kind, folder):
     """kill -9 twice in mid-run: files are whole whenever it comes, and the run that goes on ends in the very same ones."""
     for count in (3, 2):

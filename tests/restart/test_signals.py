@@ -184,6 +184,7 @@ finally:
 
 @serial
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.slow
 def test_status(number, status, folder):
     """What a shell sees of a run that was ended, and what is in its checkpoint."""
     process = start_process(RUN.format(checkpoint=f"uem.Checkpoint({str(folder / 'run')!r})"))
