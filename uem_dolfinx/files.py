@@ -48,7 +48,7 @@ class Trouble:
         if self._error is None and isinstance(error, self.kind):
             self._error = error
         elif self._error is None and isinstance(error, (OSError, MPI.Exception)):
-            self._error = self.kind(f"{self.what} ({error}): {self.remedy}")
+            self._error = self.kind(f"{self.what} ({' '.join(str(error).split())}): {self.remedy}")
         return isinstance(error, (OSError, MPI.Exception))
 
     @property

@@ -35,7 +35,11 @@ DEGREES_ENOUGH = 4
 
 def original_cells(domain: Any) -> npt.NDArray[np.int64]:
     """Number of every cell in the mesh's input ``(n_cells incl. ghosts,)``; empty for a mesh made from another one."""
-    return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+    try:
+        return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+    except RuntimeError:
+        # a mesh made of another one may not know its input
+        return np.zeros(0, dtype=np.int64)
 
 
 def vertex_nodes(domain: Any) -> Indices:
