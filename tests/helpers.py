@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,18 @@ MESHES = Path(__file__).resolve().parents[1] / "meshes"
 #: Oedometric modulus over Young's modulus.
 M = oedometric()
 serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
+
+
+def refused(error: type[Exception], words: str | Iterable[str], call: Callable[[], object]) -> Exception:
+    """The same error on all ranks, a UEMError of this class, with all these words in its message (collective)."""
+    with pytest.raises(error) as caught:
+        call()
+    message = str(caught.value)
+    assert isinstance(caught.value, uem.UEMError)
+    for text in (words,) if isinstance(words, str) else words:
+        assert text in message, message
+    assert len(set(MPI.COMM_WORLD.allgather(f"{type(caught.value).__name__}: {message}"))) == 1
+    return caught.value
 
 
 def gathered_matrix(A: PETSc.Mat) -> Array:

@@ -12,7 +12,7 @@ import pytest
 import ufl
 from bar_scenes import Bar
 from dolfinx import fem
-from helpers import blocks, clamp, linear, modulus, run
+from helpers import blocks, clamp, linear, modulus, refused, run
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -21,18 +21,6 @@ from uem_dolfinx import compat, forms, given
 COMM = MPI.COMM_WORLD
 LAST = COMM.rank == COMM.size - 1
 nan, inf = np.nan, np.inf
-
-
-def refused(error, words, call):
-    """The same error on all ranks, a UEMError of this class, with all these words in its message."""
-    with pytest.raises(error) as caught:
-        call()
-    message = str(caught.value)
-    assert isinstance(caught.value, uem.UEMError)
-    for text in (words,) if isinstance(words, str) else words:
-        assert text in message, message
-    assert len(set(COMM.allgather(f"{type(caught.value).__name__}: {message}"))) == 1
-    return caught.value
 
 
 def scene(**how):

@@ -9,24 +9,13 @@ import pytest
 import ufl
 from bar_scenes import Bar
 from dolfinx import fem
-from helpers import blocks, clamp, linear
+from helpers import blocks, clamp, linear, refused
 
 import uem_dolfinx as uem
 from uem_dolfinx.parallel import agreed
 
 COMM = MPI.COMM_WORLD
 nan, inf = np.nan, np.inf
-
-
-def refused(error, words, call):
-    """The same named error on all ranks, with all these words in its message."""
-    with pytest.raises(error) as caught:
-        call()
-    message = str(caught.value)
-    assert isinstance(caught.value, uem.UEMError)
-    for text in words:
-        assert text in message, message
-    assert len(set(COMM.allgather(f"{type(caught.value).__name__}: {message}"))) == 1
 
 
 def steel(b, **parameters):

@@ -50,12 +50,6 @@ class PairState:
         """Contactors that a corner holds ``(n,)``."""
         return np.asarray((self.held >= 0).any(axis=1))
 
-    @property
-    def united_to(self) -> bytes:
-        """What tells this active set from others: who is active, and the corners that hold contactors."""
-        corner = np.where(self.in_corner, self.facet, -1)
-        return self.active.tobytes() + corner.tobytes() + self.held.tobytes()
-
     @classmethod
     def initial(cls, n: int, gdim: int) -> PairState:
         """The state of ``n`` contactors that nothing is known about."""

@@ -61,10 +61,11 @@ class MeshTarget:
         # the answer of the rank that seems nearest tells who else can be as near
         near, far = self._bounds(points, data)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
-        found, keys = self._ask(Exchange.to(self.comm, first), data, points)
+        nearest = self._ask(Exchange.to(self.comm, first), data, points)
+        found, _ = nearest
         bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
         others = (near <= bound) & (first != np.arange(size)[:, None])
-        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=found, found_keys=keys)[0]
+        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=nearest)[0]
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
@@ -160,7 +161,7 @@ class MeshTarget:
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
-        found: FacetProjection | None = None, found_keys: Ints | None = None,
+        found: tuple[FacetProjection, Ints] | None = None,
     ) -> tuple[FacetProjection, Ints]:  # fmt: skip
         """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found; and its keys."""
         p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
@@ -172,9 +173,9 @@ class MeshTarget:
             return answer, keys
         # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
         rows, columns = exchange.rows, exchange.back(*self._judged(p, answer, keys))
-        if found is not None and found_keys is not None:
+        if found is not None:
             rows = np.append(rows, np.arange(len(points)))
-            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, found, found_keys))]
+            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, *found))]
         distance, height, keys, *columns = columns
         best = _nearest(rows, distance, height, keys, ON_SIDE * self.stride)
         return FacetProjection(*(column[best] for column in columns)), keys[best]

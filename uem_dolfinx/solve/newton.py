@@ -275,7 +275,7 @@ class _Step:
         rhs: right-hand side of the last solve.
         dq: its unknowns.
         du: its increment; None if the active set did not settle.
-        driving: its norm.
+        driving: norm of ``rhs``.
         linear_iterations: of all solves.
         exchanges: number of solves after the first.
     """

@@ -285,8 +285,7 @@ class BodySystem:
 
     def _along(self, pair: ContactPair) -> Array:
         """Stiffness of the pair's contactors along their normals ``(n,)``."""
-        if self.forces.stiffness is None:
-            return np.ones(len(pair.nodes))
+        assert self.forces.stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
 
     def restriction(self) -> Restriction:
