@@ -92,9 +92,9 @@ def cell_measure(domain: Any, cells: npt.ArrayLike, metadata: Mapping[str, Any] 
     return ufl.Measure("dx", domain=domain, subdomain_data=tags, metadata=dict(metadata or {}))(1)
 
 
-def quadrature_rule(domain: Any, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def quadrature_rule(cell: str, degree: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Points ``(n, tdim)`` and weights ``(n,)`` on the reference cell that forms use by default for polynomials of a degree."""
-    points, weights = basix.make_quadrature(getattr(basix.CellType, compat.cell_name(domain)), degree)
+    points, weights = basix.make_quadrature(getattr(basix.CellType, cell), degree)
     return np.asarray(points), np.asarray(weights)
 
 

@@ -16,6 +16,8 @@ from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
+from uem_dolfinx.contact.coupling import Coupling
+from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
@@ -43,6 +45,7 @@ class Contact:
         contactor: facets whose nodes are the contactors, or points, which have forces but no pressures: a tag, a list of tags,
             ``(meshtags, value)``, or facet indices.
         target: facets of the other body, named alike, or a rigid surface.
+        coupling: ``"node_to_surface"``, the paper's, or ``"mortar"``, from integrals over both surfaces: exact on any pair of meshes.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
@@ -62,6 +65,7 @@ class Contact:
         contactor: Part,
         target: Part | Target,
         *,
+        coupling: str = "node_to_surface",
         sliding: str = "finite",
         normals: str = "facet",
         max_penetration: float | None = None,
@@ -73,6 +77,7 @@ class Contact:
             rigid = hasattr(target, "project")
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
+            coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
             normals = given.word("normals", normals, ("facet", "averaged"))
             if max_penetration is not None:
@@ -82,6 +87,7 @@ class Contact:
             chords = given.flag("chords", chords)
             given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
+        self.coupling = coupling
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
@@ -110,7 +116,7 @@ class Contact:
         self._fields, _ = {}, self.__dict__.pop("_areas", None)
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
-            max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
+            max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__, coupling=self.coupling,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
@@ -123,9 +129,13 @@ class Contact:
             check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
             target = MeshTarget(surface, averaged=self.normals == "averaged")
         thickness = np.inf if self.thickness is None else self.thickness
-        coupling = (Bernstein if config.degree == 2 else NodeToSurface)(
-            config, nodes, target, free=free, sliding=self.sliding, thickness=thickness, chords=self.chords and config.degree == 2
-        )
+        how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
+        coupling: Coupling
+        if self.coupling == "mortar":
+            coupling = Mortar(config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how)
+        else:
+            kind = Bernstein if config.degree == 2 else NodeToSurface
+            coupling = kind(config, nodes, target, chords=self.chords and config.degree == 2, **how)
         self._pair = ContactPair(
             config,
             nodes,

@@ -112,6 +112,13 @@ class Configuration:
         (out[exchange.rows],) = exchange.back(values[asked - self._first_nodes[self.comm.rank]])
         return out
 
+    def add_at_owners(self, nodes: Ints, values: Array) -> Array:
+        """Sums of values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners ``(n_owned, k)`` (collective)."""
+        there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
+        out = np.zeros((self.n_owned, values.shape[1]))
+        np.add.at(out, there - self._first_nodes[self.comm.rank], arrived)
+        return out
+
     @cached_property
     def size(self) -> float:
         """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with (first call: collective)."""

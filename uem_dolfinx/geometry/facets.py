@@ -30,14 +30,19 @@ class FacetData:
 
 
 class TargetFacets:
-    """Facets of a target surface that this rank holds, oriented outwards (collective).
+    """Facets of a surface that this rank holds, oriented outwards (collective).
+
+    Args:
+        config: configuration of the displacement.
+        tag: of the surface.
+        role: of the surface, for messages.
 
     Raises:
         OrientationError: if a facet lies between two cells, so that outward has no meaning.
     """
 
-    def __init__(self, config: Configuration, tag: Tag):
-        self.config, self.tag = config, tag
+    def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
+        self.config, self.tag, self.role = config, tag, role
         mesh, tdim, fdim = config.mesh, config.tdim, config.tdim - 1
         mesh.topology.create_connectivity(fdim, tdim)
         mesh.topology.create_connectivity(tdim, fdim)
@@ -78,8 +83,8 @@ class TargetFacets:
         if len(inner):
             where = np.round(self.config.X[self.dofs[inner[0], :corners]].mean(axis=0), 6)
             error = OrientationError(
-                f"target '{self.tag.name}' has a facet between two cells at {where}, where outward has no meaning: "
-                "a target must lie on the outside of a body, so mesh the bodies apart"
+                f"{self.role} '{self.tag.name}' has a facet between two cells at {where}, where outward has no meaning: "
+                f"a {self.role} must lie on the outside of a body, so mesh the bodies apart"
             )
         agree(self.config.comm, error)
 

@@ -59,7 +59,7 @@ class MeshTarget:
         if size == 1:
             return self._project_here(points, data)
         # the answer of the rank that seems nearest tells who else can be as near
-        near, far = self._bounds(points, data)
+        near, far = self.bounds(points, data.x)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
         nearest = self._ask(Exchange.to(self.comm, first), data, points)
         found, _ = nearest
@@ -144,9 +144,14 @@ class MeshTarget:
         """Exchange with the ranks that hold the facets; facet -1 is nobody's."""
         return Exchange.to(self.comm, np.searchsorted(self.first, facet, side="right") - 1)
 
-    def _bounds(self, points: Array, data: FacetData) -> tuple[Array, Array]:
-        """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective)."""
-        nodes, size = data.x.reshape(-1, points.shape[1]), self.comm.size
+    def bounds(self, points: Array, x: Array) -> tuple[Array, Array]:
+        """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective).
+
+        Args:
+            points: ``(n, gdim)``.
+            x: nodes of this rank's facets ``(m, nn, gdim)``.
+        """
+        nodes, size = x.reshape(-1, points.shape[1]), self.comm.size
         box = np.stack([nodes.min(axis=0, initial=np.inf), nodes.max(axis=0, initial=-np.inf)])
         boxes = np.empty((size, *box.shape))
         self.comm.Allgather(box, boxes)

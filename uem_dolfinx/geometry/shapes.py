@@ -57,6 +57,15 @@ class FacetShape:
             ddN[..., 0, 1] = ddN[..., 1, 0] = t[4]
         return Tabulated(t[0], np.moveaxis(t[1 : 1 + d], 0, -1), ddN)
 
+    def functions(self, xi: Array) -> Array:
+        """Shape functions alone at ``xi (n, fdim)``: ``(n, nn)``."""
+        if self.degree > 1 or self.dim == 0 or not len(xi):
+            return self.tabulate(xi).N
+        if self.cell != "quadrilateral":
+            return np.column_stack([1 - xi.sum(axis=1), xi])
+        x, y = xi.T
+        return np.column_stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
+
     def chords(self, xi: Array) -> Array:
         """Weights of the straight pieces between neighbouring nodes at ``xi (n, fdim)``: ``(n, nn)`` [UEM, 4.5]."""
         if self.degree == 1:
@@ -71,6 +80,11 @@ class FacetShape:
     def nodes(self) -> Array:
         """Reference positions of the nodes ``(nn, fdim)``."""
         return np.zeros((1, 0)) if self._element is None else np.asarray(self._element.points)
+
+    @property
+    def ring(self) -> list[int]:
+        """Corners of a facet with an area in their order around it, in the sense of its parametrisation."""
+        return [0, 1, 3, 2] if self.cell == "quadrilateral" else [0, 1, 2]
 
     @property
     def middle(self) -> Array:

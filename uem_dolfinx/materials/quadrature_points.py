@@ -53,7 +53,7 @@ class QuadraturePoints:
         #: By the size of their values: the spaces made, and where the points are in them.
         self._spaces: dict[int, tuple[fem.FunctionSpace, Indices]] = {}
         metadata: dict[str, Any] = {"quadrature_degree": degree}
-        self.points, weights = forms.quadrature_rule(domain, degree)
+        self.points, weights = forms.quadrature_rule(compat.cell_name(domain), degree)
         if degree == 0:
             self.points = self.points + BESIDE_CENTRE * np.array(DIRECTIONS[domain.topology.dim])
             weights = np.full(len(self.points), weights[0] / len(self.points))

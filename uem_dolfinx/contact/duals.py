@@ -1,0 +1,148 @@
+"""Dual bases on the covered part of contactor facets, and the integrals that uniting equations are made of.
+
+Per facet, with integrals over what target facets cover of it, ``D_k = int b_k`` and ``M_kl = int b_k b_l``, the dual functions
+``psi = D M^-1 b`` satisfy ``int psi_j b_k = delta_jk D_k`` and add up to one: the consistent basis of Cichosz and Bischoff (2011,
+doi:10.1016/j.cma.2010.11.004). The functions b are the shape functions on surfaces of degree 1. Those of degree 2 have no integral,
+or a negative one, at vertices; there b are Bernstein's, which are positive, and ``du = sum b_k (T du)_k``.
+
+Where little of a node's part of a facet is covered, its dual function would be large: it is added to that of another node of the
+facet, which keeps the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import comb, factorial
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.overlaps import Segments
+from uem_dolfinx.geometry.shapes import FacetShape
+
+#: The dual function of a node is added to another's where less than this part of the node's share of a facet is covered.
+#: [convention; part of the integral; test_mortar.py::test_what_is_hardly_covered]
+HARDLY_COVERED = 0.05
+
+
+class Basis:
+    """What displacements of a facet are told by: its shape functions, or Bernstein's on facets of degree 2.
+
+    Attributes:
+        T: coefficients from nodal values ``(nn, nn)``.
+        mean: of the functions over the reference facet ``(nn,)``.
+        rank: 0 for vertices, 1 and 2 for the middles of edges and facets ``(nn,)``: coefficients take in nodes of lower rank alone.
+    """
+
+    def __init__(self, shape: FacetShape):
+        self.shape = shape
+        n_vertices = len(shape.topology[0])
+        n_edges = len(shape.topology[1]) if shape.dim == 2 else 1
+        kinds = [0] * n_vertices + ([1] * n_edges + [2] * (len(shape.nodes) - n_vertices - n_edges) if shape.degree == 2 else [])
+        self.rank: Ints = np.array(kinds, dtype=np.int64)
+        self.T: Array = np.linalg.inv(self.at(shape.nodes)) if shape.degree == 2 else np.eye(n_vertices)
+        simplex = shape.cell != "quadrilateral"
+        n = len(self.rank)
+        # Bernstein's functions of one degree have all the same integral
+        self.mean: Array = np.full(n, 1.0 / n) if simplex or shape.degree == 1 else np.full(n, 1.0 / 9.0)
+
+    def at(self, xi: Array) -> Array:
+        """Values at ``xi (q, fdim)``: ``(q, nn)``."""
+        if self.shape.degree == 1:
+            return self.shape.functions(xi)
+        if self.shape.cell == "quadrilateral":
+            order = np.rint(2 * self.shape.nodes).astype(int)
+            one = [comb(2, k) * xi**k * (1 - xi) ** (2 - k) for k in range(3)]
+            return np.stack([one[i][:, 0] * one[j][:, 1] for i, j in order], axis=1)
+        nodes, b = _barycentric(self.shape.nodes), _barycentric(xi)
+        order = np.rint(2 * nodes).astype(int)
+        return np.stack([2 / np.prod([factorial(k) for k in e]) * np.prod(b**e, axis=1) for e in order], axis=1)
+
+
+def _barycentric(xi: Array) -> Array:
+    return np.column_stack([1 - xi.sum(axis=1), xi])
+
+
+@cache
+def basis_of(shape: FacetShape) -> Basis:
+    """The one basis of a shape of facets."""
+    return Basis(shape)
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Integrals over the covered parts of ``m`` facets in ``k`` pairs.
+
+    Attributes:
+        facet: of each pair ``(k,)``, ascending.
+        D: of the functions ``(m, nn)``.
+        M: of their products ``(m, nn, nn)``.
+        G: of their products with the gap ``(m, nn)``.
+        N: of their products with the target's shape functions, pair by pair ``(k, nn, nt)``.
+        full: of the functions over the whole facets ``(m, nn)``.
+    """
+
+    facet: Ints
+    D: Array
+    M: Array
+    G: Array
+    N: Array
+    full: Array
+
+    @classmethod
+    def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, size: Array, mean: Array) -> Covered:
+        """Integrate.
+
+        Args:
+            segments: of the pairs.
+            b: functions of the contactor's basis at their points ``(q, nn)``.
+            N: the target's shape functions there ``(q, nt)``.
+            facet: contactor facet of each pair ``(k,)``.
+            size: of the contactor facets in their planes ``(m,)``.
+            mean: of the functions b over a whole facet ``(nn,)``.
+        """
+        s, m, k, nn = segments, len(size), len(facet), len(mean)
+        weighted = s.weight[:, None] * b
+        parts = [weighted, (weighted[:, :, None] * b[:, None, :]).reshape(-1, nn * nn), weighted * s.gap[:, None]]
+        D, M, G = (add_up(facet[s.pair], part, m) for part in parts)
+        pairs = add_up(s.pair, (weighted[:, :, None] * N[:, None, :]).reshape(len(b), nn * N.shape[1]), k)
+        return cls(facet, D, M.reshape(m, nn, nn), G, pairs.reshape(k, nn, N.shape[1]), size[:, None] * mean)
+
+
+def add_up(place: Ints, values: Array, n: int) -> Array:
+    """Sums of rows of ``values (q, c)`` whose ``place (q,)``, which ascends, is the same ``(n, c)``."""
+    out = np.zeros((n, values.shape[1]))
+    if len(place):
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        out[place[first]] = np.add.reduceat(values, first, axis=0)
+    return out
+
+
+def dual_functions(covered: Covered, precedence: Array) -> tuple[Array, Array]:
+    """Dual functions of facets as combinations of the functions b, and their integrals with them, ``(m, nn, nn)`` each.
+
+    Args:
+        covered: integrals over the facets.
+        precedence: of the facets' nodes ``(m, nn)``; what is hardly covered goes to the foremost node of the facet.
+    """
+    m, nn = covered.D.shape
+    kept: Bools = covered.D >= HARDLY_COVERED * covered.full
+    row, foremost = np.arange(m), np.argmax(precedence, axis=1)
+    # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
+    other = kept & (np.arange(nn) != foremost[:, None])
+    A = np.zeros((m, nn, nn))
+    some = np.flatnonzero(other.any(axis=1))
+    if len(some):
+        scaled = covered.M[some] / covered.D[some].sum(axis=1)[:, None, None]
+        # functions that are not kept take no part in the inverse but through their sum
+        A[some] = (covered.D[some] / covered.D[some].sum(axis=1)[:, None])[:, :, None] * np.linalg.pinv(scaled, hermitian=True)
+        A[some] *= other[some][:, :, None]
+    A[row, foremost] = 1.0 - A.sum(axis=1)
+    C, j = np.zeros((m, nn, nn)), np.arange(nn)
+    C[:, j, j] = np.where(other, covered.D, 0.0)
+    C[row, foremost] = np.where(other, 0.0, covered.D)
+    empty = covered.D.sum(axis=1) <= 0.0
+    A[empty] = 0.0
+    return A, C

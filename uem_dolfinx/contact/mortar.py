@@ -1,0 +1,374 @@
+"""Mortar: uniting equations from integrals over segments, exact on any pair of meshes.
+
+Where a node's part of the contactor is covered by the target, its equation says that the gap vanishes in the mean, weighted with the
+node's dual function. The equations eliminate one component of the node each, like those of ``node_to_surface``; their multipliers
+are pressures, and what they hand on balances in force and moment. Nodes that are farther from the target than a facet keep the
+equation of a node against the surface, until they come nearer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
+from uem_dolfinx.contact.duals import HARDLY_COVERED, Basis, Covered, basis_of, dual_functions
+from uem_dolfinx.contact.mortar_tangent import SegmentPoints, opposite_changes, turning
+from uem_dolfinx.contact.node_to_surface import NEAR, NodeToSurface
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.opposite import FACING, find_opposite
+from uem_dolfinx.geometry.overlaps import Planes, Segments, overlap
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.shapes import tangents
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange
+
+#: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
+#: [convention; radians; test_mortar.py::test_parallel_facets]
+PARALLEL = 1e-10
+
+
+@dataclass(frozen=True)
+class WeightedRows:
+    """Equations of all contactors, one each.
+
+    Attributes:
+        equations: in the order of the contactors; none is active. They hand forces on.
+        gradients: the derivatives of the same gaps, by which contactors move; the same object where all facets are parallel.
+        points: quadrature points of the segments; None where segments are kept.
+        covered: contactors whose equation comes from segments ``(n,)``.
+        facets: numbers of the contactor's facets near the target ``(m,)``.
+        near: contactors with a facet near the target ``(n,)``.
+        area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
+        share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
+    """
+
+    equations: UnitingEquations
+    gradients: UnitingEquations
+    points: SegmentPoints | None
+    facets: Ints
+    covered: Bools
+    near: Bools
+    area: Array
+    share: Array
+
+
+class Pieces(NamedTuple):
+    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``."""
+
+    segments: Segments
+    facet: Ints
+    to_gap: Array
+    to_shapes: Array
+    N: Array
+    opposite: Ints
+
+
+class Mortar(NodeToSurface):
+    """Implements ``Coupling``: contactor facets against the surface of one target; arguments as those of ``NodeToSurface``.
+
+    Args:
+        surface: the contactor's facets.
+    """
+
+    chained = True
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self._valleys, self.surface = None, surface
+        self.basis: Basis = basis_of(surface.shape)
+        self._place = np.full(config.n_local, -1, dtype=np.int64)
+        self._place[nodes] = np.arange(len(nodes))
+        # tells equal nodes apart, alike in any partition
+        nn = surface.dofs.shape[1]
+        code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
+        self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
+        #: Rows that a contact with small or fixed sliding keeps.
+        self._kept: WeightedRows | None = None
+
+    # -- placement -------------------------------------------------------------------------------------------------------
+
+    def place(self, points: Array, state: PairState) -> Placement:
+        """Project contactors and find the segments of their facets (collective); see ``Coupling``."""
+        if self.sliding == "finite":
+            nearest = self._nearest(points)
+            rows = self._unite(nearest, points)
+        elif self._kept is None:
+            nearest = self._anchor = self.target.project(points)
+            rows = self._kept = self._unite(nearest, points)
+        else:
+            nearest = self.target.follow(points, self._anchor)
+            rows = self._follow(self._kept, nearest, points)
+        eq = rows.equations
+        seen: Any = replace(nearest, gap=eq.gap, normal=eq.direction)  # type: ignore[type-var]
+        if self.target.n_nodes:
+            # forces and their reactions lie on one line through the contactor
+            seen = seen.with_rows(np.flatnonzero(rows.covered), {"foot": points[rows.covered]})
+        return Placement(seen, eq.gap, self._can_move(eq) if self.prescribed else None, rows)
+
+    def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
+        """Nothing is returned."""
+        return placement
+
+    def return_vectors(self, placement: Placement, points: Array, state: PairState) -> Array:
+        """Weighted gaps are closed by the linear solve."""
+        return np.zeros(points.shape)
+
+    def _can_move(self, equations: UnitingEquations) -> Bools:
+        """Contactors whose equations follow anything that can move (collective)."""
+        free = self.config.ask_owners(equations.followed, self._free_of_owned.astype(float))
+        can = np.zeros(len(equations), dtype=bool)
+        can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
+        return can
+
+    def _follow(self, rows: WeightedRows, nearest: Projection, points: Array) -> WeightedRows:
+        """The same rows where contactors and target are now (collective)."""
+        eq = rows.equations
+        if self.target.n_nodes:
+            n = self.config.n_owned
+            gap = self._along(eq, self.config.x[:n])
+        else:
+            gap = eq.gap
+        moved = replace(eq, gap=gap)
+        return replace(rows, equations=moved, gradients=moved)
+
+    def _along(self, equations: UnitingEquations, values: Array) -> Array:
+        """What the left sides of the equations make of the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
+        nodes, place = np.unique(equations.followed, return_inverse=True)
+        theirs = self.config.ask_owners(nodes, values)[place]
+        own = np.einsum("ng,ng->n", equations.direction, values[equations.node])
+        return own - np.bincount(
+            equations.row, np.einsum("kg,kg->k", equations.coefficients, theirs), minlength=len(equations)
+        )
+
+    # -- rows ------------------------------------------------------------------------------------------------------------
+
+    @timed("segments")
+    def _unite(self, nearest: Projection, points: Array) -> WeightedRows:
+        """Equations of all contactors (collective)."""
+        surface, config, nn = self.surface, self.config, self.surface.dofs.shape[1]
+        x = surface.x
+        away = np.linalg.norm(points - nearest.foot, axis=1) if self.target.n_nodes else np.abs(nearest.gap)
+        away = config.from_owners(self.nodes, away[:, None], surface.dofs.ravel())[:, 0].reshape(-1, nn)
+        size = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) * 2
+        near = np.ones(len(x), dtype=bool)
+        if self.target.n_nodes and self.sliding == "finite":
+            near = away.min(axis=1) < (1 + NEAR) * size
+        facets = np.flatnonzero(near)
+        planes = Planes.of(surface.shape, x, surface.sign).take(facets)
+        reach = away[facets].max(axis=1, initial=0.0) / FACING + 0.5 * size[facets]
+        placed = self._over_segments if isinstance(self.target, MeshTarget) else self._over_facets
+        segments, pairs, to_gap, to_shapes, N, nodes = placed(planes, x[facets], facets, reach)
+        b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
+        covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
+        A, C = dual_functions(covered, self._precedence(covered, facets))
+        turned = turning(surface.shape, x[facets], surface.sign[facets])
+        at = SegmentPoints(
+            surface.shape, segments, pairs, surface.nodes[facets], nodes, planes, turned, A, b, phi, N, to_gap, to_shapes
+        )
+        return self._gather(covered, C, at, facets, nearest)
+
+    def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
+        """Segments against a mesh (collective)."""
+        assert isinstance(self.target, MeshTarget)
+        shape = self.target.shape
+        found = find_opposite(self.target, planes, x, reach)
+        e = found.facet
+        s = overlap(planes.take(e), (self.surface.shape, x[e]), (shape, found.x), self.surface.sign[facets[e]])
+        # what lies behind the facets in reach is no contact
+        weight = np.bincount(s.pair, s.weight, minlength=len(e))
+        mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
+        kept = ((weight > 0) & (np.abs(mean) <= reach[e]))[s.pair]
+        s = Segments(s.pair[kept], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
+        tab = shape.tabulate(s.eta)
+        to_gap, to_shapes = opposite_changes(planes.normal[e[s.pair]], tangents(tab, found.x[s.pair]), tab.dN)
+        return Pieces(s, e, to_gap, to_shapes, tab.N, found.nodes)
+
+    def _over_facets(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
+        """Whole facets against a rigid surface, which covers all that face it."""
+        shape, (m, g) = self.surface.shape, planes.origin.shape
+        points, weights = forms.quadrature_rule(shape.cell, 4 * shape.degree)
+        q = len(weights)
+        xi, row = np.tile(points, (m, 1)), np.repeat(np.arange(m), q)
+        tab = shape.tabulate(xi)
+        p = self.target.project(np.einsum("qa,qag->qg", tab.N, x[row]))
+        lean = -np.einsum("qg,qg->q", p.normal, planes.normal[row])
+        flat = np.einsum("qfg,qeg->qfe", tangents(tab, x[row]), planes.axes[row][:, :-1])
+        weight = np.tile(weights, m) * np.abs(np.linalg.det(flat))
+        i = np.flatnonzero((lean.reshape(m, q) > FACING).all(axis=1)[row])
+        none = np.zeros((len(i), 0))
+        s = Segments(row[i], xi[i], none, weight[i], p.gap[i] / lean[i])
+        return Pieces(s, np.arange(m), p.normal[i] / lean[i, None], np.zeros((len(i), 0, g)), none, np.zeros((m, 0), np.int64))
+
+    def _precedence(self, covered: Covered, facets: Ints) -> Array:
+        """Order in which nodes take in what is hardly covered, alike on all ranks ``(m, nn)`` (collective).
+
+        A node's equation may take in nodes that come after it, so that no equation follows itself: middles come before vertices.
+        """
+        dofs = self.surface.dofs[facets]
+        part, full = (self.config.to_owners(dofs.ravel(), values.ravel())[dofs] for values in (covered.D, covered.full))
+        ratio = part / np.where(full > 0, full, 1.0)
+        well = 1.0 + self.basis.rank + 0.5 * np.round(np.minimum(ratio, 1.0), 6) + 1e-7 * self._code[dofs]
+        return np.where(ratio >= HARDLY_COVERED, well, ratio * (1 + 1e-7 * self._code[dofs]))
+
+    def _gather(self, covered: Covered, C: Array, at: SegmentPoints, facets: Ints, nearest: Projection) -> WeightedRows:
+        """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
+        config, n = self.config, len(self.nodes)
+        own, e, normal, dofs = at.nodes, at.facet, -at.planes.normal, self.surface.dofs[facets]
+        CT = C @ self.basis.T
+        on_facet = CT[:, :, :, None] * normal[:, None, None]
+        on_target = (at.A[e] @ covered.N)[..., None] * normal[e][:, None, None]
+        area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", at.A, covered.G)
+        f, i = np.nonzero(area > 0)
+        values = np.column_stack([on_facet[f, i, i], gap[f, i], area[f, i, None] * normal[f]])
+        total = config.add_at_owners(own[f, i], values)[self.nodes]
+        direction, gap, size = total[:, : config.gdim], total[:, config.gdim], np.linalg.norm(total[:, config.gdim + 1 :], axis=1)
+        length = np.linalg.norm(direction, axis=1)
+        is_covered = length > 0
+        scale = np.where(is_covered, length, 1.0)
+        direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
+        # a row follows its own facets' other nodes where it takes them in, and the target's
+        other = ~np.eye(own.shape[1], dtype=bool)
+        terms = [_terms(own, own, -on_facet, other & (CT != 0)), _terms(own[e], at.opposite, on_target)]
+        row, term, value = self._at_owners(terms, scale)
+        # the rest keep their places on the target
+        alone = np.flatnonzero(~is_covered)
+        k, a = np.nonzero(nearest.nodes[alone] >= 0)
+        row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
+        value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
+        gap = np.where(is_covered, gap / scale, nearest.gap)
+        equations = gradients = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
+        if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
+            more_facet, more_target = at.gap_derivatives()
+            # along the normals of the others, which are eliminated, rows keep to what they take in
+            more_facet = self._across(more_facet, direction, dofs)
+            more = self._at_owners([_terms(own, own, -more_facet), _terms(own[e], at.opposite, -more_target)], scale)
+            parts = [np.concatenate(pair) for pair in zip((row, term, value), more)]
+            gradients = replace(equations, **dict(zip(("row", "followed", "coefficients"), _add_up_terms(*parts))))
+        seen = config.to_owners(dofs.ravel(), np.ones(dofs.size))[self.nodes] > 0
+        share = np.where(is_covered, size / scale, 1.0)
+        return WeightedRows(equations, gradients, at, facets, is_covered, seen, size, share)
+
+    def _across(self, values: Array, direction: Array, dofs: Indices) -> Array:
+        """Coefficients ``(m, nr, nn, gdim)`` of facets' nodes without what their own equations eliminate there (collective)."""
+        here, g = direction * self.free, self.config.gdim
+        length = np.einsum("ng,ng->n", here, here)[:, None]
+        known = np.column_stack([direction, here / np.where(length > 0, length, 1.0)])
+        seen = self.config.from_owners(self.nodes, known, dofs.ravel()).reshape(*dofs.shape, 2 * g)
+        return values - np.einsum("mjag,mag->mja", values, seen[..., g:])[..., None] * seen[:, None, :, :g]
+
+    def _at_owners(self, parts: Sequence[tuple[Ints, Ints, Array]], scale: Array) -> tuple[Ints, Ints, Array]:
+        """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
+        node, term, value = (np.concatenate(part) for part in zip(*parts))
+        node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
+        row = self._place[node - int(self.config.index_map.local_range[0])]
+        return _add_up_terms(row, term, value / scale[row, None])
+
+    # -- what decides on contact -----------------------------------------------------------------------------------------
+
+    def foreseen(self, placement: Placement, du: Array) -> Array:
+        """Weighted gaps after an increment (collective)."""
+        rows: WeightedRows = placement.details
+        return placement.gap + self._along(rows.gradients, du)
+
+    def off(self, placement: Placement, state: PairState) -> Bools:
+        """Contactors near the target that it does not cover."""
+        rows: WeightedRows = placement.details
+        return rows.near & ~rows.covered if self.target.n_nodes else np.zeros(len(self.nodes), dtype=bool)
+
+    def at_end(self, placement: Placement, state: PairState) -> Bools:
+        """No end holds contactors: what is covered of them fades away."""
+        return np.zeros(len(self.nodes), dtype=bool)
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def approach(self, placement: Placement, which: Ints) -> UnitingEquations:
+        """The equations that the contactors ``which (k,)`` would have if they were active."""
+        part = self._select(placement.details.equations, which)
+        return replace(part, active=np.ones(len(part), dtype=bool))
+
+    def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:
+        """One equation for each contactor."""
+        rows: WeightedRows = placement.details
+        test = trial = replace(self._select(rows.equations, which), active=state.active[which])
+        if rows.gradients is not rows.equations:
+            trial = replace(self._select(rows.gradients, which), active=test.active)
+        return LabelledEquations(trial, test, which, np.full(len(which), NORMAL))
+
+    def _select(self, rows: UnitingEquations, which: Ints) -> UnitingEquations:
+        chosen = np.zeros(len(self.nodes), dtype=bool)
+        chosen[which] = True
+        return rows.select(chosen)
+
+    def forces(
+        self, placement: Placement, state: PairState, equations: LabelledEquations, multipliers: Array
+    ) -> tuple[Array, Array, Array]:
+        """Pressures times areas, and the contactors' forces (collective)."""
+        rows: WeightedRows = placement.details
+        mu = np.zeros(len(self.nodes))
+        mu[equations.contactor] = multipliers
+        nodes, values = self._handed_on(rows, mu)
+        force = np.asarray(self.config.add_at_owners(nodes, values)[self.nodes])
+        return mu * rows.share, np.einsum("ng,ng->n", force, rows.equations.direction), force
+
+    def _handed_on(self, rows: WeightedRows, mu: Array) -> tuple[Ints, Array]:
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
+        eq = rows.equations
+        own, terms = mu != 0, mu[eq.row] != 0
+        nodes = np.concatenate([self.config.to_global(self.nodes[own]), eq.followed[terms]])
+        return nodes, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
+
+    def nodal_forces(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
+        """What the equations hand on of the state's multipliers."""
+        rows: WeightedRows = placement.details
+        return self._handed_on(rows, state.lam / rows.share)
+
+    def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
+        """How forces turn with the facets, and go from node to node where they slide."""
+        rows: WeightedRows = placement.details
+        assert rows.points is not None
+        pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
+        dofs = self.surface.dofs[rows.facets]
+        at_nodes = self.config.from_owners(self.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
+        nodes, blocks = rows.points.force_derivatives(at_nodes)
+        if rows.gradients is rows.equations:
+            blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        return nodes, blocks
+
+    def areas(self, placement: Placement, areas: Array) -> Array:
+        """Integrals of the dual functions over what is covered."""
+        rows: WeightedRows = placement.details
+        return np.where(rows.covered, rows.area, areas)
+
+    def commit(self) -> None:
+        """Small sliding finds its segments anew in every step."""
+        super().commit()
+        if self.sliding == "small":
+            self._kept = None
+
+
+def _terms(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> tuple[Ints, Ints, Array]:
+    """Terms of rows of nodes ``rows (m, nr)`` that follow ``followed (m, nf)`` with ``values (m, nr, nf, gdim)``, zeros left out."""
+    m, i, a = np.nonzero(values.any(axis=3) & which)
+    return rows[m, i], followed[m, a], values[m, i, a]
+
+
+def _add_up_terms(row: Ints, term: Ints, value: Array) -> tuple[Ints, Ints, Array]:
+    """Terms of the same row and node added up."""
+    order = np.lexsort((term, row))
+    row, term, value = row[order], term[order], value[order]
+    if not len(row):
+        return row, term, value
+    first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(term, prepend=-1) != 0))
+    return row[first], term[first], np.add.reduceat(value, first, axis=0)

@@ -1,0 +1,98 @@
+"""Which facets of a target may lie opposite to a contactor's facets, wherever they are.
+
+Target facets travel to the ranks whose contactor facets may see them, and to no others; no rank ever holds a whole surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.overlaps import Planes
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange
+
+#: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
+#: [convention; cosine; test_overlaps.py::test_facets_that_face_each_other]
+FACING = 0.5
+
+
+@dataclass(frozen=True)
+class Opposite:
+    """Pairs of facets, ordered by contactor facet and then by what tells the target's in any partition.
+
+    Attributes:
+        facet: number of the contactor facet among those asked for ``(k,)``, ascending.
+        x: nodes of the target facet ``(k, nt, gdim)``.
+        nodes: their global block numbers ``(k, nt)``.
+    """
+
+    facet: Ints
+    x: Array
+    nodes: Ints
+
+
+@timed("search")
+def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array) -> Opposite:
+    """Target facets that face contactor facets and may lie upon them, no farther than ``reach (m,)`` along the normal (collective).
+
+    Args:
+        target: the surface.
+        planes: of the contactor facets ``(m,)``.
+        x: their nodes ``(m, nc, gdim)``.
+        reach: lengths ``(m,)``.
+    """
+    comm = target.comm
+    middle = x.mean(axis=1)
+    radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1, initial=0.0)
+    here = target.facets.x
+    asked = [middle, radius, reach, planes.normal]
+    if comm.size == 1:
+        i, f = _candidates(target, here, *asked)
+        order = np.lexsort((target.keys[f], i))
+        i, f = i[order], f[order]
+        return Opposite(i, here[f], target.facets.nodes[f])
+    near = _boxes_near(target, here, middle, radius + reach)
+    exchange = Exchange(comm, [np.flatnonzero(n) for n in near])
+    mine = np.arange(len(x))
+    *arrived, row, rank = exchange.send(*asked, mine, np.full(len(x), comm.rank))
+    i, f = _candidates(target, here, *arrived)
+    found, y, nodes, key = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f])
+    order = np.lexsort((key, found))
+    return Opposite(found[order], y[order], nodes[order])
+
+
+def _boxes_near(target: MeshTarget, here: Array, middle: Array, within: Array) -> Array:
+    """Whether the facets of each rank may be within a distance of points ``(size, m)`` (collective)."""
+    near, _ = target.bounds(middle, here)
+    return np.asarray(near <= within)
+
+
+def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reach: Array, normal: Array) -> tuple[Ints, Ints]:
+    """Contactor facets, by middle, radius, reach and normal, and this rank's target facets that may lie upon them, ``(k,)`` each."""
+    none = np.zeros(0, dtype=np.int64)
+    if not len(middle) or not len(y):
+        return none, none
+    from scipy.spatial import cKDTree
+
+    centre = y.mean(axis=1)
+    size = np.linalg.norm(y - centre[:, None], axis=2).max(axis=1)
+    outward = Planes.of(target.shape, y, target.facets.sign).normal
+    kinds = np.floor(np.log2(size / size.max()))
+    rows, facets = [none], [none]
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
+        hits = cKDTree(centre[members]).query_ball_point(middle, radius + reach + size[members].max(), return_sorted=False)
+        counts = np.fromiter((len(h) for h in hits), np.int64, len(middle))
+        rows.append(np.repeat(np.arange(len(middle)), counts))
+        facets.append(members[np.concatenate([none, *(np.asarray(h, dtype=np.int64) for h in hits)])])
+    i, f = np.concatenate(rows), np.concatenate(facets)
+    away = centre[f] - middle[i]
+    height = np.einsum("kg,kg->k", away, normal[i])
+    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    both = radius[i] + size[f]
+    kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -FACING) & (beside < both) & (np.abs(height) < reach[i] + both)
+    return i[kept], f[kept]

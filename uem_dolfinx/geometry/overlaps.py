@@ -1,0 +1,216 @@
+"""Segments: where the facets of two surfaces lie upon each other, and quadrature there. Pure geometry of pairs of facets.
+
+A contactor facet has one normal n of its own. Its corners and those of a target facet are projected along n into its mean plane; what
+the two polygons have in common is a *segment*. Integrals run over the segments in that plane, so that the forces at one quadrature
+point lie on one line along n, and leave neither force nor moment behind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.shapes import FacetShape
+
+#: A segment that is smaller is rounding of two sides that coincide.
+#: [convention; part of the contactor facet; test_overlaps.py::test_slivers]
+SLIVER = 1e-12
+#: Newton iterations for the place of a point in the plane of a facet whose map is not affine.
+#: [bound; iterations; -]
+IN_MEAN_PLANE = 12
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Mean planes of facets.
+
+    Attributes:
+        origin: a corner ``(m, gdim)``.
+        axes: orthonormal, the facet's in the plane and then the outward normal ``(m, gdim, gdim)``.
+        size: of the facets projected into it, a length or an area ``(m,)``.
+    """
+
+    origin: Array
+    axes: Array
+    size: Array
+
+    @classmethod
+    def of(cls, shape: FacetShape, x: Array, sign: Array) -> Planes:
+        """The planes of facets with nodes ``x (m, nn, gdim)``, whose own parametrisation's normal times ``sign (m,)`` is outward."""
+        corner = x[:, : len(shape.topology[0])]
+        along = corner[:, 1] - corner[:, 0]
+        if shape.dim == 1:
+            size = np.linalg.norm(along, axis=1)
+            t = along / size[:, None]
+            n = np.stack([t[:, 1], -t[:, 0]], axis=1) * sign[:, None]
+            return cls(corner[:, 0], np.stack([t, n], axis=1), size)
+        # of a quadrilateral the diagonals span the mean plane
+        ends = (corner[:, 3] - corner[:, 0], corner[:, 2] - corner[:, 1]) if shape.cell == "quadrilateral" else (
+            along, corner[:, 2] - corner[:, 0],
+        )  # fmt: skip
+        area = 0.5 * np.cross(*ends)
+        size = np.linalg.norm(area, axis=1)
+        n = area / size[:, None] * sign[:, None]
+        t = along - np.einsum("mg,mg->m", along, n)[:, None] * n
+        t /= np.linalg.norm(t, axis=1, keepdims=True)
+        return cls(corner[:, 0], np.stack([t, np.cross(n, t), n], axis=1), size)
+
+    @property
+    def normal(self) -> Array:
+        """Outward unit normals ``(m, gdim)``."""
+        return self.axes[:, -1]
+
+    def take(self, which: Ints) -> Planes:
+        """Some of them, repeated or not."""
+        return Planes(self.origin[which], self.axes[which], self.size[which])
+
+    def coordinates(self, x: Array) -> Array:
+        """Coordinates of points ``x (m, k, gdim)``, those in the plane and then the height ``(m, k, gdim)``."""
+        return np.einsum("mkg,mfg->mkf", x - self.origin[:, None], self.axes)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Quadrature points of the segments of pairs of facets, in the order of the pairs.
+
+    Attributes:
+        pair: number of the pair ``(q,)``, ascending.
+        xi: reference coordinates on the contactor facet ``(q, fdim)``.
+        eta: on the target facet ``(q, fdim)``.
+        weight: of the quadrature in the mean plane, a length or an area ``(q,)``.
+        gap: from the contactor to the target along the contactor's normal ``(q,)``.
+    """
+
+    pair: Ints
+    xi: Array
+    eta: Array
+    weight: Array
+    gap: Array
+
+
+def quadrature(shape: FacetShape) -> tuple[Array, Array]:
+    """Rule for products of two shape functions on a piece of a facet: barycentric points ``(k, fdim + 1)`` and weights of sum 1."""
+    cell = "interval" if shape.dim == 1 else "triangle"
+    # bilinear functions are of degree 2 along the diagonals
+    points, weights = forms.quadrature_rule(cell, 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1))
+    return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
+
+
+def overlap(planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[FacetShape, Array], sign: Array) -> Segments:
+    """Segments of pairs of facets.
+
+    Args:
+        planes: of the contactor facet of every pair ``(m,)``.
+        contactor: shape, and nodes of the facets ``(m, nc, gdim)``.
+        target: likewise ``(m, nt, gdim)``.
+        sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
+    """
+    (shape, x), (other, y) = contactor, target
+    own, its = planes.coordinates(x), planes.coordinates(y)
+    place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, shape, own, other, its, sign)
+    xi, eta = locate(shape, own[place, :, :-1], at), locate(other, its[place, :, :-1], at)
+    height = np.einsum("qa,qa->q", other.functions(eta), its[place, :, -1])
+    height -= np.einsum("qa,qa->q", shape.functions(xi), own[place, :, -1])
+    return Segments(place, xi, eta, weight, height)
+
+
+def _intervals(planes: Planes, shape: FacetShape, own: Array, other: FacetShape, its: Array, sign: Array) -> tuple[Ints, Array, Array]:
+    """Pairs, places in the plane ``(q, 1)`` and weights of the quadrature in 2D."""
+    ends = np.sort(its[:, :2, 0], axis=1)
+    low, high = np.maximum(0.0, ends[:, 0]), np.minimum(planes.size, ends[:, 1])
+    found = np.flatnonzero(high - low > SLIVER * planes.size)
+    points, weights = quadrature(shape)
+    s = low[found, None] * points[:, 0] + high[found, None] * points[:, 1]
+    return np.repeat(found, len(weights)), s.reshape(-1, 1), ((high - low)[found, None] * weights).ravel()
+
+
+def _polygons(planes: Planes, shape: FacetShape, own: Array, other: FacetShape, its: Array, sign: Array) -> tuple[Ints, Array, Array]:
+    """Pairs, places in the plane ``(q, 2)`` and weights of the quadrature in 3D."""
+    frame = own[:, shape.ring, :2]
+    # counter-clockwise about the outward normal
+    frame = np.where(sign[:, None, None] > 0, frame, frame[:, ::-1])
+    corners, count = clip(its[:, other.ring, :2], frame)
+    doubled = 2 * np.abs(_areas(corners, count))
+    found = np.flatnonzero(doubled > 2 * SLIVER * planes.size)
+    corners, count = corners[found], count[found]
+    polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
+    a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
+    area = 0.5 * np.abs(_cross(b - a, c - a))
+    points, weights = quadrature(shape)
+    at = np.einsum("qk,kpg->pqg", points, np.stack([a, b, c]))
+    return np.repeat(found[polygon], len(weights)), at.reshape(-1, 2), (area[:, None] * weights).ravel()
+
+
+def clip(subject: Array, frame: Array) -> tuple[Array, Ints]:
+    """What convex polygons have in common with convex frames, all at once (Sutherland and Hodgman, 1974, doi:10.1145/360767.360802).
+
+    Args:
+        subject: corners in either order ``(m, k, 2)``.
+        frame: corners counter-clockwise ``(m, l, 2)``.
+
+    Returns:
+        Corners ``(m, k + l, 2)`` and how many of them there are ``(m,)``.
+    """
+    m, k, _ = subject.shape
+    corners, count = subject, np.full(m, k)
+    for a in range(frame.shape[1]):
+        start, along = frame[:, a], frame[:, (a + 1) % frame.shape[1]] - frame[:, a]
+        corners, count = _cut(corners, count, start, along)
+    return corners, count
+
+
+def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array, Ints]:
+    """What lies on the left of lines; polygons may have one more corner then."""
+    m, k, _ = corners.shape
+    i = np.arange(k)
+    real = i < count[:, None]
+    inside_by = _cross(along[:, None], corners - start[:, None])
+    after = np.where(i + 1 < count[:, None], i + 1, 0)
+    following, beyond_by = np.take_along_axis(corners, after[..., None], axis=1), np.take_along_axis(inside_by, after, axis=1)
+    inside = inside_by >= 0
+    crosses = real & (inside != (beyond_by >= 0))
+    drop = inside_by - beyond_by
+    part = inside_by / np.where(crosses, drop, 1.0)
+    met = corners + part[..., None] * (following - corners)
+    every = np.stack([corners, met], axis=2).reshape(m, 2 * k, 2)
+    kept = np.stack([real & inside, crosses], axis=2).reshape(m, 2 * k)
+    order = np.argsort(~kept, axis=1, kind="stable")[:, : k + 1]
+    return np.take_along_axis(every, order[..., None], axis=1), kept.sum(axis=1)
+
+
+def _areas(corners: Array, count: Ints) -> Array:
+    """Signed areas of polygons ``(m,)``."""
+    arm = corners - corners[:, :1]
+    part = _cross(arm[:, 1:-1], arm[:, 2:])
+    return 0.5 * np.where(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1, part, 0.0).sum(axis=1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def locate(shape: FacetShape, y: Array, at: Array) -> Array:
+    """Reference coordinates of the points of facets with nodes ``y (q, nn, fdim)`` in a plane that lie at ``at (q, fdim)``."""
+    if shape.affine:
+        sides = y[:, 1 : shape.dim + 1] - y[:, :1]
+        return _solve(sides.transpose(0, 2, 1), at - y[:, 0])
+    xi = np.tile(shape.middle, (len(at), 1))
+    for _ in range(IN_MEAN_PLANE):
+        tab = shape.tabulate(xi)
+        left = at - np.einsum("qa,qaf->qf", tab.N, y)
+        step = _solve(np.einsum("qae,qaf->qfe", tab.dN, y), left)
+        xi += step
+        if not (np.abs(step) > 1e-14).any():
+            break
+    return xi
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solutions of small systems ``A (q, f, f)`` for ``b (q, f)``, f = 1 or 2."""
+    if A.shape[1] == 1:
+        return b / A[:, 0]
+    det = _cross(A[:, :, 0], A[:, :, 1])
+    return np.stack([_cross(b, A[:, :, 1]), _cross(A[:, :, 0], b)], axis=1) / det[:, None]
