@@ -37,6 +37,9 @@ from uem_dolfinx.parallel import Exchange
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
 #: [convention; radians; test_mortar.py::test_parallel_facets]
 PARALLEL = 1e-10
+#: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
+#: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
+COVERED_AGAIN = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class WeightedRows:
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
         near: contactors with a facet near the target ``(n,)``.
+        ratio: part of the contactor's share of its facets that is covered ``(n,)``.
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
     """
@@ -60,6 +64,7 @@ class WeightedRows:
     facets: Ints
     covered: Bools
     near: Bools
+    ratio: Array
     area: Array
     share: Array
 
@@ -172,12 +177,15 @@ class Mortar(NodeToSurface):
         segments, pairs, to_gap, to_shapes, N, nodes = placed(planes, x[facets], facets, reach)
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
         covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
-        A, C = dual_functions(covered, self._precedence(covered, facets))
+        dofs = surface.dofs[facets]
+        part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
+        ratio = part / np.where(full > 0, full, 1.0)
+        A, C = dual_functions(covered, self._precedence(ratio[dofs], dofs))
         turned = turning(surface.shape, x[facets], surface.sign[facets])
         at = SegmentPoints(
             surface.shape, segments, pairs, surface.nodes[facets], nodes, planes, turned, A, b, phi, N, to_gap, to_shapes
         )
-        return self._gather(covered, C, at, facets, nearest)
+        return self._gather(covered, C, at, facets, ratio[self.nodes], nearest)
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Segments against a mesh (collective)."""
@@ -211,18 +219,22 @@ class Mortar(NodeToSurface):
         s = Segments(row[i], xi[i], none, weight[i], p.gap[i] / lean[i])
         return Pieces(s, np.arange(m), p.normal[i] / lean[i, None], np.zeros((len(i), 0, g)), none, np.zeros((m, 0), np.int64))
 
-    def _precedence(self, covered: Covered, facets: Ints) -> Array:
-        """Order in which nodes take in what is hardly covered, alike on all ranks ``(m, nn)`` (collective).
+    def _precedence(self, ratio: Array, dofs: Indices) -> Array:
+        """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
 
         A node's equation may take in nodes that come after it, so that no equation follows itself: middles come before vertices.
-        """
-        dofs = self.surface.dofs[facets]
-        part, full = (self.config.to_owners(dofs.ravel(), values.ravel())[dofs] for values in (covered.D, covered.full))
-        ratio = part / np.where(full > 0, full, 1.0)
-        well = 1.0 + self.basis.rank + 0.5 * np.round(np.minimum(ratio, 1.0), 6) + 1e-7 * self._code[dofs]
-        return np.where(ratio >= HARDLY_COVERED, well, ratio * (1 + 1e-7 * self._code[dofs]))
 
-    def _gather(self, covered: Covered, C: Array, at: SegmentPoints, facets: Ints, nearest: Projection) -> WeightedRows:
+        Args:
+            ratio: part of the node's share of all its facets that is covered ``(m, nn)``.
+            dofs: local nodes of the facets ``(m, nn)``.
+        """
+        code = 1e-7 * self._code[dofs]
+        well = 1.0 + self.basis.rank + 0.5 * np.round(np.minimum(ratio, 1.0), 6) + code
+        return np.where(ratio >= HARDLY_COVERED, well, ratio * (1 + code))
+
+    def _gather(
+        self, covered: Covered, C: Array, at: SegmentPoints, facets: Ints, ratio: Array, nearest: Projection
+    ) -> WeightedRows:
         """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
         config, n = self.config, len(self.nodes)
         own, e, normal, dofs = at.nodes, at.facet, -at.planes.normal, self.surface.dofs[facets]
@@ -258,7 +270,7 @@ class Mortar(NodeToSurface):
             gradients = replace(equations, **dict(zip(("row", "followed", "coefficients"), _add_up_terms(*parts))))
         seen = config.to_owners(dofs.ravel(), np.ones(dofs.size))[self.nodes] > 0
         share = np.where(is_covered, size / scale, 1.0)
-        return WeightedRows(equations, gradients, at, facets, is_covered, seen, size, share)
+        return WeightedRows(equations, gradients, at, facets, is_covered, seen, ratio, size, share)
 
     def _across(self, values: Array, direction: Array, dofs: Indices) -> Array:
         """Coefficients ``(m, nr, nn, gdim)`` of facets' nodes without what their own equations eliminate there (collective)."""
@@ -283,9 +295,15 @@ class Mortar(NodeToSurface):
         return placement.gap + self._along(rows.gradients, du)
 
     def off(self, placement: Placement, state: PairState) -> Bools:
-        """Contactors near the target that it does not cover."""
+        """Contactors near the target that it does not cover, or that it has let go of in this step and hardly covers again.
+
+        A target that springs back when its end lets go would cover the contactor's last bit again, for ever.
+        """
         rows: WeightedRows = placement.details
-        return rows.near & ~rows.covered if self.target.n_nodes else np.zeros(len(self.nodes), dtype=bool)
+        if not self.target.n_nodes:
+            return np.zeros(len(self.nodes), dtype=bool)
+        hardly = (state.slips > 0) & (rows.ratio < COVERED_AGAIN)
+        return np.where(rows.near, ~rows.covered | hardly, super().off(placement, state))
 
     def at_end(self, placement: Placement, state: PairState) -> Bools:
         """No end holds contactors: what is covered of them fades away."""
