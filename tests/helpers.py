@@ -48,16 +48,22 @@ M = oedometric()
 serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
 
 
-def refused(error: type[Exception], words: str | Iterable[str], call: Callable[[], object]) -> Exception:
-    """The same error on all ranks, a UEMError of this class, with all these words in its message (collective)."""
-    with pytest.raises(error) as caught:
+def raised(error: type[Exception], match: str, call: Callable[[], object]) -> Exception:
+    """The same error on all ranks, of this class and of no other of the package's, with a message that matches (collective)."""
+    with pytest.raises(error, match=match) as caught:
         call()
-    message = str(caught.value)
-    assert isinstance(caught.value, uem.UEMError)
-    for text in (words,) if isinstance(words, str) else words:
-        assert text in message, message
-    assert len(set(MPI.COMM_WORLD.allgather(f"{type(caught.value).__name__}: {message}"))) == 1
+    assert caught.type is error or not issubclass(error, uem.UEMError)
+    assert len(set(MPI.COMM_WORLD.allgather(f"{type(caught.value).__name__}: {caught.value}"))) == 1
     return caught.value
+
+
+def refused(error: type[Exception], words: str | Iterable[str], call: Callable[[], object]) -> Exception:
+    """Likewise, a UEMError with all these words in its message (collective)."""
+    found = raised(error, "", call)
+    assert isinstance(found, uem.UEMError)
+    for text in (words,) if isinstance(words, str) else words:
+        assert text in str(found)
+    return found
 
 
 def gathered_matrix(A: PETSc.Mat) -> Array:

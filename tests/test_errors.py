@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, linear, modulus, run, scene, st_venant
+from helpers import at, blocks, box, clamp, linear, modulus, raised, run, scene, st_venant
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -24,20 +24,9 @@ def problem_of(b, *contacts, F=None, **options):
     return uem.UnitedProblem(F, b.u, bcs=options.pop("bcs", clamp(b.V, b.bottom)), contacts=contacts, **options)
 
 
-def on_every_rank(error, match, call):
-    """The same error with the same message on all ranks."""
-    with pytest.raises(error, match=match) as caught:
-        call()
-    messages = COMM.allgather(str(caught.value))
-    assert len(set(messages)) == 1
-    assert caught.type is error
-    assert set(COMM.allgather(caught.type.__name__)) == {error.__name__}
-    return caught.value
-
-
 def test_agree_raises_the_first_error_on_all_ranks():
     error = uem.SurfaceError(f"from rank {COMM.rank}") if COMM.rank == COMM.size - 1 else None
-    on_every_rank(uem.SurfaceError, f"from rank {COMM.size - 1}", lambda: agree(COMM, error))
+    raised(uem.SurfaceError, f"from rank {COMM.size - 1}", lambda: agree(COMM, error))
     agree(COMM, None)
 
 
@@ -49,30 +38,30 @@ def test_empty_tag(role):
     b = blocks(COMM, "triangle", 2, 2)
     nothing = uem.Tag("nothing", 9, 1, b.scene.mesh, np.zeros(0, np.int32))
     pair = (nothing, b.low) if role == "contactor" else (b.high, nothing)
-    on_every_rank(uem.TagError, f"{role} '+nothing'+ holds no facets", lambda: problem_of(b, uem.Contact(*pair)))
+    raised(uem.TagError, f"{role} '+nothing'+ holds no facets", lambda: problem_of(b, uem.Contact(*pair)))
 
 
 def test_tag_of_cells():
     b = blocks(COMM, "triangle", 2, 2)
     cells = uem.Tag("body", 1, 2, b.scene.mesh, np.arange(2, dtype=np.int32))
-    on_every_rank(uem.TagError, "dimension 2.*expected facets, dimension 1", lambda: problem_of(b, uem.Contact(cells, b.low)))
+    raised(uem.TagError, "dimension 2.*expected facets, dimension 1", lambda: problem_of(b, uem.Contact(cells, b.low)))
 
 
 def test_tag_of_another_mesh():
     b, other = blocks(COMM, "triangle", 2, 2), blocks(COMM, "triangle", 2, 2)
-    on_every_rank(uem.SpaceError, "another mesh", lambda: problem_of(b, uem.Contact(b.high, other.low)))
-    on_every_rank(uem.SpaceError, "another mesh", lambda: problem_of(b, uem.Contact(other.high, b.low)))
+    raised(uem.SpaceError, "another mesh", lambda: problem_of(b, uem.Contact(b.high, other.low)))
+    raised(uem.SpaceError, "another mesh", lambda: problem_of(b, uem.Contact(other.high, b.low)))
 
 
 def test_contactor_is_its_own_target():
     b = blocks(COMM, "tetrahedron", 2, 2)
-    on_every_rank(uem.SurfaceError, "share the node at", lambda: problem_of(b, uem.Contact(b.high, b.high)))
+    raised(uem.SurfaceError, "share the node at", lambda: problem_of(b, uem.Contact(b.high, b.high)))
 
 
 def test_contactor_touches_its_target_in_one_node():
     b = blocks(COMM, "triangle", 2, 2)
     side = b.scene.tag("side", 0, at(0, 0.0))
-    error = on_every_rank(uem.SurfaceError, "share the node at", lambda: problem_of(b, uem.Contact(side, b.low)))
+    error = raised(uem.SurfaceError, "share the node at", lambda: problem_of(b, uem.Contact(side, b.low)))
     assert "'side'" in str(error) and "'low'" in str(error)
 
 
@@ -89,14 +78,14 @@ def test_target_between_two_cells(cell):
     u = fem.Function(V)
     inside, high = s.tag("inside", 0, at(g - 1, 0.5)), s.tag("high", 1, at(g - 1, 1.5))
     F = linear(u, fem.Constant(s.mesh, PETSc.ScalarType(1.0)))
-    on_every_rank(
+    raised(
         uem.OrientationError, "'inside'.*between two cells", lambda: uem.UnitedProblem(F, u, contacts=[uem.Contact(high, inside)])
     )
 
 
 def test_contact_before_its_problem():
     b = blocks(COMM, "triangle", 2, 2)
-    on_every_rank(uem.SurfaceError, "belongs to no problem yet", lambda: uem.Contact(b.high, b.low).resultant())
+    raised(uem.SurfaceError, "belongs to no problem yet", lambda: uem.Contact(b.high, b.low).resultant())
 
 
 @pytest.mark.parametrize("option,value", [("sliding", "infinite"), ("normals", "smooth")])
@@ -125,14 +114,14 @@ def test_scalar_displacement():
     u = fem.Function(compat.function_space(b.scene.mesh, 1))
     v = ufl.TestFunction(u.function_space)
     F = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
-    on_every_rank(uem.SpaceError, "1 component.*vector Lagrange space of size 2", lambda: uem.UnitedProblem(F, u))
+    raised(uem.SpaceError, "1 component.*vector Lagrange space of size 2", lambda: uem.UnitedProblem(F, u))
 
 
 def test_three_components_in_the_plane():
     b = blocks(COMM, "triangle", 2, 2)
     u = fem.Function(compat.function_space(b.scene.mesh, 1, (3,)))
     v = ufl.TestFunction(u.function_space)
-    on_every_rank(uem.SpaceError, "3 component.*size 2", lambda: uem.UnitedProblem(ufl.inner(u, v) * ufl.dx, u))
+    raised(uem.SpaceError, "3 component.*size 2", lambda: uem.UnitedProblem(ufl.inner(u, v) * ufl.dx, u))
 
 
 def test_surface_in_space():
@@ -141,19 +130,19 @@ def test_surface_in_space():
     s = scene(COMM, "triangle", [flat.mapped(lambda x: np.column_stack([x, 0 * x[:, 0]]))])
     u = fem.Function(compat.function_space(s.mesh, 1, (3,)))
     F = ufl.inner(ufl.grad(u), ufl.grad(ufl.TestFunction(u.function_space))) * ufl.dx
-    on_every_rank(uem.SpaceError, "dimension 2 in 3D", lambda: uem.UnitedProblem(F, u))
+    raised(uem.SpaceError, "dimension 2 in 3D", lambda: uem.UnitedProblem(F, u))
 
 
 def test_cubic_displacement():
     b = blocks(COMM, "triangle", 2, 2, degree=3)
-    on_every_rank(uem.SpaceError, "degree 3.*degree 1 or 2", lambda: problem_of(b))
+    raised(uem.SpaceError, "degree 3.*degree 1 or 2", lambda: problem_of(b))
 
 
 def test_residual_without_the_displacement():
     b = blocks(COMM, "triangle", 2, 2)
     other = fem.Function(b.V)
     F = linear(other, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0)))
-    on_every_rank(uem.SpaceError, "does not depend on u", lambda: uem.UnitedProblem(F, b.u))
+    raised(uem.SpaceError, "does not depend on u", lambda: uem.UnitedProblem(F, b.u))
 
 
 # -- initial penetration -----------------------------------------------------------------------------------------------
@@ -161,7 +150,7 @@ def test_residual_without_the_displacement():
 
 def test_initial_penetration_beyond_the_bound():
     b = blocks(COMM, "triangle", 2, 4, gap=-0.02, overhang=0.25)
-    error = on_every_rank(
+    error = raised(
         uem.PenetrationError,
         "0.02 inside the target.*max_penetration = 0.01",
         lambda: problem_of(b, uem.Contact(b.high, b.low, max_penetration=0.01)),
@@ -186,7 +175,7 @@ def test_initial_penetration_below_the_bound_is_resolved(caplog):
 def test_deep_default_bound():
     """Without a bound of one's own it is 5 % of the model's size."""
     b = blocks(COMM, "triangle", 2, 4, gap=-0.3, overhang=0.25)
-    on_every_rank(uem.PenetrationError, "0.3 inside", lambda: problem_of(b, uem.Contact(b.high, b.low)))
+    raised(uem.PenetrationError, "0.3 inside", lambda: problem_of(b, uem.Contact(b.high, b.low)))
 
 
 # -- the loop ----------------------------------------------------------------------------------------------------------
@@ -199,7 +188,7 @@ def test_nan_in_the_residual():
     if COMM.rank == COMM.size - 1:
         E.x.array[0] = np.nan
     problem = problem_of(b, uem.Contact(b.high, b.low), F=linear(b.u, E), bcs=b.oedometer(0.01))
-    on_every_rank(uem.NotFiniteError, "not finite", lambda: problem.solve())
+    raised(uem.NotFiniteError, "not finite", lambda: problem.solve())
     assert not b.u.x.array.any()
 
 
@@ -237,7 +226,7 @@ def test_inverted_element():
     problem = problem_of(
         b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 1.0)), bcs=b.oedometer(2.5), line_search=False
     )
-    on_every_rank(uem.InvertedElementError, r"cell at \[.*inside out", lambda: problem.solve())
+    raised(uem.InvertedElementError, r"cell at \[.*inside out", lambda: problem.solve())
     assert not b.u.x.array.any()
 
 
@@ -246,7 +235,7 @@ def test_no_convergence():
     problem = problem_of(
         b, uem.Contact(b.high, b.low), F=st_venant(b.u, modulus(b.scene, 1.0, 3.0)), bcs=b.oedometer(0.2), max_iterations=2
     )
-    error = on_every_rank(uem.ConvergenceError, "no convergence in 2 iterations.*smaller load steps", lambda: problem.solve())
+    error = raised(uem.ConvergenceError, "no convergence in 2 iterations.*smaller load steps", lambda: problem.solve())
     assert [i.active for i in error.history] == [5, 5, 5]
     assert error.history[-1].linear_iterations == 0 and error.history[-1].residual > 1e-8
     assert not b.u.x.array.any()
@@ -258,7 +247,7 @@ def test_prescribed_normal_of_a_contactor(target):
     b = blocks(COMM, "triangle", 2, 4)
     contact = uem.Contact(b.high, b.low if target == "prescribed" else uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.low, 1), *clamp(b.V, b.high, 1, value=-0.01)]
-    on_every_rank(uem.ConflictError, "prescribed.*neither body can give way", lambda: run(problem_of(b, contact, bcs=bcs)))
+    raised(uem.ConflictError, "prescribed.*neither body can give way", lambda: run(problem_of(b, contact, bcs=bcs)))
 
 
 # -- backends ----------------------------------------------------------------------------------------------------------
@@ -271,9 +260,7 @@ def test_prescribed_normal_of_a_contactor(target):
 def test_missing_backend(monkeypatch, backend, options):
     monkeypatch.setattr(linear_solver, f"has_{backend}", lambda: False)
     b = blocks(COMM, "triangle", 2, 2)
-    error = on_every_rank(
-        uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options)
-    )
+    error = raised(uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options))
     assert "use" in str(error)
 
 
@@ -294,7 +281,7 @@ def test_linear_solver_that_gives_up():
     b = blocks(COMM, "triangle", 2, 4)
     options = {"ksp_type": "cg", "pc_type": "none", "ksp_max_it": 2, "ksp_rtol": 1e-12}
     problem = problem_of(b, uem.Contact(b.high, b.low), bcs=b.oedometer(0.01), petsc_options=options)
-    on_every_rank(uem.LinearSolveError, "cg.*KSP reason", lambda: problem.solve())
+    raised(uem.LinearSolveError, "cg.*KSP reason", lambda: problem.solve())
     assert not b.u.x.array.any()
 
 

@@ -90,7 +90,7 @@ class LagrangeSystem(BodySystem):
         self._restriction = state.test
         load = self._A * state.trial.c
         load.axpy(1.0, self.forces.residual)
-        driving = state.test.reduce(state.test.pass_on(load))
+        driving = state.test.transpose(load)
         driving.scale(-1.0)
         return driving
 

@@ -221,7 +221,7 @@ def test_vector_maps_are_those_of_the_matrix(name):
     rng = np.random.default_rng(0)
     y, q = rng.normal(size=case.size), rng.normal(size=case.size)
     like = r.P.createVecLeft()
-    reduced = r.reduce(r.pass_on(scattered(y, like)))
+    reduced = r.transpose(scattered(y, like))
     assert np.allclose(gathered_vector(reduced), P.T @ y, atol=1e-14, rtol=1e-14)
     assert np.allclose(gathered_vector(r.expand(scattered(q, like))), P @ q, atol=1e-14, rtol=1e-14)
 
@@ -240,7 +240,7 @@ def test_united_increment_solves_the_saddle_point_problem(name):
     solver = UnitedSolver(case.config, "restriction_", DIRECT)
     solver.set_operator(r, K, None)
     f = scattered(force, K.createVecLeft())
-    rhs = r.reduce(r.pass_on(f - K * r.c))
+    rhs = r.transpose(f - K * r.c)
     dq, _ = solver.solve(rhs)
     du = r.expand(dq)
     du.axpy(1.0, r.c)

@@ -16,9 +16,9 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
+from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.time_steps import _refuse_given_energy
-from uem_dolfinx.solve.tunnelling import check_tunnelling
 
 COMM = MPI.COMM_WORLD
 
@@ -122,7 +122,7 @@ class Passing:
         self.problem.system.place(returning=False)
 
     def check(self):
-        check_tunnelling(self.problem.config, self.problem.pairs, self.start)
+        refuse_passages(self.problem.config, self.problem.pairs, self.start, [None], moving=True)
 
 
 def test_depth_of_a_passage():

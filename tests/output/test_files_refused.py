@@ -5,11 +5,13 @@ Read ``test_full_disk`` and ``test_folder_that_cannot_be_made`` first.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 
 from mpi4py import MPI
 
 import pytest
+from helpers import raised
 from resting_scenes import Bar
 from results_scenes import pressed, rows, series, small_disk, strains
 
@@ -27,17 +29,22 @@ def without_vtx(monkeypatch):
     monkeypatch.setattr(compat, "has_vtx", lambda: False)
 
 
-def alike(kind, match, call):
-    """The same error on every rank, after which all ranks can still meet."""
-    with pytest.raises(kind, match=match) as caught:
-        call()
-    assert len(set(COMM.allgather((type(caught.value), str(caught.value))))) == 1
-
-
 def picture(path):
     pytest.importorskip("matplotlib")
     with uem.figure(path, COMM):
         pass
+
+
+@contextmanager
+def filled_disk(folder, size, left):
+    """A disk of so many bytes at the folder, of which so many are left."""
+    with small_disk(COMM, folder, size) as permitted:
+        if not permitted:
+            pytest.skip("this system does not permit to mount a disk")
+        if COMM.rank == 0:
+            (folder / "filler").write_bytes(b"x" * (size - left))
+        COMM.barrier()
+        yield
 
 
 MAKERS = {
@@ -57,10 +64,10 @@ def test_folder_that_cannot_be_made(what, folder):
     if COMM.rank == 0:
         (folder / "out").write_text("in the way")
     COMM.barrier()
-    alike(
+    raised(
         uem.OutputError, "out.*cannot be written .*: check the folder, its rights", lambda: MAKERS[what](folder / "out" / "run")
     )
-    alike(OSError, "out", lambda: MAKERS[what](folder / "out" / "deeper" / "run"))
+    raised(OSError, "out", lambda: MAKERS[what](folder / "out" / "deeper" / "run"))
 
 
 @pytest.mark.parametrize("ending", [".xdmf", ".bin", ".csv"])
@@ -68,7 +75,7 @@ def test_folder_where_a_file_should_be(ending, folder):
     if COMM.rank == 0:
         (folder / f"run{ending}").mkdir()
     COMM.barrier()
-    alike(uem.OutputError, "run.*cannot be written", lambda: MAKERS["results"](folder / "run"))
+    raised(uem.OutputError, "run.*cannot be written", lambda: MAKERS["results"](folder / "run"))
 
 
 @pytest.mark.parametrize("rank", sorted({0, COMM.size - 1}))
@@ -84,7 +91,7 @@ def test_numbers_that_one_rank_cannot_write(rank, folder, monkeypatch):
     with monkeypatch.context() as patch:
         if COMM.rank == rank:
             patch.setattr(xdmf, "write_at", full)
-        alike(uem.OutputError, "run.xdmf cannot be written .no space left.", lambda: writer.write(1.0))
+        raised(uem.OutputError, "run.xdmf cannot be written .no space left.", lambda: writer.write(1.0))
     writer.write(2.0)
     writer.close()
     COMM.barrier()
@@ -95,14 +102,8 @@ def test_numbers_that_one_rank_cannot_write(rank, folder, monkeypatch):
 @pytest.mark.parametrize("kilobytes", [0, 4, 12, 16, 24, 40])
 def test_full_disk(kilobytes, folder):
     """Wherever the disk becomes full - in numbers, XDMF or CSV, or at the very beginning."""
-    with small_disk(COMM, folder, 2**20) as permitted:
-        if not permitted:
-            pytest.skip("this system does not permit to mount a disk")
-        problem = pressed(COMM, "triangle")
-        if COMM.rank == 0:
-            (folder / "filler").write_bytes(b"x" * (2**20 - 1024 * kilobytes))
-        COMM.barrier()
-        written = []
+    with filled_disk(folder, 2**20, 1024 * kilobytes):
+        problem, written = pressed(COMM, "triangle"), []
 
         def run():
             writer = uem.ResultsWriter(folder / "run", problem)
@@ -110,7 +111,7 @@ def test_full_disk(kilobytes, folder):
                 writer.write(float(len(written)))
                 written.append(len(written))
 
-        alike(uem.OutputError, "run.* cannot be written .*: check the folder, its rights and its free space", run)
+        raised(uem.OutputError, "run.* cannot be written .*: check the folder, its rights and its free space", run)
         assert len(set(COMM.allgather(len(written)))) == 1 and (len(written) > 0) == (kilobytes > 4)
         if written:
             COMM.barrier()
@@ -122,21 +123,15 @@ def test_full_disk(kilobytes, folder):
 @pytest.mark.parametrize("resume", [False, True])
 def test_full_disk_under_a_table(resume, folder):
     """What is written of a row that does not fit is taken back; with space the next row follows the last whole one."""
-    with small_disk(COMM, folder, 2**16) as permitted:
-        if not permitted:
-            pytest.skip("this system does not permit to mount a disk")
-        problem = pressed(COMM, "triangle")
-        if COMM.rank == 0:
-            (folder / "filler").write_bytes(b"x" * (2**16 - 2**12))
-        COMM.barrier()
-        history, written = uem.HistoryWriter(folder / "run.csv", problem, resume=resume), []
+    with filled_disk(folder, 2**16, 2**12):
+        history, written = uem.HistoryWriter(folder / "run.csv", pressed(COMM, "triangle"), resume=resume), []
 
         def run():
             while True:
                 history.write(float(len(written)))
                 written.append(float(len(written)))
 
-        alike(uem.OutputError, "run.csv cannot be written .*[Nn]o space left", run)
+        raised(uem.OutputError, "run.csv cannot be written .*[Nn]o space left", run)
         if COMM.rank == 0:
             (folder / "filler").unlink()
         COMM.barrier()
@@ -150,14 +145,14 @@ def test_drawing_that_fails(folder):
     """What rank 0 alone draws, and what users hand it, fails on all ranks alike."""
     pytest.importorskip("matplotlib")
     problem = pressed(COMM, "triangle")
-    alike(ValueError, "no such colours", lambda: uem.plot_scene(problem, folder / "a.png", cmap="no such colours"))
+    raised(ValueError, "no such colours", lambda: uem.plot_scene(problem, folder / "a.png", cmap="no such colours"))
 
     def curve(s):
         raise ZeroDivisionError("no such curve")
 
-    alike(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, folder / "b.png", reference=curve))
+    raised(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, folder / "b.png", reference=curve))
     with uem.figure(folder / "c.png", COMM) as (panel,):
-        alike(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, panel, reference=curve))
+        raised(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, panel, reference=curve))
 
 
 class Unsendable(Exception):

@@ -14,6 +14,7 @@ import helpers
 import numpy as np
 import pytest
 from dolfinx import fem, mesh
+from helpers import raised
 from ramp_scenes import RAMPS
 from resting_scenes import Bar
 from results_scenes import pressed, rows, same_series, series, strains
@@ -188,9 +189,8 @@ def test_results_that_cannot_be_gone_on_with(other, match, folder):
     before = contents(folder)
     problem = begun(**{k: v for k, v in other.items() if k in ("shuffle", "n_low")})
     fields = {name: problem.u[1] for name in other.get("fields", {"u2": ""})}
-    with pytest.raises(uem.CheckpointError, match=match) as caught:
-        uem.ResultsWriter(folder / "run", problem, fields=fields, resume=True)
-    assert len(set(COMM.allgather(str(caught.value)))) == 1 and contents(folder) == before
+    raised(uem.CheckpointError, match, lambda: uem.ResultsWriter(folder / "run", problem, fields=fields, resume=True))
+    assert contents(folder) == before
 
 
 def test_steps_after_the_checkpoint_are_replaced(folder):

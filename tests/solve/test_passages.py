@@ -23,18 +23,29 @@ from uem_dolfinx.solve.passages import refuse_passages
 COMM = MPI.COMM_WORLD
 
 
-def boundary(s, body, part):
+def boundary(s, body, part, name="plate"):
     """The whole boundary of a box as a tag."""
     sides = [
         s.tag("side", body, at(axis, value)).entities
         for axis in range(part.x.shape[1])
         for value in (part.x[:, axis].min(), part.x[:, axis].max())
     ]
-    return uem.Tag("plate", 1, s.mesh.topology.dim - 1, s.mesh, np.unique(np.concatenate(sides)).astype(np.int32))
+    return uem.Tag(name, 1, s.mesh.topology.dim - 1, s.mesh, np.unique(np.concatenate(sides)).astype(np.int32))
 
 
-def plate_and_block(cell="quadrilateral", thick=0.1, gap=0.05, push=(0.0, -0.7), lift=0.0, layers=1, degree=1, comm=COMM):
-    """A block above a plate that is clamped at its ends, whose whole boundary is the target: the problem and its contact.
+def plate_and_block(
+    cell="quadrilateral",
+    thick=0.1,
+    gap=0.05,
+    push=(0.0, -0.7),
+    lift=0.0,
+    layers=1,
+    degree=1,
+    fine=1,
+    contactor="block",
+    comm=COMM,
+):
+    """A block above a plate that is clamped at its ends; the whole boundary of one is the target: the problem and its contact.
 
     Args:
         cell: kind of cells.
@@ -44,18 +55,22 @@ def plate_and_block(cell="quadrilateral", thick=0.1, gap=0.05, push=(0.0, -0.7),
         lift: displacement of the plate's ends across it.
         layers: of cells in the plate.
         degree: of the displacement.
+        fine: how many times finer both meshes are in 2D.
+        contactor: whose side that faces the other body touches its whole boundary.
         comm: communicator.
     """
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     wide, n = [0.3] * (g - 2), [2] * (g - 2)
-    plate = box(cell, [-1.0, *(-w for w in wide), -thick], [1.0, *wide, 0.0], [20 if g == 2 else 10, *n, layers])
-    block = box(
-        cell, [-0.2, *(-0.5 * w for w in wide), gap], [0.2, *(0.5 * w for w in wide), gap + 0.3], [5, 3] if g == 2 else [3, 2, 2]
-    )
+    plate = box(cell, [-1.0, *(-w for w in wide), -thick], [1.0, *wide, 0.0], [20 * fine if g == 2 else 10, *n, layers * fine])
+    cells = [5 * fine, 3 * fine] if g == 2 else [3, 2, 2]
+    block = box(cell, [-0.2, *(-0.5 * w for w in wide), gap], [0.2, *(0.5 * w for w in wide), gap + 0.3], cells)
     s = scene(comm, cell, [plate, block])
     V = compat.function_space(s.mesh, degree, (g,))
     u = fem.Function(V)
-    contact = uem.Contact(s.tag("block", 1, at(g - 1, gap)), boundary(s, 0, plate))
+    if contactor == "block":
+        contact = uem.Contact(s.tag("block", 1, at(g - 1, gap)), boundary(s, 0, plate))
+    else:
+        contact = uem.Contact(s.tag("plate", 0, at(g - 1, 0.0)), boundary(s, 1, block, "block"))
     ends = [s.tag("end", 0, at(0, x)) for x in (-1.0, 1.0)]
     bcs = clamp(V, s.tag("top", 1, at(g - 1, gap + 0.3)), value=[push[0], *[0.0] * (g - 2), push[1]])
     for end in ends:
@@ -85,6 +100,37 @@ def test_a_plate_is_not_passed(how):
         forces.append(contact.resultant().force)
     assert forces[1][-1] > 1e-5
     assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-7 * forces[1][-1])
+
+
+WRAPPED = [
+    {"thick": 0.2, "fine": 2},
+    {"thick": 0.1, "fine": 2, "push": (0.0, -1.0)},
+    {"thick": 0.05, "push": (0.3, -0.7)},
+    {"thick": 0.2, "degree": 2},
+    {"cell": "triangle", "thick": 0.2, "fine": 2},
+    {"cell": "triangle", "thick": 0.1, "degree": 2, "push": (0.0, -1.0)},
+]
+
+
+@pytest.mark.parametrize("how", WRAPPED, ids=str)
+def test_a_plate_wraps_the_right_faces(how):
+    """Nodes of the plate that come from beside the block's edge end on the faces that small steps bring them to."""
+    forces = []
+    for steps in (1, 20):
+        problem, contact = plate_and_block(contactor="plate", **how)
+        taken = run(problem, steps)
+        forces.append(contact.resultant().force)
+    assert steps == len(taken) and abs(forces[1][-1]) > 1e-5
+    assert forces[0] == pytest.approx(forces[1], rel=1e-5, abs=1e-5 * np.abs(forces[1]).max())
+
+
+def test_a_single_solve_names_the_edge():
+    problem, _ = plate_and_block(contactor="plate", thick=0.2, fine=2)
+    with pytest.raises(
+        uem.TunnellingError,
+        match=r"plate on block: the contactor at \(.*\) comes to a face beside an edge of the target within a step",
+    ):
+        problem.solve()
 
 
 @pytest.mark.parametrize("gap", [0.05, 0.2])

@@ -227,6 +227,10 @@ class Restriction:
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
         return self._vector(q)
 
+    def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
+        """``P'F``."""
+        return self.reduce(self.pass_on(F))
+
     def multipliers(self, y: PETSc.Vec) -> Array:
         """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed."""
         nodal = y.array_r.reshape(-1, self.config.gdim)

@@ -206,7 +206,7 @@ class Dynamics:
         M = self.mass.M.copy() if restriction.M is None else self.mass.M.PtAP(restriction.P)
         if restriction.M is None:
             restriction.cross_out(M)
-        rhs = restriction.reduce(restriction.pass_on(F))
+        rhs = restriction.transpose(F)
         diagonal = M.getDiagonal()
         idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
         diagonal.array[idle], rhs.array[idle] = 1.0, 0.0

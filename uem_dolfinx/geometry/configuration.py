@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 
 from mpi4py import MPI
@@ -60,6 +62,17 @@ class Configuration:
     def x(self) -> Array:
         """Current positions of the local nodes ``(n_local, gdim)``, ghosts included."""
         return self.X + self.displacement
+
+    @contextmanager
+    def at(self, displacement: Array) -> Iterator[None]:
+        """For a while, the nodes where another displacement takes them ``(n_local incl. ghosts,)``, which is flat."""
+        u = self.u.x.array
+        kept = np.array(u)
+        u[:] = displacement
+        try:
+            yield
+        finally:
+            u[:] = kept
 
     def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
         """Global block numbers of local nodes."""

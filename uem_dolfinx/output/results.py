@@ -22,7 +22,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
 
 #: Endings of VTX files, by the rank of what is in them.
-KINDS = ("scalars", "vectors")
+ENDINGS = ("scalars", "vectors")
 
 
 class HistoryWriter(Closing):
@@ -147,7 +147,7 @@ class ResultsWriter(Closing):
         def move() -> None:
             self._stem.parent.mkdir(parents=True, exist_ok=True)
             own = [self._name(ending) for ending in (".xdmf", ".bin", ".h5", ".csv")]
-            begin = tuple(f"{self._stem.name}_{kind}." for kind in KINDS)
+            begin = tuple(f"{self._stem.name}_{ending}." for ending in ENDINGS)
             own += [f for f in sorted(self._stem.parent.iterdir()) if f.name.startswith(begin) and f.suffix == ".bp"]
             xdmf, csv = self._name(".xdmf"), self._name(".csv")
             if (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1):
@@ -168,10 +168,10 @@ class ResultsWriter(Closing):
     def _open_vtx(self) -> list[Any]:
         """VTX files, beside those that are there (collective)."""
         opened, comm = [], self.problem.comm
-        for rank, kind in enumerate(KINDS):
+        for rank, ending in enumerate(ENDINGS):
             functions = [u for u in self._sources().values() if len(u.ufl_shape) == rank]
             if self._wants_vtx and functions:
-                stem = self._name(f"_{kind}")
+                stem = self._name(f"_{ending}")
                 first = stem.with_name(f"{stem.name}.bp")
 
                 def free(first: Path = first) -> Path:

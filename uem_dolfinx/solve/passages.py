@@ -2,7 +2,9 @@
 
 What counts is the converged step, not the iterates of Newton's method: the straight ways of contactors and target from the committed
 to the new configuration. A contactor passes if it enters the target in one place and leaves it in another that faces away from the
-first. One that only cuts an edge or a crest short, or slides past an end, comes to the same place by shorter steps.
+first. One that only cuts an edge or a crest short, or slides past an end, comes to the same place by shorter steps; in motion it has
+missed a blow. One that touches at the end has come to the wrong face if it comes from behind this, or from the sector in front of
+both faces of an edge, where a straight way does not tell which of them it meets.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.checks import CORNER
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -19,14 +22,21 @@ from uem_dolfinx.geometry.crossings import Crossings, find_crossings
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import Exchange, agree
-from uem_dolfinx.solve.tunnelling import MOST_PLACES, PASSAGE_DEPTH
 
+#: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
+#: [convention; the target's stride; test_thresholds_motion.py::test_depth_of_a_passage]
+PASSAGE_DEPTH = 0.1
+#: A step that would have to be examined at more places than this is too long.
+#: [bound; places; test_thresholds_motion.py::test_too_many_places]
+MOST_PLACES = 256
 #: Faces look away from each other if their normals' cosine is less: the sides of a plate do, those of a right-angled edge do not.
 #: [convention; cosine; test_passages.py::test_what_looks_away]
 LOOKING_AWAY = -0.5
 
 
-def refuse_passages(config: Configuration, pairs: Sequence[ContactPair], start: Array, motions: Sequence[Motion | None]) -> None:
+def refuse_passages(
+    config: Configuration, pairs: Sequence[ContactPair], start: Array, motions: Sequence[Motion | None], moving: bool = False
+) -> None:
     """Refuse a step that leads a contactor through its target (collective).
 
     Steps within which nothing moves by half a facet, or half the thickness of a body of one cell, are not looked at.
@@ -36,9 +46,10 @@ def refuse_passages(config: Configuration, pairs: Sequence[ContactPair], start: 
         pairs: of all contacts; those that keep their facets for a step cannot pass.
         start: displacement at the beginning ``(n_local incl. ghosts,)``.
         motions: of the pairs' rigid targets at the beginning.
+        moving: whether bodies have inertia, so that none may cut a crest short.
 
     Raises:
-        TunnellingError: naming a contactor.
+        TunnellingError: naming the deepest such contactor of the first rank that has one.
     """
     du = config.displacement - start.reshape(-1, config.gdim)
     looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.sliding == "finite"]
@@ -54,17 +65,25 @@ def refuse_passages(config: Configuration, pairs: Sequence[ContactPair], start: 
             continue
         if isinstance(pair.target, MeshTarget):
             total = all_ways[:, k, 2:].sum(axis=0)
-            passed = _through_mesh(pair, pair.target, start, du - total[:-1] / max(total[-1], 1.0))
+            depth = _through_mesh(pair, pair.target, start, du - total[:-1] / max(total[-1], 1.0), moving)
+            behind, unsure = _came_from(pair, pair.target, start)
         else:
-            passed = _through_surface(pair, ways[k][0], motion, longest)
-        error = None
-        if passed.any():
-            i = int(np.flatnonzero(passed)[0])
-            error = TunnellingError(
-                f"{pair.name}: the contactor at {config.describe(int(pair.nodes[i]))} passes through the target within a step: "
-                "take smaller steps"
-            )
-        agree(config.comm, error)
+            depth, behind = _through_surface(pair, ways[k][0], motion, longest, moving)
+            unsure = np.zeros(len(depth))
+        _refuse(pair, depth, "passes through the target within a step, {:.4g} inside on its way")
+        behind = np.where(behind > PASSAGE_DEPTH * pair.target.stride, behind, 0.0)
+        _refuse(pair, behind, "touches the target from behind after a step, {:.4g} inside on its way")
+        _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away")
+
+
+def _refuse(pair: ContactPair, by: Array, how: str) -> None:
+    """Raise if a contactor has passed, by a length that is positive ``(n,)`` (collective)."""
+    error = None
+    if (by > 0.0).any():
+        i = int(np.argmax(by))
+        where = pair.config.describe(int(pair.nodes[i]))
+        error = TunnellingError(f"{pair.name}: the contactor at {where} {how.format(by[i])}: take smaller steps")
+    agree(pair.config.comm, error)
 
 
 def _ways(pair: ContactPair, du: Array, motion: Motion | None) -> tuple[Array, Array]:
@@ -80,8 +99,8 @@ def _ways(pair: ContactPair, du: Array, motion: Motion | None) -> tuple[Array, A
 # -- meshed targets ------------------------------------------------------------------------------------------------------
 
 
-def _through_mesh(pair: ContactPair, target: MeshTarget, start: Array, du: Array) -> Bools:
-    """Contactors that pass through a mesh, from displacements ``du (n_local, gdim)`` relative to its mean ``(n,)`` (collective)."""
+def _through_mesh(pair: ContactPair, target: MeshTarget, start: Array, du: Array, moving: bool) -> Array:
+    """How deep contactors that pass are in a mesh, from displacements ``du (n_local, gdim)`` relative to its mean ``(n,)`` (collective)."""
     comm, points, way = pair.config.comm, pair.points, du[pair.nodes]
     moved = du[target.dofs]
     length = np.linalg.norm(way, axis=1) + max(comm.allgather(np.linalg.norm(moved, axis=2).max(initial=0.0)))
@@ -89,19 +108,24 @@ def _through_mesh(pair: ContactPair, target: MeshTarget, start: Array, du: Array
     # only those that the target could have met on its way
     p = pair.projection
     near = np.flatnonzero((length > target.stride) & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
+    depth = np.zeros(len(points))
     if not any(comm.allgather(len(near))):
-        return np.zeros(len(points), bool)
+        return depth
     found = _crossings(target, near, points[near] - way[near], points[near], moved, reach)
     entry, leaving, out = _entries_and_exits(found)
-    inside = (found.time[leaving] - found.time[entry]) * length[found.point[entry]]
-    away = _look_away(found.normal[entry], found.normal[leaving]) & (inside > reach)
-    passed = np.zeros(len(points), bool)
-    passed[found.point[entry[away]]] = True
+    i = found.point[entry]
+    cosine = _dot(found.normal[entry], found.normal[leaving])
+    # half of the way between two faces where they are parallel, less where they meet
+    inside = (found.time[leaving] - found.time[entry]) * length[i] * np.sqrt(np.maximum(1.0 - cosine, 0.0) / 8.0)
+    passed = (inside > reach) & ((cosine < LOOKING_AWAY) | (moving & ~pair.trial.active[i]))
+    np.maximum.at(depth, i[passed], inside[passed])
     # those that leave without having entered began inside, or on a curved facet that its pieces cut short
     i = np.unique(found.point[out])
     if any(comm.allgather(len(i))):
-        passed[found.point[out]] |= _look_away(_normals_at_start(pair, start, found.point[out]), found.normal[out])
-    return passed
+        i = found.point[out]
+        back = _dot(_normals_at_start(pair, start, i), found.normal[out]) < LOOKING_AWAY
+        depth[i[back]] = np.maximum(depth[i[back]], reach)
+    return depth
 
 
 def _crossings(target: MeshTarget, who: Ints, p0: Array, p1: Array, moved: Array, reach: float) -> Crossings:
@@ -137,36 +161,63 @@ def _entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
 
 def _normals_at_start(pair: ContactPair, start: Array, who: Ints) -> Array:
     """Normals of the target at contactors ``who (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
-    u = pair.config.u.x.array
-    end = np.array(u)
-    u[:] = start
-    p = pair.target.project(pair.points[who])
-    u[:] = end
+    with pair.config.at(start):
+        p = pair.target.project(pair.points[who])
     began = pair.committed.active[who] | (p.gap < 0.0)
     return np.where(began[:, None], p.normal, 0.0)
 
 
-def _look_away(a: Array, b: Array) -> Bools:
-    """Whether faces with normals ``a`` and ``b (k, gdim)`` look away from each other ``(k,)``."""
-    return np.asarray(np.einsum("kg,kg->k", a, b) < LOOKING_AWAY)
+def _came_from(pair: ContactPair, target: MeshTarget, start: Array) -> tuple[Array, Array]:
+    """Where contactors that have come to a mesh in a step began (collective).
+
+    Returns:
+        How far behind the facet that they touch, and, of those that began in front of both faces of an edge or nearer to another face,
+        how far from this facet; lengths ``(n,)``, zero for all others.
+    """
+    behind, unsure = np.zeros((2, len(pair.nodes)))
+    new = np.flatnonzero(pair.trial.active & ~pair.committed.active)
+    if any(pair.config.comm.allgather(len(new))):
+        with pair.config.at(start):
+            x = pair.points[new]
+            nearest, touched = target.project(x), target.project_on(x, pair.projection.facet[new])
+        behind[new] = np.where(nearest.gap >= 0.0, -touched.gap, 0.0)
+        outward, away = target.outward(nearest), x - nearest.foot
+        beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
+        beside &= ~(nearest.beyond != 0.0).any(axis=1)
+        # the mean of the normals about an edge leans from those of both faces
+        sharp = 1.0 / np.hypot(1.0, CORNER)
+        other = (beside & (_dot(nearest.averaged, outward) < sharp)) | (_dot(target.outward(touched), outward) < sharp)
+        way = np.linalg.norm(x - touched.foot, axis=1)
+        unsure[new] = np.where(other & (way > target.stride), way, 0.0)
+    return behind, unsure
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Products of vectors ``a`` and ``b (k, gdim)``: ``(k,)``."""
+    return np.asarray(np.einsum("kg,kg->k", a, b))
 
 
 # -- other targets -------------------------------------------------------------------------------------------------------
 
 
-def _through_surface(pair: ContactPair, way: Array, motion: Motion | None, longest: float) -> Bools:
-    """Contactors that pass through a surface without facets, by its gaps at places a stride apart ``(n,)`` (collective)."""
-    target, end = pair.target, pair.points
+def _through_surface(pair: ContactPair, way: Array, motion: Motion | None, longest: float, moving: bool) -> tuple[Array, Array]:
+    """Contactors that pass through a surface without facets, by its gaps at places a stride apart (collective).
+
+    Returns:
+        How deep those that pass are inside, and how far behind the place that they touch those have begun that have come to it in the
+        step; lengths ``(n,)``.
+    """
+    target, end, active = pair.target, pair.points, pair.trial.active
     places = np.ceil(longest / target.stride)
     if places > MOST_PLACES:
         raise TunnellingError(
-            f"{pair.name}: contactors move by {longest:.4g} past the target within a step, {places:.3g} times what they may pass "
-            "without being noticed: take smaller steps"
+            f"{pair.name}: the surfaces move by {longest:.4g} within a step, {places:.3g} times what a contactor may pass without being "
+            "noticed: take smaller steps"
         )
     now, still = target.motion, Motion.none(end.shape[1])
     turned = (now or still).since(motion or still, 1.0)
     start = turned.back(end - way)
-    passed, deep = np.zeros((2, len(end)), bool)
+    depth, deepest, behind = np.zeros((3, len(end)))
     entry = np.zeros_like(end)
     for k in range(int(places) + 1):
         part = k / places
@@ -175,8 +226,13 @@ def _through_surface(pair: ContactPair, way: Array, motion: Motion | None, longe
         if motion is not now:
             x = (now or still).since(motion or still, 1.0 - part).carry(x)
         p = target.project(x)
-        outside = (p.gap >= 0.0) | (k == 0) | ((k == places) & pair.trial.active)
-        passed |= outside & deep & _look_away(entry, p.normal)
-        deep = ~outside & (deep | (p.gap < -PASSAGE_DEPTH * target.stride))
+        if k == 0:
+            new = active & ~pair.committed.active & (p.gap >= 0.0)
+            behind[new] = np.einsum("ng,ng->n", end - x, pair.projection.normal)[new]
+        outside = (p.gap >= 0.0) | (k == 0) | ((k == places) & active)
+        passed = outside & (deepest > PASSAGE_DEPTH * target.stride)
+        passed &= (_dot(entry, p.normal) < LOOKING_AWAY) | (moving & ~active)
+        depth = np.where(passed, np.maximum(depth, deepest), depth)
+        deepest = np.where(outside, 0.0, np.maximum(deepest, -p.gap))
         entry = np.where(outside[:, None], p.normal, entry)
-    return passed
+    return depth, behind

@@ -198,7 +198,7 @@ class UnitedProblem:
                 heed=lambda: self.progress.heed(self.comm),
             )
             self.system.end_step()
-            refuse_passages(self.config, self.pairs, self.committed, self._motions)
+            refuse_passages(self.config, self.pairs, self.committed, self._motions, moving=self.dynamics is not None)
         except UEMError:
             self.restore()
             raise

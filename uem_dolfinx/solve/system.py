@@ -46,13 +46,11 @@ class _Rows:
     Attributes:
         equations: of every pair.
         independent: how those that got in each other's way were resolved; None if none could.
-        trial: P and c.
         test: Q.
     """
 
     equations: list[LabelledEquations]
     independent: IndependentEquations | None
-    trial: Restriction
     test: Restriction
 
 
@@ -196,22 +194,22 @@ class BodySystem:
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
             fallen = self.floating.fall_again(lambda: self.place(returning=False), unsettled, at_rest)
             if moved or fallen:
-                F, rows = forces.residual, self._rows()
-                residual = rows.test.reduce(rows.test.pass_on(F))
+                rows = self._rows()
+                residual = rows.test.transpose(forces.residual)
         return self._state(rows, residual, rounding, moved or fallen, at_rest and wrong == 0)
 
     def _rows(self) -> _Rows:
-        """Equations of all pairs in their present states, and P and Q (collective)."""
+        """Equations of all pairs in their present states, and Q (collective)."""
         equations = [pair.equations() for pair in self.pairs]
         Q, independent = self._restrict([e.test for e in equations])
-        P = Q if all(e.trial is e.test for e in equations) else self._restrict([e.trial for e in equations])[0]
-        return _Rows(equations, independent, P, Q)
+        return _Rows(equations, independent, Q)
 
     def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
-        """What the loop sees of these rows (collective)."""
+        """What the loop sees of these rows, with P (collective)."""
+        apart = any(e.trial is not e.test for e in rows.equations)
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=rows.trial,
+            trial=self._restrict([e.trial for e in rows.equations])[0] if apart else rows.test,
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -260,7 +258,7 @@ class BodySystem:
             rows = self._rows()
             # a body that is let go has to fall first
             self._adrift = self.floating.adrift
-            residual = rows.test.reduce(rows.test.pass_on(self.forces.residual))
+            residual = rows.test.transpose(self.forces.residual)
         return self._state(rows, residual, state.rounding, state.changed, False)
 
     def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
@@ -338,8 +336,7 @@ class BodySystem:
         Q belongs to the present normals: the old Q would take the turned contact forces for a residual.
         """
         self.place(returning=False)
-        Q = self.restriction()
-        return Q.reduce(Q.pass_on(self.forces.residual))
+        return self.restriction().transpose(self.forces.residual)
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
@@ -377,7 +374,7 @@ class BodySystem:
         if curvature is not None:
             load.axpy(1.0, curvature * c)
         load.axpy(1.0, self.forces.residual)
-        rhs = Q.reduce(Q.pass_on(load))
+        rhs = Q.transpose(load)
         rhs.scale(-1.0)
         return rhs
 

@@ -21,7 +21,6 @@ from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import between_steps
-from uem_dolfinx.solve.tunnelling import check_tunnelling
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
@@ -191,9 +190,7 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     assert problem.dynamics is not None
     problem.set_load(problem.dynamics.time + length)
     problem.dynamics.begin(length)
-    iterations = problem.attempt()
-    check_tunnelling(problem.config, problem.pairs, problem.committed)
-    return iterations
+    return problem.attempt()
 
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
