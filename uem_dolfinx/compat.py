@@ -78,7 +78,7 @@ def geometry_dofs(domain: Any) -> npt.NDArray[np.int32]:
     """Local geometry nodes of every cell in DOLFINx's order, vertices first ``(n_cells incl. ghosts, n_nodes)``."""
     geometry = domain.geometry
     dofmap = geometry.dofmaps[0] if DOLFINX_VERSION >= (0, 11) else geometry.dofmap
-    return cell_table(domain, dofmap)
+    return dofmap if isinstance(dofmap, np.ndarray) else cell_table(dofmap, geometry.cmap.create_dof_layout().num_dofs)
 
 
 def belongs_to(meshtags: Any, domain: Any) -> bool:
@@ -156,17 +156,12 @@ def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]
 
 def cell_dofs(V: Any) -> npt.NDArray[np.int32]:
     """Local blocked d.o.f. of every cell ``(n_cells incl. ghosts, n_blocks)``."""
-    return cell_table(V.mesh, V.dofmap.list)
+    return cell_table(V.dofmap.list, V.dofmap.dof_layout.num_dofs)
 
 
-def cell_table(domain: Any, rows: Any) -> npt.NDArray[np.int32]:
-    """Rows of equal length, one for each cell, from an array or an adjacency list."""
-    if isinstance(rows, np.ndarray):
-        return rows
-    cells = domain.topology.index_map(domain.topology.dim)
-    n_cells = cells.size_local + cells.num_ghosts
-    array = np.asarray(rows.array, dtype=np.int32)
-    return array.reshape(n_cells, -1) if n_cells else array.reshape(0, 1)
+def cell_table(rows: Any, width: int) -> npt.NDArray[np.int32]:
+    """Rows of so many numbers, one for each cell, from an array or an adjacency list; also where a rank has no cell."""
+    return np.asarray(getattr(rows, "array", rows), dtype=np.int32).reshape(-1, width)
 
 
 def lagrange_degree(V: Any) -> int | None:

@@ -47,9 +47,10 @@ def vertex_nodes(domain: Any) -> Indices:
     topology = domain.topology
     vertex_map = topology.index_map(0)
     topology.create_connectivity(topology.dim, 0)
-    vertices = compat.cell_table(domain, topology.connectivity(topology.dim, 0))
+    n_vertices = len(reference_topology(compat.cell_name(domain))[0])
+    vertices = compat.cell_table(topology.connectivity(topology.dim, 0), n_vertices)
     nodes = np.zeros(vertex_map.size_local + vertex_map.num_ghosts, dtype=np.int32)
-    nodes[vertices] = compat.geometry_dofs(domain)[:, : vertices.shape[1]]
+    nodes[vertices] = compat.geometry_dofs(domain)[:, :n_vertices]
     return nodes
 
 

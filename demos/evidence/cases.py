@@ -221,6 +221,7 @@ class BoxScene(Scene):
         pose: where the drawing's nodes ``(n, gdim)`` of each body, by its number, start.
         nu: Poisson's ratio.
         law: of the bodies.
+        degree: of the displacement.
     """
 
     def __init__(
@@ -230,6 +231,7 @@ class BoxScene(Scene):
         pose: Callable[[Array, int], Array] | None = None,
         nu: float = NU,
         law: type[Any] = uem.LinearElastic,
+        degree: int = 1,
     ):
         self.boxes, self.g = list(boxes), len(boxes[0].lo)
         parts = [box(cell, b.lo, b.hi, b.n) for b in boxes]
@@ -240,12 +242,12 @@ class BoxScene(Scene):
 
         made = scene(COMM, cell, parts, pose=posed)
         super().__init__(made.mesh, made.drawing, made.body)
-        self.V = compat.function_space(self.mesh, 1, (self.g,))
+        self.V = compat.function_space(self.mesh, degree, (self.g,))
         self.u = fem.Function(self.V, name="displacement")
         self.E = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="E")
         self.E.x.array[compat.cell_dofs(self.E.function_space)[:, 0]] = np.array([box.E for box in boxes])[self.body]
         self.material = law(self.E, nu, kind="plane_strain" if self.g == 2 else "3d")
-        self.F = self.material.residual(self.u, ufl.TestFunction(self.V)) * ufl.dx(degree=2)
+        self.F = self.material.residual(self.u, ufl.TestFunction(self.V)) * ufl.dx(degree=2 * degree)
         self.bcs: list[fem.DirichletBC] = []
         self.contacts: list[uem.Contact] = []
 

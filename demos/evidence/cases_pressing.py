@@ -1,15 +1,21 @@
-"""Cases of pressure that is hard to hold: edges and corners that dig in, and scenes drawn at random."""
+"""Cases of pressure that is hard to hold: round bodies, edges and corners that dig in, and scenes drawn at random."""
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
+from dolfinx import fem
 
 import uem_dolfinx as uem
-from evidence.cases import COMM, FORCE, Box, BoxScene, Case, Trial
-from evidence.cases_laws import check_laws
-from evidence.scenes import rotation
+from evidence.cases import BALANCE, COMM, FORCE, OVERLAP, Box, BoxScene, Case, Trial
+from evidence.cases_laws import check_laws, overlap
+from evidence.scenes import NU, rotation
+from uem_dolfinx import compat
+
+#: What a scene and its mirror image may differ by; Hertz' half-spaces are not the bodies themselves.
+MIRROR, HERTZ = 1e-9, 3 * FORCE
 
 
 def _under_a_punch(boxes: list[Box]) -> BoxScene:
@@ -159,7 +165,85 @@ def random_scenes(seeds: range, g: int, law: type, trial: Trial) -> None:
         trial.about(f"scene {seed}", start)
 
 
+def mirrored(cell: str, degree: int, trial: Trial) -> None:
+    """A round block on a flat one, and their mirror image: mirrored in every displacement."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    n = 8 // (degree * (g - 1))
+    mirror, found = np.array([-1.0, *[1.0] * (g - 1)]), []
+    for sign in (np.ones(g), mirror):
+
+        def pose(x: np.ndarray, body: int, sign: np.ndarray = sign) -> np.ndarray:
+            bulge = 0.3 * (1.05 - x[:, -1]) * (x[:, :-1] ** 2).sum(axis=1) if body else 0.0
+            return sign * np.column_stack([x[:, :-1], x[:, -1] + bulge])
+
+        boxes = [Box([-1.0] * (g - 1) + [-1.0], [1.0] * (g - 1) + [0.0], [n] * (g - 1) + [n // 2])]
+        boxes += [Box([-0.5] * (g - 1) + [0.05], [0.5] * (g - 1) + [1.05], [n] * g, 3.0)]
+        scene = BoxScene(boxes, cell, pose, degree=degree)
+        scene.hold(scene.side(0, g - 1, 0))
+        scene.hold(scene.side(1, g - 1, 1), value=[0.0] * (g - 1) + [-0.2])
+        scene.unite(scene.side(1, g - 1, 0), scene.side(0, g - 1, 1))
+        before = trial.iterations
+        scene.solve(trial, 1 / n, 2)
+        ground, top = scene.reaction(scene.side(0, g - 1, 0)), scene.reaction(scene.side(1, g - 1, 1))
+        trial.check("action - reaction", float(np.abs(ground + top).max()) / ground[-1], BALANCE)
+        trial.check("overlap", overlap(scene, 1 / n), OVERLAP)
+        corners = fem.Function(compat.function_space(scene.mesh, 1, (g,)))
+        corners.interpolate(scene.u)
+        found.append((sign * scene.gather(corners), sign * ground, trial.iterations - before))
+    (u, force, iterations), (v, image, of_image) = found
+    trial.check("force of the mirror image", float(np.abs(image - force).max() / force[-1]), MIRROR)
+    trial.check("displacement of the mirror image", float(np.abs(v - u).max() / np.abs(u).max()), MIRROR)
+    trial.check("iterations of the mirror image", of_image - iterations, 0.5)
+
+
+def cylinder_on_block(trial: Trial, degree: int = 1, gap: float = 0.0, **options: Any) -> None:
+    """A steel cylinder of radius 50 mm that 35 kN/mm press on an aluminium block, across a gap or not, in one step.
+
+    NAFEMS' FENET-1, with half of a section of the cylinder: forces and the half-width of the contact, 6.21 mm, against Hertz.
+    """
+    R, load, E = 50.0, 35e3, (70e3, 210e3)
+
+    def pose(x: np.ndarray, body: int) -> np.ndarray:
+        size = np.array([100.0, 200.0]) if body == 0 else np.array([30.0, 50.0])
+        y = size * np.sign(x) * np.abs(x) ** 2
+        if body:
+            y[:, 1] += (R - np.sqrt(R**2 - y[:, 0] ** 2)) * (1 - y[:, 1] / size[1]) + gap
+        return y
+
+    n = 48 // degree
+    boxes = [Box((0.0, -1.0), (1.0, 0.0), (n, n // 2), E[0]), Box((0.0, 0.0), (1.0, 1.0), (n, n // 2), E[1])]
+    scene = BoxScene(boxes, pose=pose, degree=degree)
+    for body in (0, 1):
+        scene.hold(scene.side(body, 0, 0), 0)
+    scene.hold(scene.side(0, 1, 0), 1)
+    scene.push(scene.side(1, 1, 1), (0.0, -load / 2 / 30.0))
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), **options)
+    h = 30.0 / n
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts)
+    trial.check("cuts", sum(step.cuts for step in trial.load_steps(problem, 1)), 0.5)
+    trial.check("force", scene.reaction(scene.side(0, 1, 0))[1] / (load / 2) - 1, FORCE)
+    nodes = scene.nodes(scene.side(1, 1, 0))
+    x, r = scene.V.tabulate_dof_coordinates()[nodes, 0], scene.residual()[nodes, 1]
+    spread = COMM.allreduce(float(r @ x**2)) / COMM.allreduce(float(r.sum()))
+    half_width = np.sqrt(4 * load * R / np.pi * (1 - NU**2) * sum(1 / e for e in E))
+    trial.check("half-width of the contact", np.sqrt(max(4 * spread, 0.0)) / half_width - 1, HERTZ)
+    trial.check("overlap", overlap(scene, h), OVERLAP)
+
+
 CASES = [
+    *(
+        Case(
+            f"mirrored {cell} {degree}",
+            "a round block on a flat one, and its mirror image",
+            partial(mirrored, cell, degree),
+            cell == "triangle",
+        )
+        for cell, degree in (("triangle", 2), ("quadrilateral", 2), ("tetrahedron", 1), ("tetrahedron", 2), ("hexahedron", 2))
+    ),
+    Case("cylinder on block", "pressed on by a force in one step", cylinder_on_block),
+    Case("cylinder averaged", "with averaged normals", partial(cylinder_on_block, normals="averaged")),
+    Case("cylinder degree 2", "with quadratic elements", partial(cylinder_on_block, degree=2)),
+    Case("cylinder falls", "pressed on across a gap of 1 mm", partial(cylinder_on_block, gap=1.0)),
     Case("flat punch", "stiff flat punch, singular at its edge", flat_punch),
     Case("sharp corner", "a square pressed in with its corner", sharp_corner),
     Case("corner on edge", "an overhanging block over the edge of its target", corner_on_corner),

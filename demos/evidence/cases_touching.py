@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import numpy as np
 from dolfinx import fem
 
 import uem_dolfinx as uem
-from evidence.cases import BALANCE, FORCE, OVERLAP, Box, BoxScene, Case, Trial
+from evidence.cases import BALANCE, COMM, FORCE, OVERLAP, Box, BoxScene, Case, Trial
 from evidence.cases_laws import check_laws, overlap
 from evidence.cases_scales import settled, springs
-from evidence.scenes import oedometric
+from evidence.scenes import CELLS, oedometric
 
 
 def bend(height: float, nudge: float, lift: float) -> Callable[[np.ndarray, int], np.ndarray]:
@@ -259,6 +260,29 @@ def lifted(trial: Trial) -> None:
     trial.check("force", np.inf, FORCE)
 
 
+def beside(g: int, sliding: str, rollers: bool, trial: Trial) -> None:
+    """A long block, its far end held, under a short stiff punch: whatever holds its contactors, nothing beside the punch is pressed."""
+    h, length = 0.25 if g == 2 else 0.5, 30.0 if g == 2 else 8.0
+    across, n = [1.0] * (g - 2), [round(1 / h)] * (g - 1)
+    lower = Box([0.0] * (g - 1) + [-1.0], [length, *across, 0.0], [round(length / h), *n])
+    scene = BoxScene([lower, Box([0.0] * g, [1.1, *across, 1.0], [round(1 / h), *n], 1e3)], CELLS[2 * (g - 2) + 1])
+    scene.hold(scene.side(0, g - 1, 0))
+    scene.hold(scene.side(0, 0, 1), *([0] if rollers else []))
+    for body, (axis, end) in product((0, 1), ((0, 0), *((1, 0), (1, 1))[: 2 * (g - 2)])):
+        scene.hold(scene.side(body, axis, end), axis)
+    scene.hold(scene.side(1, g - 1, 1), value=[0.0] * (g - 1) + [-0.02])
+    top = scene.side(0, g - 1, 1)
+    scene.unite(top, scene.side(1, g - 1, 0), sliding=sliding)
+    scene.solve(trial, h)
+    nodes = scene.nodes(top)
+    far = nodes[scene.V.tabulate_dof_coordinates()[nodes, 0] > 1.1]
+    ground, punch = (scene.reaction(scene.side(body, g - 1, body))[-1] for body in (0, 1))
+    trial.check("force beside the punch", COMM.allreduce(float(np.abs(scene.residual()[far, -1]).sum())) / ground, FORCE)
+    # rollers carry a part of what is sheared beside the punch
+    trial.check("force of ground and punch", punch / ground + 1, FORCE)
+    check_laws(trial, scene, h)
+
+
 CASES = [
     Case("vertex ridge", "contactor on a vertex of a ridge to the last bit", partial(vertex, 0.3, uem.StVenantKirchhoff)),
     Case("vertex flat", "contactor on a vertex of a plane to the last bit", partial(vertex, 0.0, uem.LinearElastic)),
@@ -268,6 +292,15 @@ CASES = [
     Case("grazing", "sliding at zero pressure, and off the end", grazing),
     Case("tangent", "round block brought down until it touches", tangent_sphere),
     Case("off the end", "pressed block dragged off its target", off_the_end),
+    *(
+        Case(
+            f"beside {g}D {sliding}{' rollers' * rollers}",
+            "a far end that is held, beside a short punch",
+            partial(beside, g, sliding, rollers),
+            quick=(g == 2) == rollers,
+        )
+        for g, sliding, rollers in product((2, 3), ("finite", "small"), (False, True))
+    ),
     Case("contactor led", "Dirichlet values on the contactors, the target gives way", led_contactor),
     Case("contactor fought", "contradicting Dirichlet values", fought_contactor),
     Case("clamped corner", "contactor beside a node of the target that is held", clamped_corner),

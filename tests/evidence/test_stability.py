@@ -6,25 +6,37 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from evidence import cases_motion, cases_pressing, cases_scales, cases_touching, methods
+from evidence import cases_bending, cases_motion, cases_pressing, cases_scales, cases_touching, methods
 from evidence.cases import COLUMNS, FORCE, Case, Check, judge
 from evidence.cases_laws import check_laws
 from evidence.cases_scales import springs
 
 COMM = MPI.COMM_WORLD
-CASES = {case.name: case for m in (cases_scales, cases_touching, cases_pressing, cases_motion) for case in m.CASES}
+TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_motion)
+CASES = {case.name: case for m in TABLES for case in m.CASES}
 UNITED = COLUMNS[0]
 
 
 def test_names_are_told_apart_on_the_command_line():
-    assert len(CASES) == sum(len(m.CASES) for m in (cases_scales, cases_touching, cases_pressing, cases_motion))
+    assert len(CASES) == sum(len(m.CASES) for m in TABLES)
     assert not any("," in name for name in CASES)
     assert len({column.name for column in COLUMNS}) == len(COLUMNS)
     assert {column.method for column in COLUMNS} == set(methods.METHODS)
 
 
 @pytest.mark.parametrize(
-    "name", ["E ratio 1e-09", "mesh 50:1", "overlap 1e-12", "vertex flat", "tangent", "two-pass 3:4", "corner on edge"]
+    "name",
+    [
+        "E ratio 1e-09",
+        "mesh 50:1",
+        "overlap 1e-12",
+        "vertex flat",
+        "tangent",
+        "two-pass 3:4",
+        "corner on edge",
+        "beside 2D finite",
+    ]
+    + ["cylinder averaged", "cylinder falls"],
 )
 def test_correct(name):
     cell = judge(CASES[name], UNITED)
@@ -33,7 +45,9 @@ def test_correct(name):
     assert cell["iterations"] > 0 and cell["what"]
 
 
-@pytest.mark.parametrize("name,error", [("contactor fought", "ConflictError"), ("lifted", "FloatingBodyError")])
+@pytest.mark.parametrize(
+    "name,error", [("contactor fought", "ConflictError"), ("lifted", "FloatingBodyError"), ("E ratio 1e+12", "PrecisionError")]
+)
 def test_named_error(name, error):
     """What contradicts itself is said so."""
     cell = judge(CASES[name], UNITED)

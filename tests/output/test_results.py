@@ -17,6 +17,7 @@ import helpers
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem, mesh
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -157,3 +158,31 @@ def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
     S = compat.function_space(b.scene.mesh, 1)
     values, cells = pictures.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
     np.testing.assert_allclose(values[cells], np.where(b.scene.body == 0, 3.0, 7.0)[:, None] * np.ones(cells.shape[1]))
+
+
+def test_ranks_without_a_cell_write_along(folder: Path) -> None:
+    """One cell for all ranks: results and a picture as one rank makes them, and a checkpoint that one rank goes on from."""
+
+    def press(comm: MPI.Comm, name: str) -> tuple[int, list[float]]:
+        domain = mesh.create_unit_square(comm, 1, 1, mesh.CellType.quadrilateral)
+        u = fem.Function(compat.function_space(domain, 1, (2,)))
+        low, top = (mesh.locate_entities_boundary(domain, 1, lambda x, y=y: np.isclose(x[1], y)) for y in (0.0, 1.0))
+        contact = uem.Contact(low, uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
+        bcs = [uem.dirichlet(u.function_space, top, 0), uem.dirichlet(u.function_space, top, 1, -0.1)]
+        problem = uem.UnitedProblem(helpers.linear(u, 1.0), u, bcs=bcs, contacts=[contact])
+        uem.plot_scene(problem, folder / f"{name}.png")
+        with uem.Checkpoint(folder / "run.uem") as checkpoint, uem.ResultsWriter(folder / name, problem, vtx=False) as results:
+            begun = checkpoint.begin(problem.state())
+            for step in uem.load_steps(problem, 2, checkpoint=checkpoint):
+                results.write(step)
+        return begun, list(contact.resultant().force)
+
+    begun, force = press(comm, "together")
+    assert not begun and force[1] > 0
+    if comm.rank == 0:
+        (folder / "run.uem").rename(folder / "theirs.uem")
+        assert press(MPI.COMM_SELF, "alone") == (begun, pytest.approx(force, rel=1e-12))
+        together, alone = (np.fromfile(folder / f"{name}.bin", np.float64) for name in ("together", "alone"))
+        np.testing.assert_allclose(together, alone, rtol=1e-12, atol=1e-15)
+        (folder / "theirs.uem").rename(folder / "run.uem")
+        assert press(MPI.COMM_SELF, "again")[0]

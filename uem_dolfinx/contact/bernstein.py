@@ -231,8 +231,7 @@ def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, B
     place = np.full(config.n_local, -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
     layout = config.V.dofmap.dof_layout
-    # also where a rank has no cell at all
-    cells = compat.cell_dofs(config.V).reshape(-1, layout.num_dofs)
+    cells = compat.cell_dofs(config.V)
     topology = forms.reference_topology(compat.cell_name(config.mesh))
     vertex = [layout.entity_dofs(0, v)[0] for v in range(len(topology[0]))]
     edge = [layout.entity_dofs(1, e)[0] for e in range(len(topology[1]))]

@@ -124,7 +124,7 @@ class XdmfSeries:
         def rows() -> AnyArray:
             padded = np.zeros((n, *(3 for _ in shape)))
             padded[(slice(None), *map(slice, shape))] = u.x.array.reshape(-1, *shape)[:n]
-            return padded.reshape(n, -1)
+            return padded.reshape(n, 3 ** len(shape))
 
         return Table(rows, 3 ** len(shape), numbering)
 
