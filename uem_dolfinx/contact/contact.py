@@ -21,7 +21,7 @@ from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
-from uem_dolfinx.errors import SpaceError, SurfaceError
+from uem_dolfinx.errors import InputError, SpaceError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import Target
@@ -85,6 +85,11 @@ class Contact:
             if thickness is not None:
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
+            if coupling == "mortar" and (chords or normals != "facet"):
+                what = "chords = True" if chords else f"normals = '{normals}'"
+                raise InputError(
+                    f"{what} does not go with coupling = 'mortar', whose facets have normals of their own: leave it out"
+                )
             given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.coupling = coupling
@@ -132,7 +137,14 @@ class Contact:
         how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
         coupling: Coupling
         if self.coupling == "mortar":
-            coupling = Mortar(config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how)
+            if self.contactor.dim == 0:
+                raise SurfaceError(
+                    f"contact '{self.name}': its contactor is points, and coupling = 'mortar' integrates over facets: give facets, or "
+                    "take coupling = 'node_to_surface'"
+                )
+            coupling = Mortar(
+                config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how
+            )
         else:
             kind = Bernstein if config.degree == 2 else NodeToSurface
             coupling = kind(config, nodes, target, chords=self.chords and config.degree == 2, **how)

@@ -62,6 +62,8 @@ class Coupling(Protocol):
     """Ties contactors to a target. States are handed in and out; nothing of them is kept."""
 
     target: Target
+    #: Whether the target may be the contactor of another contact with these surfaces.
+    two_pass: bool
 
     @property
     def followed(self) -> Indices:

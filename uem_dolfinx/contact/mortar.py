@@ -87,7 +87,7 @@ class Mortar(NodeToSurface):
         surface: the contactor's facets.
     """
 
-    chained = True
+    chained, two_pass = True, False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -153,9 +153,7 @@ class Mortar(NodeToSurface):
         nodes, place = np.unique(equations.followed, return_inverse=True)
         theirs = self.config.ask_owners(nodes, values)[place]
         own = np.einsum("ng,ng->n", equations.direction, values[equations.node])
-        return own - np.bincount(
-            equations.row, np.einsum("kg,kg->k", equations.coefficients, theirs), minlength=len(equations)
-        )
+        return own - np.bincount(equations.row, np.einsum("kg,kg->k", equations.coefficients, theirs), minlength=len(equations))
 
     # -- rows ------------------------------------------------------------------------------------------------------------
 
@@ -359,10 +357,7 @@ class Mortar(NodeToSurface):
         pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
         dofs = self.surface.dofs[rows.facets]
         at_nodes = self.config.from_owners(self.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
-        nodes, blocks = rows.points.force_derivatives(at_nodes)
-        if rows.gradients is rows.equations:
-            blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
-        return nodes, blocks
+        return rows.points.force_derivatives(at_nodes)
 
     def areas(self, placement: Placement, areas: Array) -> Array:
         """Integrals of the dual functions over what is covered."""

@@ -60,7 +60,7 @@ class NodeToSurface:
         chords: trial rows with the weights of the straight pieces between a curved target's nodes [UEM, 4.5].
     """
 
-    chained = False
+    chained, two_pass = False, True
 
     def __init__(
         self,

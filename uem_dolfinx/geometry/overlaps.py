@@ -8,6 +8,7 @@ point lie on one line along n, and leave neither force nor moment behind.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,9 +19,19 @@ from uem_dolfinx.geometry.shapes import FacetShape
 #: A segment that is smaller is rounding of two sides that coincide.
 #: [convention; part of the contactor facet; test_overlaps.py::test_slivers]
 SLIVER = 1e-12
+#: Maps of facets that depart less from affine ones are affine.
+#: [convention; part of the largest facet; test_overlaps.py::test_facets_that_are_affine]
+STRAIGHT = 1e-9
+#: Rules are by so much of a higher degree where maps are not affine and products of shape functions no polynomials.
+#: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
+BENT = 8
 #: Newton iterations for the place of a point in the plane of a facet whose map is not affine.
 #: [bound; iterations; -]
 IN_MEAN_PLANE = 12
+
+
+Rule: TypeAlias = tuple[Array, Array]
+Facets: TypeAlias = tuple[FacetShape, Array]
 
 
 @dataclass(frozen=True)
@@ -91,12 +102,25 @@ class Segments:
     gap: Array
 
 
-def quadrature(shape: FacetShape) -> tuple[Array, Array]:
-    """Rule for products of two shape functions on a piece of a facet: barycentric points ``(k, fdim + 1)`` and weights of sum 1."""
+def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:
+    """Rule for products of two shape functions on a piece of a facet: barycentric points ``(k, fdim + 1)`` and weights of sum 1.
+
+    Args:
+        shape: of the facets.
+        straight: whether the maps of all facets are affine, so that the products are polynomials.
+    """
     cell = "interval" if shape.dim == 1 else "triangle"
     # bilinear functions are of degree 2 along the diagonals
-    points, weights = forms.quadrature_rule(cell, 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1))
+    degree = 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1) + (0 if straight else BENT)
+    points, weights = forms.quadrature_rule(cell, degree)
     return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
+
+
+def _affine(shape: FacetShape, y: Array) -> bool:
+    """Whether the maps of facets with nodes ``y (m, nn, fdim)`` in their planes are affine."""
+    corners = y[:, : shape.dim + 1]
+    made = corners[:, :1] + np.einsum("af,mfe->mae", shape.nodes, corners[:, 1:] - corners[:, :1])
+    return bool(np.abs(y - made).max(initial=0.0) <= STRAIGHT * np.abs(y - y[:, :1]).max(initial=0.0))
 
 
 def overlap(planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[FacetShape, Array], sign: Array) -> Segments:
@@ -110,25 +134,27 @@ def overlap(planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[F
     """
     (shape, x), (other, y) = contactor, target
     own, its = planes.coordinates(x), planes.coordinates(y)
-    place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, shape, own, other, its, sign)
+    rule = quadrature(shape, _affine(shape, own[:, :, :-1]) and _affine(other, its[:, :, :-1]))
+    place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, (shape, own), (other, its), sign, rule)
     xi, eta = locate(shape, own[place, :, :-1], at), locate(other, its[place, :, :-1], at)
     height = np.einsum("qa,qa->q", other.functions(eta), its[place, :, -1])
     height -= np.einsum("qa,qa->q", shape.functions(xi), own[place, :, -1])
     return Segments(place, xi, eta, weight, height)
 
 
-def _intervals(planes: Planes, shape: FacetShape, own: Array, other: FacetShape, its: Array, sign: Array) -> tuple[Ints, Array, Array]:
+def _intervals(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
     """Pairs, places in the plane ``(q, 1)`` and weights of the quadrature in 2D."""
+    its, (points, weights) = target[1], rule
     ends = np.sort(its[:, :2, 0], axis=1)
     low, high = np.maximum(0.0, ends[:, 0]), np.minimum(planes.size, ends[:, 1])
     found = np.flatnonzero(high - low > SLIVER * planes.size)
-    points, weights = quadrature(shape)
     s = low[found, None] * points[:, 0] + high[found, None] * points[:, 1]
     return np.repeat(found, len(weights)), s.reshape(-1, 1), ((high - low)[found, None] * weights).ravel()
 
 
-def _polygons(planes: Planes, shape: FacetShape, own: Array, other: FacetShape, its: Array, sign: Array) -> tuple[Ints, Array, Array]:
+def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
     """Pairs, places in the plane ``(q, 2)`` and weights of the quadrature in 3D."""
+    (shape, own), (other, its), (points, weights) = contactor, target, rule
     frame = own[:, shape.ring, :2]
     # counter-clockwise about the outward normal
     frame = np.where(sign[:, None, None] > 0, frame, frame[:, ::-1])
@@ -139,7 +165,6 @@ def _polygons(planes: Planes, shape: FacetShape, own: Array, other: FacetShape, 
     polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
     a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
     area = 0.5 * np.abs(_cross(b - a, c - a))
-    points, weights = quadrature(shape)
     at = np.einsum("qk,kpg->pqg", points, np.stack([a, b, c]))
     return np.repeat(found[polygon], len(weights)), at.reshape(-1, 2), (area[:, None] * weights).ravel()
 

@@ -24,6 +24,7 @@ from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
 from uem_dolfinx.contact.coupling import LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
@@ -87,6 +88,8 @@ class BodySystem:
         self._factored: object = None
         self._curvature: PETSc.Mat | None = None
         self._pivoting = Pivoting()
+        #: Whether P differs from Q.
+        self._apart = False
         #: Whether the last exchange has let go of a body that loads drive.
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
@@ -114,6 +117,11 @@ class BodySystem:
         self.mutual: Bools = (meets & meets.T).any(axis=1)
         for pair, mutual in zip(pairs, self.mutual):
             pair.mutual = bool(mutual)
+            if mutual and not pair.coupling.two_pass:
+                raise ConflictError(
+                    f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
+                    "one of the two contacts, or give both coupling='node_to_surface'"
+                )
         #: Whether a node that is followed may itself be eliminated.
         self.stacked = bool(meets.any()) or any(pair.coupling.chained for pair in pairs)
         #: Whether equations can get in each other's way.
@@ -206,10 +214,10 @@ class BodySystem:
 
     def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
-        apart = any(e.trial is not e.test for e in rows.equations)
+        self._apart = any(e.trial is not e.test for e in rows.equations) and not self._contested(rows)
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=self._restrict([e.trial for e in rows.equations])[0] if apart else rows.test,
+            trial=self._restrict([e.trial for e in rows.equations])[0] if self._apart else rows.test,
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -223,6 +231,10 @@ class BodySystem:
             closed=gap <= CLOSED * self.config.size and self.forces.dirichlet_met(),
             rows=rows,
         )
+
+    def _contested(self, rows: _Rows) -> bool:
+        """Whether equations get in each other's way, so that those of P might eliminate other components than those of Q."""
+        return self.shared or (rows.independent is not None and rows.independent.found)
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
         """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none (collective).
@@ -381,6 +393,8 @@ class BodySystem:
     def curvature(self) -> PETSc.Mat | None:
         """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
         parts = [pair.curvature() for pair in self.pairs if pair.sliding == "finite"]
+        if not self._apart:
+            parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
         # a plane has none
         if not self.comm.allreduce(any(blocks.any() for _, blocks in parts), op=MPI.LOR):
             return None

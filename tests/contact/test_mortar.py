@@ -1,0 +1,400 @@
+"""Mortar: constant pressures through any pair of meshes, rows against slow quadrature, balances and derivatives.
+
+The test to read first is ``test_patch_on_any_meshes``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import CELLS, M, at, box, clamp, complementary, factors, highest, linear, modulus, refused, run, scene, st_venant
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
+from uem_dolfinx.contact.duals import basis_of
+from uem_dolfinx.geometry.shapes import facet_shape
+
+COMM = MPI.COMM_WORLD
+
+
+class Blocks:
+    """Two blocks of any meshes between rollers; the upper one may be narrower, and surfaces may wave.
+
+    Args:
+        cell: of both bodies.
+        n: divisions of the lower and of the upper block.
+        degree: of the displacement.
+        contactor: ``"upper"`` or ``"lower"``.
+        seed: moves the inner nodes of the surfaces at random.
+        narrow: width of the upper block.
+        wave: height of waves of both surfaces.
+        how: arguments of the contact.
+    """
+
+    def __init__(
+        self,
+        cell,
+        n=(5, 3),
+        degree=1,
+        contactor="upper",
+        *,
+        seed=None,
+        narrow=1.0,
+        wave=0.0,
+        gap=0.0,
+        comm=COMM,
+        E=(1.0, 2.0),
+        **how,
+    ):
+        g = 2 if cell in ("triangle", "quadrilateral") else 3
+        self.g, self.comm, rng = g, comm, np.random.default_rng(seed)
+
+        def moved(body, k):
+            x, h = body.x.copy(), 1.0 / k
+            if seed is not None:
+                inner = (x[:, : g - 1] > 1e-9) & (x[:, : g - 1] < 1 - 1e-9)
+                x[:, : g - 1] += 0.25 * h * rng.uniform(-1, 1, inner.shape) * inner
+            x[:, -1] += wave * np.sin(7 * x[:, 0]) * np.prod(1 + 0.3 * x[:, : g - 1], axis=1)
+            return replace(body, x=x)
+
+        bodies = [box(cell, [0.0] * (g - 1) + [-1.0], [1.0] * (g - 1) + [0.0], [n[0]] * g)]
+        bodies.append(box(cell, [0.0] * (g - 1) + [gap], [narrow] * (g - 1) + [1.0 + gap], [n[1]] * g))
+        tagged = scene(comm, cell, bodies)
+        self.scene = s = scene(comm, cell, [moved(body, k) for body, k in zip(bodies, n)])
+        s.drawing = tagged.drawing
+        self.V = compat.function_space(s.mesh, degree, (g,))
+        self.u = fem.Function(self.V)
+        self.low, self.high = s.tag("low", 0, at(g - 1, 0.0)), s.tag("high", 1, at(g - 1, gap))
+        self.top, self.E = s.tag("top", 1, at(g - 1, 1.0 + gap)), modulus(s, *E)
+        pair = (self.high, self.low) if contactor == "upper" else (self.low, self.high)
+        self.contact = uem.Contact(*pair, coupling="mortar", **how)
+        self.bcs = clamp(self.V, s.tag("bottom", 0, at(g - 1, -1.0)), g - 1)
+        for c, end, body in product(range(g - 1), (0.0, narrow, 1.0), (0, 1)):
+            self.bcs += clamp(self.V, s.tag("side", body, at(c, end)), c)
+
+    def problem(self, F, **how):
+        return uem.UnitedProblem(F, self.u, bcs=self.bcs, contacts=[self.contact], **how)
+
+    def pressed(self, p=1e-3, **how):
+        v = ufl.TestFunction(self.V)
+        load = p * v[self.g - 1] * forms.surface_measure(self.scene.mesh, self.top.entities)
+        return self.problem(linear(self.u, self.E) + load, **how)
+
+
+# -- the patch test ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("contactor", ["upper", "lower"])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("cell", "n", "seed"), [
+    ("triangle", (5, 3), None), ("triangle", (10, 7), 1), ("quadrilateral", (7, 10), None), ("quadrilateral", (5, 4), 2),
+    ("tetrahedron", (2, 3), None), ("tetrahedron", (3, 2), 3), ("hexahedron", (3, 2), None), ("hexahedron", (2, 3), 4),
+])  # fmt: skip
+def test_patch_on_any_meshes(cell, n, seed, degree, contactor):
+    """A constant pressure passes: stress, displacement, every pressure and both balances to rounding, in one solve."""
+    p = 1e-3
+    b = Blocks(cell, n, degree, contactor, seed=seed)
+    steps = run(b.pressed(p))
+    stress = fem.Function(compat.function_space(b.scene.mesh, ("DG", 0)))
+    law = uem.LinearElastic(b.E, 0.3, kind="plane_strain" if b.g == 2 else "3d")
+    compat.interpolate_expression(stress, law.stress(b.u)[b.g - 1, b.g - 1])
+    assert highest(COMM, np.abs(stress.x.array / p + 1)) < 1e-11
+    x = b.contact.pair.config.X
+    lower = x[:, -1] < -1e-9
+    exact = np.where(lower, -p / M * (x[:, -1] + 1), -p / M - p / (2 * M) * x[:, -1])
+    inside = np.abs(x[:, -1]) > 1e-9
+    assert highest(COMM, np.abs(b.u.x.array.reshape(-1, b.g)[:, -1] - exact)[inside]) < 1e-11 * p
+    assert highest(COMM, np.abs(b.contact.pressures / p - 1)) < 1e-11
+    assert b.contact.balance().force < 1e-14 and b.contact.balance().moment < 1e-14
+    assert steps[0].newton_iterations <= 2
+
+
+@pytest.mark.parametrize("sliding", ["finite", "small", "fixed"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_every_kind_of_sliding(cell, sliding):
+    """Two steps, the second half of them with kept rows."""
+    b = Blocks(cell, (3, 2), sliding=sliding)
+    run(b.pressed(), 2)
+    assert highest(COMM, np.abs(b.contact.pressures / 1e-3 - 1)) < 1e-11
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("contactor", ["upper", "lower"])
+@pytest.mark.parametrize("width", [0.55, 0.61, 0.6 + 1e-9])
+def test_partly_covered_facets(contactor, degree, width):
+    """The upper block ends within a facet of the lower one: its own stress stays that of the load, whichever is the contactor."""
+    p = 1e-3
+    b = Blocks("quadrilateral", (5, 3), degree, contactor, narrow=width, E=(1e4, 1.0))
+    run(b.pressed(p))
+    assert b.contact.resultant().force[1] == pytest.approx((1 if contactor == "upper" else -1) * p * width, rel=1e-9)
+    # the stiff floor stays even; rollers on its sides see no more than its small strain
+    assert highest(COMM, np.abs(b.contact.pressures[b.contact.pair.trial.active] / p - 1)) < 0.01
+    complementary(b.contact, 1e-12, 1e-12)
+
+
+# -- rows ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_rows_against_slow_quadrature(degree):
+    """Rows of 2D facets on a wavy target, from 20,000 points a facet that look for what is opposite one by one."""
+    b = Blocks("triangle", (5, 3), degree, wave=0.02, gap=0.01, comm=MPI.COMM_SELF)
+    b.pressed()
+    pair = b.contact.pair
+    rows, config, surface = pair.placement.details.equations, pair.config, pair.coupling.surface
+    target = pair.target.facets
+    shape, basis = facet_shape("interval", degree), basis_of(facet_shape("interval", degree))
+    total, follows = np.zeros((config.n_local, 2)), np.zeros((config.n_local, config.n_local, 2))
+    s = (np.arange(20000) + 0.5) / 20000
+    for x, dofs, sign in zip(surface.x, surface.dofs, surface.sign):
+        t = x[1] - x[0]
+        length = np.linalg.norm(t)
+        n = np.array([t[1], -t[0]]) / length * sign
+        xi = s[:, None]
+        where = np.einsum("qa,ag->qg", shape.tabulate(xi).N, x)
+        along = (where - x[0]) @ t / length
+        w = np.gradient(along)
+        seen, N = np.zeros(len(s), bool), np.zeros((len(s), config.n_local))
+        for y, its in zip(target.x, target.dofs):
+            z = (y - x[0]) @ t / length
+            grid = np.linspace(0, 1, 2001)
+            there = shape.tabulate(grid[:, None]).N @ z
+            order = np.argsort(there)
+            eta = np.interp(along, there[order], grid[order], left=np.nan, right=np.nan)
+            here = ~np.isnan(eta) & ~seen
+            N[np.ix_(here, its)] = shape.tabulate(eta[here, None]).N
+            seen |= here
+        values = basis.at(xi) * (w * seen)[:, None]
+        D, Me = values.sum(axis=0), values.T @ basis.at(xi)
+        A = np.diag(D) @ np.linalg.inv(Me)
+        for j, row in enumerate(D[:, None] * basis.T):
+            for k in range(len(dofs)):
+                if k == j:
+                    total[dofs[j]] -= row[k] * n
+                else:
+                    follows[dofs[j], dofs[k]] += row[k] * n
+            follows[dofs[j]] -= (A @ values.T @ N)[j][:, None] * n
+    for k, node in enumerate(pair.nodes):
+        scale = np.linalg.norm(total[node])
+        assert rows.direction[k] == pytest.approx(total[node] / scale, abs=1e-6)
+        terms = rows.row == k
+        found = np.zeros((config.n_local, 2))
+        np.add.at(found, rows.followed[terms], rows.coefficients[terms])
+        assert np.abs(found - follows[node] / scale).max() < 2e-4
+
+
+def disturbed(b, seed, size):
+    """Both bodies displaced at random, alike on any number of ranks."""
+    x = b.contact.pair.config.X if b.contact.taken else b.V.tabulate_dof_coordinates()[:, : b.g]
+    rng = np.random.default_rng(seed)
+    k, phase = 9 * rng.standard_normal((b.g, b.g)), rng.uniform(0, 6, b.g)
+    b.u.x.array[:] = (size * np.sin(x @ k + phase)).ravel()[: len(b.u.x.array)]
+    b.u.x.scatter_forward()
+
+
+@pytest.mark.parametrize(("cell", "degree"), [*product(CELLS, (1,)), ("triangle", 2), ("tetrahedron", 2)])
+def test_forces_balance_across_open_gaps(cell, degree):
+    """Whatever the multipliers, rows hand on forces without resultant and without moment, wherever the bodies are."""
+    b = Blocks(cell, (3, 2), degree, gap=0.03)
+    problem = b.pressed()
+    disturbed(b, 1, 0.01)
+    problem.system.place(returning=False)
+    pair = b.contact.pair
+    x = pair.config.X[pair.nodes]
+    lam = 1e-3 * (2 + np.sin(11 * x[:, 0])) * pair.placement.details.covered
+    pair.trial = replace(pair.trial, lam=lam, active=lam > 0)
+    balance = b.contact.balance()
+    assert balance.force < 1e-14 and balance.moment < 1e-14
+    complete = COMM.allreduce(float(np.abs(b.contact.force.x.array).max()), op=MPI.MAX)
+    assert complete > 1e-5
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_forces_turn_as_the_tangent_says(cell):
+    """Blocks of the curvature against central differences of the forces at constant multipliers, in directions at random."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF)
+    problem = b.pressed()
+    disturbed(b, 2, 0.01)
+    pair, g, u = b.contact.pair, b.g, b.u.x.array
+    start = u.copy()
+
+    def rows_at(displacement):
+        u[:] = displacement
+        problem.system.place(returning=False)
+        return pair.placement.details
+
+    rows = rows_at(start)
+    # what is covered in part has ends that move, which is left out
+    inner = rows.ratio > 0.9
+    pressure = np.where(inner, 1.0 + 0.5 * np.sin(5 * pair.config.X[pair.nodes, 0]), 0.0)
+    surface = pair.coupling.surface
+    at_facets = np.zeros(pair.config.n_local)
+    at_facets[pair.nodes] = pressure
+    which = at_facets[surface.dofs[rows.facets]]
+    edge = (~np.isin(surface.dofs[rows.facets], pair.nodes[inner])).any(axis=1)
+    which[edge] = 0.0
+
+    def forces(displacement):
+        points = rows_at(displacement).points
+        s, e = points.segments, points.facet
+        force = np.zeros((pair.config.n_local, g))
+        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", which, points.A)[e[s.pair]]) * s.weight
+        push = -amount[:, None] * points.planes.normal[e[s.pair]]
+        for nodes, values in ((points.nodes[e[s.pair]], points.phi), (points.opposite[s.pair], -points.N)):
+            np.add.at(force, nodes, values[..., None] * push[:, None])
+        return force.ravel()
+
+    nodes, blocks = rows.points.force_derivatives(which)
+    assert len(nodes)
+    index = (nodes[:, :, None] * g + np.arange(g)).reshape(len(nodes), -1)
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        way = rng.standard_normal(len(u))
+        h = 1e-6
+        measured = -(forces(start + h * way) - forces(start - h * way)) / (2 * h)
+        told = np.zeros(len(u))
+        np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+
+
+# -- Newton, rigid targets, ends -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("contactor", ["upper", "lower"])
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_newton_is_quadratic(cell, contactor):
+    """Wavy surfaces, finite strain and far sliding in one step: the residual is squared by every iteration."""
+    b = Blocks(cell, (5, 4), contactor=contactor, wave=0.03, gap=0.01)
+    s, g = b.scene, b.g
+    bcs = clamp(b.V, s.tag("bottom", 0, at(g - 1, -1.0)))
+    bcs += clamp(b.V, b.top, value=[0.03, *[0.0] * (g - 2), -0.06])
+    problem = uem.UnitedProblem(st_venant(b.u, b.E), b.u, bcs=bcs, contacts=[b.contact], rtol=1e-11)
+    steps = run(problem)
+    history = [i.residual for i in steps[-1].iterations]
+    assert len(history) <= 9
+    assert all(f < 1e3 for f in factors(steps[-1].iterations)) or history[-2] ** 2 < history[-1]
+    complementary(b.contact, 1e-12, 1e-12)
+    assert b.contact.balance().force < 1e-13 and b.contact.balance().moment < 1e-13
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_rigid_plane(cell, degree):
+    """A constant pressure on a plane that moves, on any mesh."""
+    g = 2 if cell == "triangle" else 3
+    s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [3] * g)])
+    V = compat.function_space(s.mesh, degree, (g,))
+    u = fem.Function(V)
+    plane = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0])
+    contact = uem.Contact(s.tag("base", 0, at(g - 1, 0.0)), plane, coupling="mortar")
+    bcs = clamp(V, s.tag("top", 0, at(g - 1, 1.0)), g - 1)
+    for c, end in product(range(g - 1), (0.0, 1.0)):
+        bcs += clamp(V, s.tag("side", 0, at(c, end)), c)
+
+    def push(factor):
+        plane.move([0.0] * (g - 1) + [0.02 * factor])
+
+    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], load=push)
+    for step in uem.load_steps(problem, 2):
+        assert highest(COMM, np.abs(contact.pressures / (0.02 * step.factor * M) - 1)) < 1e-10
+    assert contact.resultant().force[-1] == pytest.approx(0.02 * M, rel=1e-10)
+    assert contact.resultant(on="target").force[-1] == pytest.approx(-0.02 * M, rel=1e-10)
+
+
+@pytest.mark.parametrize("punch", [0.03, 0.1])
+def test_what_is_hardly_covered(punch):
+    """A punch on 3 % of a facet far from its nodes is carried by one row of all of them; on 10 % by a row for each."""
+    s = scene(COMM, "quadrilateral", [
+        box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [1, 1]), box("quadrilateral", [0.5, -1.0], [0.5 + punch, 0.0], [1, 4])
+    ])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("base", 0, at(1, 0.0)), s.tag("punch", 1, at(1, 0.0)), coupling="mortar")
+    bcs = clamp(V, s.tag("ground", 1, at(1, -1.0))) + clamp(V, s.tag("top", 0, at(1, 1.0)), value=[0.0, -1e-3])
+    problem = uem.UnitedProblem(linear(u, modulus(s, 1.0, 100.0)), u, bcs=bcs, contacts=[contact])
+    run(problem)
+    assert contact.n_active == (1 if punch < 0.05 else 2)
+    assert contact.balance().moment < 1e-13
+    # the block's base between its corners, against the punch's: the weighted gap is closed
+    assert contact.max_gap() < 1e-13 and contact.resultant().force[1] > 1e-6
+
+
+def test_off_the_end_and_back():
+    """A block is drawn off the end of a slab and back again: it lets go without a cut, and takes hold again."""
+    s = scene(COMM, "quadrilateral", [
+        box("quadrilateral", [0.0, -0.5], [1.0, 0.0], [8, 3]), box("quadrilateral", [0.3, 0.0], [0.8, 0.4], [3, 2])
+    ])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("base", 1, at(1, 0.0)), s.tag("slab", 0, at(1, 0.0)), coupling="mortar")
+    place = fem.Constant(s.mesh, np.zeros(2))
+    bcs = clamp(V, s.tag("ground", 0, at(1, -0.5)))
+    bcs.append(uem.dirichlet(V, s.tag("top", 1, at(1, 0.4)), value=place))
+    way = np.concatenate([[0.0, 0.0], np.linspace(0.0, 0.85, 17), np.linspace(0.85, 0.0, 17)])
+    down = np.minimum(np.arange(36) / 2, 1.0) * 0.01
+
+    def lead(factor):
+        place.value[:] = [np.interp(35 * factor, range(36), way), -np.interp(35 * factor, range(36), down)]
+
+    problem = uem.UnitedProblem(st_venant(u, 1.0), u, bcs=bcs, contacts=[contact], load=lead)
+    forces, cuts = [], 0
+    for step in uem.load_steps(problem, 35):
+        forces.append(contact.resultant().force[1])
+        cuts += step.cuts
+    assert cuts == 0 and min(forces[16:19]) == 0.0
+    assert forces[-1] == pytest.approx(forces[1], rel=1e-6) and forces[1] > 1e-3
+
+
+def test_parallel_facets():
+    """Where all facets are parallel the rows are the derivatives, and the united system is symmetric."""
+    for tilt, same in ((0.0, True), (1e-9, False)):
+        b = Blocks("quadrilateral", (3, 2), comm=MPI.COMM_SELF)
+        problem = b.pressed()
+        b.u.x.array[1::2] += tilt * b.contact.pair.config.X[:, 0] * (b.contact.pair.config.X[:, 1] > -0.5 + 1e-6)
+        b.u.x.array[1::2] -= np.where(np.isin(np.arange(len(b.u.x.array) // 2), b.contact.pair.nodes), 0.0, 0.0)
+        high = np.isin(np.arange(len(b.u.x.array) // 2), b.contact.pair.nodes)
+        b.u.x.array[1::2][high] += tilt * b.contact.pair.config.X[high, 0]
+        problem.system.place(returning=False)
+        rows = b.contact.pair.placement.details
+        assert (rows.gradients is rows.equations) == same
+
+
+# -- ranks, and what is refused ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_ranks_do_as_one(cell):
+    """Histories, forces and displacements of a wavy contact are those of one rank."""
+
+    def solve(comm):
+        b = Blocks(cell, (4, 3), wave=0.02, gap=0.01, comm=comm)
+        bcs = clamp(b.V, b.scene.tag("bottom", 0, at(b.g - 1, -1.0)))
+        bcs += clamp(b.V, b.top, value=[0.01, *[0.0] * (b.g - 2), -0.04])
+        problem = uem.UnitedProblem(st_venant(b.u, b.E), b.u, bcs=bcs, contacts=[b.contact])
+        steps = run(problem, 2)
+        path = [(i.active, i.exchanges) for step in steps for i in step.iterations]
+        return path, b.contact.resultant().force, b.contact.max_pressure()
+
+    mine, alone = solve(COMM), solve(MPI.COMM_SELF)
+    assert mine[0] == alone[0]
+    assert mine[1] == pytest.approx(alone[1], rel=1e-9, abs=1e-12) and mine[2] == pytest.approx(alone[2], rel=1e-9)
+
+
+def test_what_does_not_go_with_mortar():
+    b = Blocks("triangle", (2, 3))
+    low, high = b.low, b.high
+    for how, words in (({"normals": "averaged"}, "normals = 'averaged'"), ({"chords": True}, "chords = True")):
+        refused(uem.InputError, [words, "mortar"], lambda how=how: uem.Contact(high, low, coupling="mortar", **how))
+    refused(uem.InputError, ["coupling", "mortar"], lambda: uem.Contact(high, low, coupling="mortars"))
+    both = [uem.Contact(high, low, coupling="mortar"), uem.Contact(low, high, coupling="mortar")]
+    refused(
+        uem.ConflictError, ["high on low", "one pass"],
+        lambda: uem.UnitedProblem(linear(b.u, b.E), b.u, bcs=b.bcs, contacts=both),
+    )  # fmt: skip

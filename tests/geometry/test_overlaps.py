@@ -1,0 +1,156 @@
+"""Segments of pairs of facets against SciPy's half-spaces and against integrals in closed form.
+
+The test to read first is ``test_common_part_of_polygons``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import at, box, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from uem_dolfinx import compat
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.opposite import find_opposite
+from uem_dolfinx.geometry.overlaps import Planes, clip, locate, overlap
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.shapes import facet_shape
+
+KINDS = [("interval", 1), ("interval", 2), ("triangle", 1), ("triangle", 2), ("quadrilateral", 1), ("quadrilateral", 2)]
+
+
+def polygon(rng, corners, spread=1.0):
+    """A convex polygon, counter-clockwise."""
+    turn = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    return rng.uniform(-spread, spread, 2) + np.column_stack([np.cos(turn), np.sin(turn)]) * rng.uniform(0.3, 1.0)
+
+
+def half_spaces(p):
+    """``A x + b <= 0`` of a counter-clockwise polygon."""
+    along = np.roll(p, -1, axis=0) - p
+    out = np.column_stack([along[:, 1], -along[:, 0]])
+    return np.column_stack([out, -(out * p).sum(axis=1)])
+
+
+def area(p):
+    q = np.roll(p, -1, axis=0)
+    return 0.5 * float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(3, 4), st.integers(3, 4))
+def test_common_part_of_polygons(seed, first, second):
+    """Areas of what triangles and quadrilaterals have in common, in either sense of the subject."""
+    rng = np.random.default_rng(seed)
+    subject, frame = polygon(rng, first), polygon(rng, second)
+    for way in (subject, subject[::-1]):
+        corners, count = clip(way[None], frame[None])
+        found = abs(area(corners[0, : count[0]])) if count[0] > 2 else 0.0
+        inner = corners[0, : count[0]].mean(axis=0) if found > 1e-9 else None
+        if inner is not None:
+            try:
+                exact = ConvexHull(
+                    HalfspaceIntersection(np.vstack([half_spaces(subject), half_spaces(frame)]), inner).intersections
+                )
+            except QhullError:
+                continue
+            assert found == pytest.approx(exact.volume, rel=1e-8)
+        else:
+            sample = rng.uniform(-2, 2, (4000, 2))
+            inside = [(sample @ h[:, :2].T + h[:, 2] < -1e-6).all(axis=1) for h in (half_spaces(subject), half_spaces(frame))]
+            assert not (inside[0] & inside[1]).any()
+
+
+@pytest.mark.parametrize(("cell", "degree"), KINDS)
+def test_places_in_a_plane(cell, degree):
+    """Reference coordinates from places in the plane, also where the map is not affine."""
+    shape, rng = facet_shape(cell, degree), np.random.default_rng(1)
+    y = shape.nodes + rng.uniform(-0.08, 0.08, (50, *shape.nodes.shape))
+    xi = rng.dirichlet(np.ones(shape.dim + 1), 50)[:, : shape.dim]
+    there = np.einsum("qa,qaf->qf", shape.tabulate(xi).N, y)
+    assert np.abs(locate(shape, y, there) - xi).max() < 1e-12
+    assert np.abs(shape.functions(xi) - shape.tabulate(xi).N).max() < 1e-14
+
+
+def pair_of(cell, shift, tilt=0.0):
+    """A facet, one that faces it from above, and their signs."""
+    shape = facet_shape(cell, 1)
+    flat = np.column_stack([shape.nodes, np.zeros(len(shape.nodes))])
+    g = flat.shape[1]
+    other = flat + np.array([shift, *[0.0] * (g - 2), 0.1])
+    other[:, -1] += tilt * other[:, 0]
+    return shape, flat, other
+
+
+@pytest.mark.parametrize("cell", ["interval", "triangle", "quadrilateral"])
+def test_integrals_over_a_segment(cell):
+    """Size and mean gap of what a shifted and tilted facet covers."""
+    shift, tilt = 0.25, 0.3
+    shape, x, y = pair_of(cell, shift, tilt)
+    sign = np.array([1.0 if cell != "interval" else -1.0])
+    planes = Planes.of(shape, x[None], sign)
+    assert planes.normal[0] == pytest.approx(np.eye(x.shape[1])[-1])
+    s = overlap(planes, (shape, x[None]), (shape, y[None]), sign)
+    # the second facet's inclined plane is z = 0.1 + tilt x
+    size = {"interval": 0.75, "quadrilateral": 0.75, "triangle": 0.75**2 / 2}[cell]
+    middle = {"interval": 0.625, "quadrilateral": 0.625, "triangle": 0.5}[cell]
+    assert s.weight.sum() == pytest.approx(size, rel=1e-12)
+    assert (s.weight * s.gap).sum() / size == pytest.approx(0.1 + tilt * middle, rel=1e-12)
+
+
+def test_slivers():
+    """Sides that coincide to rounding make no segments; a hundred times more does."""
+    found = []
+    for part in (3e-13, 3e-12):
+        shape, x, y = pair_of("interval", 1.0 - part)
+        planes = Planes.of(shape, x[None], np.array([-1.0]))
+        found.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([-1.0])).pair) > 0)
+    assert found == [False, True]
+
+
+def test_facets_that_are_affine():
+    """Quadrature gets finer for quadrilaterals that depart from parallelograms by 1e-8, not by 1e-10."""
+    counts = []
+    for bend in (0.0, 1e-10, 1e-8):
+        shape, x, y = pair_of("quadrilateral", 0.25)
+        x[3, 0] += bend
+        planes = Planes.of(shape, x[None], np.array([1.0]))
+        counts.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0])).pair))
+    assert counts[0] == counts[1] < counts[2]
+
+
+def test_products_that_are_no_polynomials():
+    """The integrals of shape functions of a crooked quadrilateral, piece by piece, to 1e-11 of a fine rule's."""
+    shape, x, y = pair_of("quadrilateral", 0.0)
+    y = np.array([[-1.0, -1.0, 0.1], [3.0, -1.0, 0.1], [-1.0, 3.0, 0.1], [3.0, 3.0, 0.1]])
+    x[3, :2] += [0.25, -0.15]
+    planes = Planes.of(shape, x[None], np.array([1.0]))
+    s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]))
+    found = s.weight @ shape.functions(s.xi)
+    gauss, w = np.polynomial.legendre.leggauss(12)
+    xi = np.stack(np.meshgrid(0.5 * gauss + 0.5, 0.5 * gauss + 0.5, indexing="ij"), axis=-1).reshape(-1, 2)
+    tab = shape.tabulate(xi)
+    J = np.abs(np.linalg.det(np.einsum("qaf,ag->qfg", tab.dN, x[:, :2])))
+    exact = (np.outer(w, w).ravel() * 0.25 * J) @ tab.N
+    assert np.abs(found - exact).max() < 1e-11
+
+
+@pytest.mark.parametrize(("angle", "faces"), [(0.0, True), (58.0, True), (62.0, False), (95.0, False), (180.0, False)])
+def test_facets_that_face_each_other(angle, faces):
+    """A facet is opposite to another if their normals are less than 60 degrees from antiparallel, and it is in reach."""
+    s = scene(MPI.COMM_SELF, "quadrilateral", [box("quadrilateral", [0.0, -1.0], [1.0, 0.0], [1, 1])])
+    config = Configuration(fem.Function(compat.function_space(s.mesh, 1, (2,))))
+    target = MeshTarget(TargetFacets(config, s.tag("top", 0, at(1, 0.0))))
+    a = np.deg2rad(angle)
+    x = np.array([0.5, 0.1]) + np.outer([-0.5, 0.5], [np.cos(a), np.sin(a)])
+    planes = Planes.of(target.shape, x[None], np.array([1.0]))
+    assert planes.normal[0, 1] == pytest.approx(-np.cos(a))
+    assert (len(find_opposite(target, planes, x[None], np.array([0.2])).facet) > 0) == faces
+    assert not len(find_opposite(target, planes, x[None] + [0.0, 3.0], np.array([0.2])).facet)
