@@ -16,7 +16,6 @@ from functools import cache
 from math import comb, factorial
 
 import numpy as np
-import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.overlaps import Segments
@@ -42,7 +41,7 @@ class Basis:
         n_edges = len(shape.topology[1]) if shape.dim == 2 else 1
         kinds = [0] * n_vertices + ([1] * n_edges + [2] * (len(shape.nodes) - n_vertices - n_edges) if shape.degree == 2 else [])
         self.rank: Ints = np.array(kinds, dtype=np.int64)
-        self.T: Array = np.linalg.inv(self.at(shape.nodes)) if shape.degree == 2 else np.eye(n_vertices)
+        self.T: Array = np.asarray(np.linalg.inv(self.at(shape.nodes)))
         simplex = shape.cell != "quadrilateral"
         n = len(self.rank)
         # Bernstein's functions of one degree have all the same integral
@@ -128,7 +127,7 @@ def dual_functions(covered: Covered, precedence: Array) -> tuple[Array, Array]:
         precedence: of the facets' nodes ``(m, nn)``; what is hardly covered goes to the foremost node of the facet.
     """
     m, nn = covered.D.shape
-    kept: Bools = covered.D >= HARDLY_COVERED * covered.full
+    kept: Bools = HARDLY_COVERED * covered.full <= covered.D
     row, foremost = np.arange(m), np.argmax(precedence, axis=1)
     # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
     other = kept & (np.arange(nn) != foremost[:, None])

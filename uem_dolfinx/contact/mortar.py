@@ -236,8 +236,8 @@ class Mortar(NodeToSurface):
         """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
         config, n = self.config, len(self.nodes)
         own, e, normal, dofs = at.nodes, at.facet, -at.planes.normal, self.surface.dofs[facets]
-        CT = C @ self.basis.T
-        on_facet = CT[:, :, :, None] * normal[:, None, None]
+        coefficients = C @ self.basis.T
+        on_facet = coefficients[:, :, :, None] * normal[:, None, None]
         on_target = (at.A[e] @ covered.N)[..., None] * normal[e][:, None, None]
         area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", at.A, covered.G)
         f, i = np.nonzero(area > 0)
@@ -250,7 +250,7 @@ class Mortar(NodeToSurface):
         direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
         # a row follows its own facets' other nodes where it takes them in, and the target's
         other = ~np.eye(own.shape[1], dtype=bool)
-        terms = [_terms(own, own, -on_facet, other & (CT != 0)), _terms(own[e], at.opposite, on_target)]
+        terms = [_terms(own, own, -on_facet, other & (coefficients != 0)), _terms(own[e], at.opposite, on_target)]
         row, term, value = self._at_owners(terms, scale)
         # the rest keep their places on the target
         alone = np.flatnonzero(~is_covered)
@@ -260,23 +260,37 @@ class Mortar(NodeToSurface):
         gap = np.where(is_covered, gap / scale, nearest.gap)
         equations = gradients = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
-            more_facet, more_target = at.gap_derivatives()
-            # along the normals of the others, which are eliminated, rows keep to what they take in
-            more_facet = self._across(more_facet, direction, dofs)
-            more = self._at_owners([_terms(own, own, -more_facet), _terms(own[e], at.opposite, -more_target)], scale)
-            parts = [np.concatenate(pair) for pair in zip((row, term, value), more)]
-            gradients = replace(equations, **dict(zip(("row", "followed", "coefficients"), _add_up_terms(*parts))))
+            gradients = self._with_gradients(equations, at, dofs, scale)
         seen = config.to_owners(dofs.ravel(), np.ones(dofs.size))[self.nodes] > 0
         share = np.where(is_covered, size / scale, 1.0)
         return WeightedRows(equations, gradients, at, facets, is_covered, seen, ratio, size, share)
 
-    def _across(self, values: Array, direction: Array, dofs: Indices) -> Array:
-        """Coefficients ``(m, nr, nn, gdim)`` of facets' nodes without what their own equations eliminate there (collective)."""
-        here, g = direction * self.free, self.config.gdim
+    def _with_gradients(self, equations: UnitingEquations, at: SegmentPoints, dofs: Indices, scale: Array) -> UnitingEquations:
+        """The derivatives of the gaps, from rows that hand forces on and the facets' nodes ``dofs (m, nc)`` (collective).
+
+        What they have along the normals of other contactors, which are eliminated, is of second order in the angle between
+        neighbouring facets. It is taken by the contactor itself, so that the rows still hold nothing back of a rigid motion.
+        """
+        config, g, d = self.config, self.config.gdim, equations.direction
+        on_facet, on_target = at.gap_derivatives()
+        here = d * self.free
         length = np.einsum("ng,ng->n", here, here)[:, None]
-        known = np.column_stack([direction, here / np.where(length > 0, length, 1.0)])
-        seen = self.config.from_owners(self.nodes, known, dofs.ravel()).reshape(*dofs.shape, 2 * g)
-        return values - np.einsum("mjag,mag->mja", values, seen[..., g:])[..., None] * seen[:, None, :, :g]
+        here = here / np.where(length > 0, length, 1.0)
+        seen = config.from_owners(self.nodes, np.column_stack([d, here]), dofs.ravel()).reshape(*dofs.shape, 2 * g)
+        along = np.einsum("mjag,mag->mja", on_facet, seen[..., g:])[..., None] * seen[:, None, :, :g]
+        left = config.add_at_owners(at.nodes.ravel(), along.sum(axis=2).reshape(-1, g))[self.nodes] / scale[:, None]
+        more = np.einsum("ng,ng->n", left, here)
+        own = np.arange(len(self.nodes))
+        row, term, value = self._at_owners(
+            [_terms(at.nodes, at.nodes, along - on_facet), _terms(at.nodes[at.facet], at.opposite, -on_target)], scale
+        )
+        parts = [
+            (equations.row, equations.followed, equations.coefficients), (row, term, value),
+            (own, config.to_global(self.nodes), more[:, None] * d - left),
+        ]  # fmt: skip
+        row, term, value = _add_up_terms(*(np.concatenate(part) for part in zip(*parts)))
+        by = 1.0 + more
+        return replace(equations, gap=equations.gap / by, row=row, followed=term, coefficients=value / by[row, None])
 
     def _at_owners(self, parts: Sequence[tuple[Ints, Ints, Array]], scale: Array) -> tuple[Ints, Ints, Array]:
         """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
@@ -311,7 +325,7 @@ class Mortar(NodeToSurface):
 
     def approach(self, placement: Placement, which: Ints) -> UnitingEquations:
         """The equations that the contactors ``which (k,)`` would have if they were active."""
-        part = self._select(placement.details.equations, which)
+        part = self._select(placement.details.gradients, which)
         return replace(part, active=np.ones(len(part), dtype=bool))
 
     def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:

@@ -89,7 +89,7 @@ class SegmentPoints:
         Returns:
             Global nodes of the pairs that press ``(p, nc + nt)``, and blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
         """
-        (m, nc), nt = self.nodes.shape, self.opposite.shape[1]
+        nc, nt = self.nodes.shape[1], self.opposite.shape[1]
         g, size = self.to_gap.shape[1], nc + nt
         pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1))
         place = np.full(len(self.facet), -1, dtype=np.int64)

@@ -133,8 +133,8 @@ class FloatingBodies:
         return du - self.motions.part(self._open, du.reshape(-1, self._forces.config.gdim)).ravel()
 
     def _equations(self) -> UnitingEquations:
-        """Uniting equations of all pairs."""
-        return UnitingEquations.join([pair.equations().test for pair in self._pairs], self._forces.config.gdim)
+        """Uniting equations of all pairs, the derivatives of their gaps."""
+        return UnitingEquations.join([pair.equations().trial for pair in self._pairs], self._forces.config.gdim)
 
     def _fall(self, place: Callable[[], None], freely: bool, small_loads: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).

@@ -209,7 +209,9 @@ class BodySystem:
     def _rows(self) -> _Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         equations = [pair.equations() for pair in self.pairs]
-        Q, independent = self._restrict([e.test for e in equations])
+        # the derivatives of the gaps tell which motions of a body nothing holds
+        free = self.floating.hold(self.forces.free[: self.config.n_owned], self._join([e.trial for e in equations]))
+        Q, independent = self._restrict([e.test for e in equations], free)
         return _Rows(equations, independent, Q)
 
     def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
@@ -217,7 +219,7 @@ class BodySystem:
         self._apart = any(e.trial is not e.test for e in rows.equations) and not self._contested(rows)
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=self._restrict([e.trial for e in rows.equations])[0] if self._apart else rows.test,
+            trial=self._restrict([e.trial for e in rows.equations], rows.test.free)[0] if self._apart else rows.test,
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -300,12 +302,19 @@ class BodySystem:
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
-        return self._restrict([pair.equations().test for pair in self.pairs])[0]
+        return self._rows().test
 
-    def _restrict(self, parts: list[UnitingEquations]) -> tuple[Restriction, IndependentEquations | None]:
-        """P and c of the equations of all pairs, and how those that got in each other's way were resolved."""
-        equations, independent = UnitingEquations.join(parts, self.config.gdim), None
-        free = self.floating.hold(self.forces.free[: self.config.n_owned], equations)
+    def _join(self, parts: list[UnitingEquations]) -> UnitingEquations:
+        return UnitingEquations.join(parts, self.config.gdim)
+
+    def _restrict(self, parts: list[UnitingEquations], free: Bools) -> tuple[Restriction, IndependentEquations | None]:
+        """P and c of the equations of all pairs, and how those that got in each other's way were resolved (collective).
+
+        Args:
+            parts: equations of every pair.
+            free: components that neither conditions nor supports hold ``(n_owned, gdim)``.
+        """
+        equations, independent = self._join(parts), None
         if self.contestable:
             mutual = np.repeat(self.mutual, [len(part) for part in parts])
             independent = IndependentEquations(self.config, equations, free, mutual)
