@@ -46,7 +46,8 @@ class Contact:
         contactor: facets whose nodes are the contactors, or points, which have forces but no pressures: a tag, a list of tags,
             ``(meshtags, value)``, or facet indices.
         target: facets of the other body, named alike, or a rigid surface.
-        coupling: ``"node_to_surface"``, the paper's, or ``"mortar"``, from integrals over both surfaces: exact on any pair of meshes.
+        coupling: ``"node_to_surface"``, the paper's, or ``"mortar"``, from integrals over both surfaces: exact on any pair of meshes;
+            a contactor of points keeps nodal equations.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
@@ -137,12 +138,8 @@ class Contact:
         thickness = np.inf if self.thickness is None else self.thickness
         how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
         coupling: Coupling
-        if self.coupling == "mortar":
-            if self.contactor.dim == 0:
-                raise SurfaceError(
-                    f"contact '{self.name}': its contactor is points, and coupling = 'mortar' integrates over facets: give facets, or "
-                    "take coupling = 'node_to_surface'"
-                )
+        # points have no facets to integrate over
+        if self.coupling == "mortar" and self.contactor.dim > 0:
             coupling = Mortar(
                 config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how
             )
