@@ -6,6 +6,8 @@ Two tests to read first: ``test_there_and_back`` (without friction the way back 
 
 from __future__ import annotations
 
+from itertools import product
+
 from mpi4py import MPI
 
 import numpy as np
@@ -58,8 +60,13 @@ def waved(height):
     return pose
 
 
-@pytest.mark.parametrize("normals", NORMALS)
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "normals"),
+    [
+        *product(["triangle"], NORMALS), ("quadrilateral", "facet"), ("hexahedron", "facet"),
+        *(pytest.param(cell, "averaged", marks=pytest.mark.slow) for cell in ("quadrilateral", "hexahedron")),
+    ],
+)  # fmt: skip
 def test_over_vertices_convex_and_concave(cell, normals):
     """Up and down along a wave of facets, pressed onto it all the way."""
     g, height = (3 if cell == "hexahedron" else 2), 0.05
@@ -100,8 +107,10 @@ def test_there_and_back(cell, normals):
         assert np.abs(u - v).max() < 1e-6
 
 
-@pytest.mark.parametrize("normals", NORMALS)
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "normals"),
+    [*product(["triangle"], NORMALS), ("hexahedron", "facet"), pytest.param("hexahedron", "averaged", marks=pytest.mark.slow)],
+)
 def test_off_the_end_and_back(cell, normals):
     """Past the end nothing holds the block, not even a line that the last facet points along; back on it, all is as before."""
     g = 3 if cell == "hexahedron" else 2
@@ -128,7 +137,7 @@ def test_off_the_end_and_back(cell, normals):
         assert np.abs(u - v).max() < 1e-6
 
 
-@pytest.mark.parametrize("normals", NORMALS)
+@pytest.mark.parametrize("normals", ["facet", pytest.param("averaged", marks=pytest.mark.slow)])
 def test_round_a_corner(normals):
     """The target goes on down the slab's end: led round the corner, the contactors press on the other side."""
 

@@ -31,7 +31,7 @@ def cantilevers(w=-28.0, contactor="A", **how):
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, rtol=1e-11), tags
 
 
-@pytest.mark.parametrize("steps", [28, 45])
+@pytest.mark.parametrize("steps", [28, pytest.param(45, marks=pytest.mark.slow)])
 def test_departure(steps):
     """Wherever the stations are: in contact up to the end, then in one uncut step to the state that was never in contact."""
     problem, tags = cantilevers(thickness=4.0)

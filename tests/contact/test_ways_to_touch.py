@@ -104,8 +104,13 @@ def meet(
 # -- poses, units, numbering -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("height", [0.0, 0.3, -0.2])
+@pytest.mark.parametrize(
+    ("height", "law"),
+    [
+        (0.0, "linear"), (0.3, "finite"), (-0.2, "finite"),
+        *(pytest.param(*how, marks=pytest.mark.slow) for how in ((0.0, "finite"), (0.3, "linear"), (-0.2, "linear"))),
+    ],
+)  # fmt: skip
 @few
 @given(angle=st.floats(-3.2, 3.2), size=st.floats(-9, 6), stiff=st.floats(-3, 11), seed=st.integers(0, 99))
 def test_force_turns_with_the_scene(law, height, angle, size, stiff, seed):
@@ -203,7 +208,9 @@ def overlapping(cell, n, overlap):
     assert drawn.force[-1] > 0.3 * overlap
 
 
-@pytest.mark.parametrize("cell,n", [("triangle", (3, 4)), ("quadrilateral", (4, 4)), ("triangle", (5, 2))])
+@pytest.mark.parametrize(
+    "cell,n", [("triangle", (3, 4)), ("quadrilateral", (4, 4)), pytest.param("triangle", (5, 2), marks=pytest.mark.slow)]
+)
 @few
 @given(exponent=st.floats(-12, np.log10(0.125)))
 @example(exponent=np.log10(0.125))
@@ -269,9 +276,10 @@ def nudged(nudge, *, height=0.0, cell="triangle", normals="facet", law="finite",
 @pytest.mark.parametrize(
     "cell,normals,height,law",
     [
-        ("triangle", "facet", 0.0, "linear"), ("triangle", "averaged", 0.0, "finite"), ("quadrilateral", "facet", 0.0, "finite"),
-        ("triangle", "averaged", 0.3, "finite"), ("triangle", "facet", -0.2, "finite"), ("quadrilateral", "averaged", -0.2, "linear"),
-        ("hexahedron", "facet", 0.0, "linear"),
+        ("triangle", "facet", 0.0, "linear"), ("triangle", "averaged", 0.0, "finite"), ("triangle", "averaged", 0.3, "finite"),
+        ("triangle", "facet", -0.2, "finite"), ("hexahedron", "facet", 0.0, "linear"),
+        pytest.param("quadrilateral", "facet", 0.0, "finite", marks=pytest.mark.slow),
+        pytest.param("quadrilateral", "averaged", -0.2, "linear", marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_contactor_next_to_a_vertex(cell, normals, height, law):

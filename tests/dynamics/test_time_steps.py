@@ -32,7 +32,15 @@ def first_mode(X):
 # ---------------------------------------------------------------------------------------------- rules
 
 
-@pytest.mark.parametrize("scheme", [uem.newmark(), uem.newmark(0.3, 0.5), uem.generalised_alpha(0.5), uem.generalised_alpha(0.0)])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        uem.newmark(),
+        pytest.param(uem.newmark(0.3, 0.5), marks=pytest.mark.slow),
+        pytest.param(uem.generalised_alpha(0.5), marks=pytest.mark.slow),
+        uem.generalised_alpha(0.0),
+    ],
+)
 def test_second_order(scheme):
     """The swing of a held bar converges like dt^2 to the mode of the lumped chain, whose frequency is known."""
     n = 20
@@ -128,9 +136,9 @@ def test_damping_form(rate):
 @pytest.mark.parametrize(
     ("cell", "mass"),
     [
-        ("quadrilateral", uem.lumped_mass),
+        pytest.param("quadrilateral", uem.lumped_mass, marks=pytest.mark.slow),
         ("quadrilateral", uem.consistent_mass),
-        ("hexahedron", uem.consistent_mass),
+        pytest.param("hexahedron", uem.consistent_mass, marks=pytest.mark.slow),
         ("triangle", uem.lumped_mass),
     ],
 )
@@ -150,7 +158,7 @@ def test_bar_hits_wall(cell, mass):
     assert np.allclose(p - p[0], impulses, atol=1e-9 * abs(p[0]))
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e3])
+@pytest.mark.parametrize("unit", [1e-9, pytest.param(1e3, marks=pytest.mark.slow)])
 def test_units(unit):
     """The same impact in nanometres and kilometres, with the density that keeps the wave's time."""
     here, there = Bar(20), Bar(20, unit=unit)

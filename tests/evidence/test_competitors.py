@@ -72,7 +72,12 @@ def test_multipliers_find_the_united_solution(cell, degree):
 
 
 @pytest.mark.parametrize(
-    "method,cell", [("penalty", "quadrilateral"), ("penalty_surface", "quadrilateral"), ("penalty", "hexahedron")]
+    "method,cell",
+    [
+        ("penalty", "quadrilateral"),
+        ("penalty_surface", "quadrilateral"),
+        pytest.param("penalty", "hexahedron", marks=pytest.mark.slow),
+    ],
 )
 def test_penalty_converges_with_its_stiffness(method, cell):
     """Overlap and error go like the inverse of the stiffness; node to surface ends at the united solution."""

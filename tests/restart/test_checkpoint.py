@@ -214,8 +214,15 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
             assert all(COMM.allgather(good and np.array_equal(c.pair.reserved, wanted.active)))
 
 
-@pytest.mark.parametrize("normals", ["facet", "averaged"])
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
+@pytest.mark.parametrize(
+    ("cell", "normals"),
+    [
+        ("triangle", "averaged"), ("quadrilateral", "facet"), ("tetrahedron", "facet"),
+        pytest.param("triangle", "facet", marks=pytest.mark.slow),
+        pytest.param("quadrilateral", "averaged", marks=pytest.mark.slow),
+        pytest.param("tetrahedron", "averaged", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_going_on_is_not_having_stopped(cell, normals, folder):
     """Ten steps over the facets, and the last six of them from a file: the same bits in serial, the same to 1e-9 on more ranks."""
     s, contact, whole = slider(COMM, cell, normals=normals)

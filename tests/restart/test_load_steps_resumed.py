@@ -58,7 +58,9 @@ def kept(kind, folder):
     return there.problem.progress.steps
 
 
-@pytest.mark.parametrize("stops", [(3,), (4, 1), (3, 2, 1)] if COMM.size == 1 else [(4, 1)], ids=str)
+@pytest.mark.parametrize(
+    "stops", [pytest.param((3,), marks=pytest.mark.slow), (4, 1), (3, 2, 1)] if COMM.size == 1 else [(4, 1)], ids=str
+)
 @pytest.mark.parametrize("kind", RAMPS)
 def test_interrupted_is_uninterrupted(kind, stops, folder):
     """Left in mid-run, in the first call of ``load_steps`` or in a later one, once or several times, and gone on with."""

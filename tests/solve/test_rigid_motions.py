@@ -59,3 +59,18 @@ def test_what_counts_as_loaded(body):
         if driven:
             assert np.argmax(np.abs(motion)) == 0 and motion[0] > 0
         assert motions.share == pytest.approx(part, rel=0.05)
+
+
+def test_supports_are_the_same_on_every_number_of_ranks():
+    """The corners of a square hold it equally well: which of them do is settled by their places, not by ranks or rounding."""
+
+    def supports(comm):
+        s = scene(comm, "quadrilateral", [box("quadrilateral", [-0.5, -0.5], [0.5, 0.5], [4, 4])])
+        u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+        problem = uem.UnitedProblem(linear(u, 1.0), u)
+        config = problem.config
+        motions = RigidMotions(config, problem.forces.free[: config.n_owned], False)
+        i, c = np.nonzero(motions.supports(motions.open_motions(None), UnitingEquations.join([], 2)))
+        return sorted(sum(comm.allgather([(*config.X[k], d) for k, d in zip(i, c)]), []))
+
+    assert supports(COMM) == supports(MPI.COMM_SELF) and len(supports(COMM)) == 3

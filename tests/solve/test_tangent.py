@@ -66,7 +66,7 @@ def test_gap_derivatives_on_a_facet(cell, degree, height):
     assert np.abs(H - H.transpose(0, 2, 1)).max() < 1e-12
     u = config.displacement
     gap, gradient = gradients()
-    for i in range(len(points)):
+    for i in (0, len(points) - 1):
         for k in range(1 + p.weights.shape[1]):
             for c in range(g):
                 values = []

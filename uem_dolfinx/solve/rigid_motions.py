@@ -181,10 +181,12 @@ class RigidMotions:
         rows = self._spread(self._modes(self._places, own)[i, :, c], own[i]) @ motions
         for _ in range(motions.shape[1]):
             size = np.linalg.norm(rows, axis=1)
-            best = int(size.argmax()) if len(size) else -1
-            # equally good ones on several ranks are told apart by rank
-            offers = self.comm.allgather(float(size[best]) if best >= 0 else -1.0)
-            winner = int(np.argmax(offers))
+            largest = self.comm.allreduce(float(size.max(initial=0.0)), op=MPI.MAX)
+            # of equally good ones the first by its place in the drawing, whichever rank has it
+            good = np.flatnonzero(size >= (1.0 - OPEN) * largest)
+            keys = [(*config.X[i[k]], c[k]) for k in good]
+            best, offers = int(good[keys.index(min(keys))]) if keys else -1, self.comm.allgather(min(keys, default=None))
+            winner = offers.index(min(offer for offer in offers if offer is not None))
             if winner == self.comm.rank:
                 pins[i[best], c[best]] = True
             direction = self.comm.bcast(rows[best] / size[best] if winner == self.comm.rank else None, root=winner)
