@@ -49,9 +49,9 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
     return parser.parse_args()
 
 
-def cg(amg: str = "", rtol: float = 1e-10) -> dict[str, Any]:
-    """PETSc options of CG with algebraic multigrid, hypre where PETSc has it."""
-    return {"ksp_type": "cg", "ksp_rtol": rtol} | uem.multigrid_options(amg)
+def cg(amg: str = "", rtol: float | None = None) -> dict[str, Any]:
+    """PETSc options of CG with algebraic multigrid, hypre where PETSc has it; without ``rtol`` as accurate as Newton's method can use."""
+    return {"ksp_type": "cg"} | uem.multigrid_options(amg) | ({} if rtol is None else {"ksp_rtol": rtol})
 
 
 def numbers(text: str, mark: str = ",") -> list[int]:

@@ -13,7 +13,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import EnergyGivenError, InputError, SpaceError, UEMError
+from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
 from uem_dolfinx.log import logger, progress
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
@@ -89,7 +89,7 @@ def time_steps(
         dt: nominal length of the steps.
         end: time to reach.
         event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``: the step is parted there,
-            so that a step begins at the instant. None leaves steps as they are.
+            so that a step begins at the instant, unless rounding hides the forces of steps that short. None leaves steps as they are.
         checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
             either here or, for writers that are to resume, already by ``checkpoint.begin(problem.state())``.
 
@@ -170,18 +170,22 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
     if tolerance is None or length <= tolerance or _touching(problem) == before:
         return length, iterations
     # the first trial asks whether the step begins at the instant
-    low, high, trial = 0.0, length, tolerance
+    low, high, trial, reached = 0.0, length, tolerance, 0.0
     while high - low > tolerance:
         problem.restore()
         try:
             _attempt(problem, trial)
             same = _touching(problem) == before
+            reached = trial if same else reached
         except MENDABLE:
             same = False
+        except PrecisionError:
+            # a step so short that rounding hides its forces: the instant is looked for later
+            same = True
         low, high = (trial, high) if same else (low, trial)
         trial = 0.5 * (low + high)
     problem.restore()
-    length = low or length
+    length = reached or length
     return length, _attempt(problem, length)
 
 
