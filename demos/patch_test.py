@@ -15,6 +15,9 @@ python3 demos/patch_test.py --plot patch_test.png
 # receives a constant pressure exactly if every function of its surface is one of the contactor's surface too, that is, if the
 # meshes are **nested**. In a **single pass** over other meshes it receives the same resultants, but unevenly. In **two passes**
 # each surface is once the contactor and once the target, and a constant pressure passes through other meshes too.
+#
+# With `--coupling mortar` contact is united in integrals over both surfaces instead of nodes, and the pressure passes exactly, in a
+# single pass, through any pair of meshes.
 
 # %%
 import common
@@ -23,19 +26,33 @@ import ufl
 from common import comm
 from dolfinx import fem
 
+from evidence import methods, patches
+
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, n=4, quads=0, dim=("both", "2", "3"), degree=("both", "1", "2"))
+args = common.arguments(
+    __doc__, n=4, quads=0, dim=("both", "2", "3"), degree=("both", "1", "2"), coupling=("node_to_surface", "mortar")
+)
 E, nu, p = 100.0, 0.3, 1.0
 
 
 # %% [markdown]
 # ## One scene
-# The error is the largest deviation of the vertical stress, over the middles of all cells.
+# The error is the largest deviation of the vertical stress, over the middles of all cells; the strict one is the largest of any
+# stress over p, at the nodes of each cell, or of any displacement over the largest.
 
 
 # %%
-def solve(dim: int, degree: int, n: tuple[int, int], passes: tuple[str, ...]) -> tuple[uem.UnitedProblem, fem.Function, float]:
+def solve(
+    dim: int,
+    degree: int,
+    n: tuple[int, int],
+    passes: tuple[str, ...],
+    *,
+    quads: int = args.quads,
+    moved: float = 0.0,
+    width: float = 1.0,
+) -> tuple[uem.UnitedProblem, fem.Function, float, float]:
     """Press the blocks together.
 
     Args:
@@ -43,87 +60,106 @@ def solve(dim: int, degree: int, n: tuple[int, int], passes: tuple[str, ...]) ->
         degree: of the displacement.
         n: cells along the sides of the lower and of the upper block.
         passes: the contactor of each pass, ``"lower"`` or ``"upper"``.
+        quads: 1 for quadrilaterals and hexahedra.
+        moved: how far nodes are moved at random, over the size of a cell.
+        width: of the lower block, at least 1; what the upper one leaves uncovered is loaded by p.
 
     Returns:
-        The problem, its vertical stress over p in each cell, and the error of that.
+        The problem, its vertical stress over p in each cell, the error of that, and the strict error.
     """
     mesh, tags = uem.read_gmsh(
-        common.MESHES / "blocks.geo", comm, gdim=dim, parameters={"dim": dim, "n_1": n[0], "n_2": n[1], "quads": args.quads}
+        common.MESHES / "blocks.geo", comm, gdim=dim, parameters={"dim": dim, "n_1": n[0], "n_2": n[1], "quads": quads}
     )
+    patches.move_nodes(mesh.geometry.x, moved / max(n))
+    patches.widen(mesh, tags["block_1"], width)
     V = uem.function_space(mesh, degree, (dim,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     material = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d")
     F = material.residual(u, v) * ufl.dx + p * v[dim - 1] * uem.ds(tags["top_2"])
+    x = ufl.SpatialCoordinate(mesh)
+    if width > 1:
+        F += p * patches.beyond(x[0], 1.0, width / n[0], degree) * v[dim - 1] * uem.ds(tags["top_1"])
     bcs = [uem.dirichlet(V, tags["bottom_1"], dim - 1)]
     bcs += [uem.dirichlet(V, tags[sides], i) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
     lower, upper = tags["top_1"], tags["bottom_2"]
-    contacts = [
-        uem.Contact(contactor=lower, target=upper) if side == "lower" else uem.Contact(contactor=upper, target=lower)
-        for side in passes
-    ]
+    contacts = [uem.Contact(*((lower, upper) if side == "lower" else (upper, lower)), coupling=args.coupling) for side in passes]
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="patch_", verbose=args.verbose)
     problem.solve()
     stress = fem.Function(uem.function_space(mesh, ("DG", 0)), name="vertical_stress")
     uem.interpolate(stress, material.stress(u)[dim - 1, dim - 1] / p)
     error = np.abs(stress.x.array + 1).max(initial=0.0)
-    return problem, stress, float(max(comm.allgather(error)))
+    strict = patches.strict_error(u, material.stress(u), p, E, nu)
+    return problem, stress, float(max(comm.allgather(error))), strict
 
 
 # %% [markdown]
-# ## The cases
+# ## The cases of nodes on facets
 # The finer mesh has twice as many cells along each side if it is nested, and one less if it is not. With quadratic displacements
 # the nodes between the vertices are contactors as well. Two passes unite linear bodies exactly on any two of these meshes: traces
 # that agree at the nodes of both sides agree everywhere. Quadratic traces may still differ between those nodes, so that two passes
 # are exact on nested meshes only.
 
 # %%
-nested, others = (args.n, 2 * args.n), (args.n, 2 * args.n - 1)
-cases = {
+scenes = {
     f"{dim}d_degree{degree}": (dim, degree)
     for dim in ((2, 3) if args.dim == "both" else (int(args.dim),))
     for degree in ((1, 2) if args.degree == "both" else (int(args.degree),))
 }
-sides = {"finer": "upper", "coarser": "lower"}
-nested_error = {case: solve(*scene, nested, ("upper",))[2] for case, scene in cases.items()}
-single_pass_error = {
-    f"{case}_{body}": solve(*scene, others, (side,))[2] for case, scene in cases.items() for body, side in sides.items()
-}
-two_pass_error = {
-    case: solve(dim, degree, others if degree == 1 else nested, ("lower", "upper"))[2] for case, (dim, degree) in cases.items()
-}
+n, exact, results = args.n, {}, {}
+nested, others = (n, 2 * n), (n, 2 * n - 1)
+if args.coupling == "node_to_surface":
+    table, sides = [], {"finer": "upper", "coarser": "lower"}
+    single = {(case, body): solve(*scene, others, (side,))[2] for case, scene in scenes.items() for body, side in sides.items()}
+    exact = {case: solve(*scene, nested, ("upper",))[2] for case, scene in scenes.items()}
+    both = {
+        case: solve(d, degree, others if degree == 1 else nested, ("lower", "upper"))[2] for case, (d, degree) in scenes.items()
+    }
+    for case in scenes:
+        table.append({"case": case, "nested": exact[case]})
+        table[-1] |= {f"{body} on {other}": single[case, body] for body, other in zip(sides, reversed(sides))}
+        table[-1]["two passes"] = both[case]
+    results |= {"error": table, "nested_error": dict(exact), "two_pass_error": both}
+    results["single_pass_error"] = {"_".join(which): error for which, error in single.items()}
+    exact |= {f"{case}, two passes": error for case, error in both.items()}
 
 # %% [markdown]
-# ## The figures
+# ## The cases of mortar
+# Meshes n:m that are not nested, nodes moved at random, a lower block that is wider and ends its contact within a facet, of which
+# that leaves a part, or as little as a hundredth; and each side once as contactor. In 3D the wider block is of hexahedra.
+# Uniting in integrals does not spoil the condition of the system: that of one body of the finer mesh is as large.
 
 # %%
-table = [
-    {
-        "case": case,
-        "nested": nested_error[case],
-        "finer on coarser": single_pass_error[f"{case}_finer"],
-        "coarser on finer": single_pass_error[f"{case}_coarser"],
-        "two passes": two_pass_error[case],
-    }
-    for case in cases
-]
-errors = {"nested_error": nested_error, "single_pass_error": single_pass_error, "two_pass_error": two_pass_error}
-common.report(args, {"error": table, **errors})
+if args.coupling == "mortar":
+    conditions = {}
+    for case, (dim, degree) in scenes.items():
+        for name, (cells, how) in patches.PAIRS[dim].items():
+            for side in ("lower", "upper"):
+                problem, _, _, exact[f"{case}_{name}_{side}"] = solve(dim, degree, cells, (side,), **how)
+                if dim == 2 and not how and comm.size == 1:
+                    whole = patches.merged_condition(max(cells), degree, E, nu)
+                    conditions[f"{case}_{name}_{side}"] = methods.condition_number(problem) / whole
+    results = {"mortar_error": exact, "condition_ratio": max(conditions.values(), default=None), "condition_ratios": conditions}
+common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# The vertical stress over p with linear triangles: in a single pass, with the finer body as contactor, and in two passes.
+# The vertical stress over p with linear triangles: in a single pass, with the finer body as contactor, and in two passes; with
+# mortar in a single pass with either body as contactor.
 
 # %%
 if args.plot or args.output:
-    single, both = (solve(2, 1, others, passes) for passes in (("upper",), ("lower", "upper")))
+    shown = {"finer as contactor": ("upper",), "two passes": ("lower", "upper")}
+    if args.coupling == "mortar":
+        shown = {"finer as contactor": ("upper",), "coarser as contactor": ("lower",)}
+    solved = [solve(2, 1, others, passes) for passes in shown.values()]
     if args.plot:
         levels = np.linspace(-1.055, -0.945, 12)
-        with uem.figure(args.plot, comm, panels=2) as (left, right):
-            for panel, (problem, stress, _), label in ((left, single, "single pass"), (right, both, "two passes")):
+        with uem.figure(args.plot, comm, panels=2) as panels:
+            for panel, (problem, stress, *_), label in zip(panels, solved, shown):
                 uem.plot_scene(problem, panel, field=stress, label=f"$\\sigma_{{yy}} / p$, {label}", levels=levels)
     if args.output:
-        with uem.ResultsWriter(f"{args.output}/patch_test", both[0]) as writer:
+        with uem.ResultsWriter(f"{args.output}/patch_test", solved[-1][0]) as writer:
             writer.write(1.0)
 
 # %%
-assert max(*nested_error.values(), *two_pass_error.values()) < 1e-12
+assert max(exact.values()) < {"node_to_surface": 1e-12, "mortar": 1e-11}[args.coupling], exact

@@ -14,7 +14,8 @@ python3 demos/stack.py --plot stack.png
 # so that the stack is three springs in series, which carry F = d / (1/M1 + 1/M2 + 1/M3), and interface k settles by
 # F (1/M1 + ... + 1/Mk). The meshes grow finer from the bottom to the top, and every block rests with its bottom, as contactor, on
 # the top of the one below, its target. Each node of the middle block's bottom is eliminated; its top is followed by the contactors
-# of the upper block. Chains of bodies ask for nothing else than that P is built in the order in which bodies follow each other.
+# of the upper block. Chains of bodies ask for nothing else than that P is built in the order in which bodies follow each other. With
+# `--coupling mortar` the meshes need not be nested.
 
 # %%
 import common
@@ -25,7 +26,7 @@ from dolfinx import fem
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, n=4, dim=("2", "3"), degree=1, ratio=1e4, d=0.1, quads=0)
+args = common.arguments(__doc__, n=4, dim=("2", "3"), degree=1, ratio=1e4, d=0.1, quads=0, coupling=("node_to_surface", "mortar"))
 dim, nu = int(args.dim), 0.3
 E_of = (1.0, args.ratio, 1.0)
 
@@ -45,7 +46,7 @@ u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 F = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d").residual(u, v) * ufl.dx
 bcs = [uem.dirichlet(V, tags["bottom_1"], dim - 1), uem.dirichlet(V, tags["top_3"], dim - 1, -args.d)]
 bcs += [uem.dirichlet(V, tags[sides], i) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
-contacts = [uem.Contact(contactor=tags[f"bottom_{k + 1}"], target=tags[f"top_{k}"]) for k in (1, 2)]
+contacts = [uem.Contact(contactor=tags[f"bottom_{k + 1}"], target=tags[f"top_{k}"], coupling=args.coupling) for k in (1, 2)]
 
 # %% [markdown]
 # ## The solution

@@ -351,8 +351,9 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
         density = _density(config, rho)
         rows = forms.assemble_array(V, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx)).reshape(-1, config.gdim)[:, 0]
         of_cells = _cell_masses(config, density)
-        points, weights = forms.quadrature_rule(compat.cell_name(config.mesh), 2 * config.degree)
-        N = forms.create_lagrange_element(compat.cell_name(config.mesh), config.degree).tabulate(0, points)[0, :, :, 0]
+        cell = compat.cell_name(config.mesh)
+        points, weights = forms.quadrature_rule(cell, 2 * config.degree)
+        N = forms.create_lagrange_element(cell, config.degree).tabulate(0, points)[0, :, :, 0]
         shares = np.diag(N.T @ (weights[:, None] * N))
         cells = compat.cell_dofs(V)[: len(of_cells)]
         scaled = config.to_owners(cells.ravel(), np.outer(of_cells, shares / shares.sum()).ravel())[: config.n_owned]
