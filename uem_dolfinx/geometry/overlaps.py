@@ -19,10 +19,10 @@ from uem_dolfinx.geometry.shapes import FacetShape
 #: A segment that is smaller is rounding of two sides that coincide.
 #: [convention; part of the contactor facet; test_overlaps.py::test_slivers]
 SLIVER = 1e-12
-#: Maps of facets that depart less from affine ones are affine.
+#: Maps of facets that depart less from affine ones are integrated like these, to 1e-12.
 #: [convention; part of the largest facet; test_overlaps.py::test_facets_that_are_affine]
-STRAIGHT = 1e-9
-#: Rules are by so much of a higher degree where maps are not affine and products of shape functions no polynomials.
+STRAIGHT = 0.01
+#: Rules are by so much of a higher degree where maps depart more, and products of shape functions are no polynomials.
 #: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
 BENT = 8
 #: Newton iterations for the place of a point in the plane of a facet whose map is not affine.
@@ -219,14 +219,20 @@ def _cross(a: Array, b: Array) -> Array:
 
 def locate(shape: FacetShape, y: Array, at: Array) -> Array:
     """Reference coordinates of the points of facets with nodes ``y (q, nn, fdim)`` in a plane that lie at ``at (q, fdim)``."""
+    sides = y[:, 1 : shape.dim + 1] - y[:, :1]
+    xi = _solve(sides.transpose(0, 2, 1), at - y[:, 0])
     if shape.affine:
-        sides = y[:, 1 : shape.dim + 1] - y[:, :1]
-        return _solve(sides.transpose(0, 2, 1), at - y[:, 0])
-    xi = np.tile(shape.middle, (len(at), 1))
+        return xi
+    bilinear = shape.degree == 1
+    twist = y[:, 0] - y[:, 1] - y[:, 2] + y[:, 3] if bilinear else np.zeros(0)
     for _ in range(IN_MEAN_PLANE):
-        tab = shape.tabulate(xi)
-        left = at - np.einsum("qa,qaf->qf", tab.N, y)
-        step = _solve(np.einsum("qae,qaf->qfe", tab.dN, y), left)
+        if bilinear:
+            there = y[:, 0] + np.einsum("qf,qfe->qe", xi, sides) + (xi[:, 0] * xi[:, 1])[:, None] * twist
+            slope = sides.transpose(0, 2, 1) + twist[:, :, None] * xi[:, None, ::-1]
+        else:
+            tab = shape.tabulate(xi)
+            there, slope = np.einsum("qa,qaf->qf", tab.N, y), np.einsum("qae,qaf->qfe", tab.dN, y)
+        step = _solve(slope, at - there)
         xi += step
         if not (np.abs(step) > 1e-14).any():
             break
