@@ -291,16 +291,17 @@ def test_newton_is_quadratic(cell, contactor):
     assert b.contact.balance().force < 1e-13 and b.contact.balance().moment < 1e-13
 
 
+@pytest.mark.parametrize("sliding", ["finite", "small", "fixed"])
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_rigid_plane(cell, degree):
-    """A constant pressure on a plane that moves, on any mesh."""
+def test_rigid_plane(cell, degree, sliding):
+    """A constant pressure on a plane that moves, on any mesh and with any sliding."""
     g = 2 if cell == "triangle" else 3
     s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [3] * g)])
     V = compat.function_space(s.mesh, degree, (g,))
     u = fem.Function(V)
     plane = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0])
-    contact = uem.Contact(s.tag("base", 0, at(g - 1, 0.0)), plane, coupling="mortar")
+    contact = uem.Contact(s.tag("base", 0, at(g - 1, 0.0)), plane, coupling="mortar", sliding=sliding)
     bcs = clamp(V, s.tag("top", 0, at(g - 1, 1.0)), g - 1)
     for c, end in product(range(g - 1), (0.0, 1.0)):
         bcs += clamp(V, s.tag("side", 0, at(c, end)), c)

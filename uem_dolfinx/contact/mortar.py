@@ -114,7 +114,7 @@ class Mortar(NodeToSurface):
             rows = self._kept = self._unite(nearest, points)
         else:
             nearest = self.target.follow(points, self._anchor)
-            rows = self._follow(self._kept, nearest, points)
+            rows = self._follow(self._kept, nearest)
         eq = rows.equations
         seen: Any = replace(nearest, gap=eq.gap, normal=eq.direction)  # type: ignore[type-var]
         if self.target.n_nodes:
@@ -137,14 +137,18 @@ class Mortar(NodeToSurface):
         can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
         return can
 
-    def _follow(self, rows: WeightedRows, nearest: Projection, points: Array) -> WeightedRows:
+    def _follow(self, rows: WeightedRows, nearest: Projection) -> WeightedRows:
         """The same rows where contactors and target are now (collective)."""
-        eq = rows.equations
+        eq, n = rows.equations, self.config.n_owned
         if self.target.n_nodes:
-            n = self.config.n_owned
             gap = self._along(eq, self.config.x[:n])
         else:
-            gap = eq.gap
+            assert self._anchor is not None
+            # what the nodes have come nearer, as a displacement along the rows
+            lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
+            way = np.zeros((n, self.config.gdim))
+            way[self.nodes] = ((nearest.gap - self._anchor.gap) / np.where(lean > FACING, lean, 1.0))[:, None] * eq.direction
+            gap = eq.gap + self._along(eq, way)
         moved = replace(eq, gap=gap)
         return replace(rows, equations=moved, gradients=moved)
 
