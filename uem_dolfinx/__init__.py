@@ -5,7 +5,7 @@
 The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
 
 1. Unite: the normal displacement of each active contactor follows the target: ``contact.node_to_surface`` and
-   ``contact.bernstein`` write the equations, ``algebra.restriction`` builds P and c from them.
+   ``contact.bernstein``, or ``contact.mortar``, write the equations, ``algebra.restriction`` builds P and c from them.
 2. Solve the united system (``algebra.linear_solver``), then return each contactor along the normal onto the moved target
    (``contact.pair``, with projections from ``geometry``).
 3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.system``.

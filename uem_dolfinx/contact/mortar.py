@@ -305,10 +305,10 @@ class Mortar(NodeToSurface):
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
-    def foreseen(self, placement: Placement, du: Array) -> Array:
+    def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
         """Weighted gaps after an increment (collective)."""
         rows: WeightedRows = placement.details
-        return placement.gap + self._along(rows.gradients, du)
+        return placement.gap + self._along(rows.equations if tested else rows.gradients, du)
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors near the target that it does not cover, or that it has let go of in this step and hardly covers again.
