@@ -35,7 +35,7 @@ def spaces(mesh):
     found = {f"P{k}{shape}": (compat.function_space(mesh, k, shape), None) for k, shape in product((1, 2), ((), (g,), (g, g)))}
     found |= {f"DG0{shape}": (compat.function_space(mesh, ("DG", 0), shape), middle) for shape in ((), (g,))}
     for k, shape in ((2, ()), (3, (4,))):
-        found[f"Q{k}{shape}"] = compat.quadrature_space(mesh, k, shape), forms.quadrature_rule(mesh, k)[0]
+        found[f"Q{k}{shape}"] = compat.quadrature_space(mesh, k, shape), forms.quadrature_rule(compat.cell_name(mesh), k)[0]
     return found
 
 
