@@ -10,7 +10,8 @@ python3 demos/stability.py --methods united --quick
 # bodies that nothing holds, steps that fly through the target. Each column is a method. A cell is
 #
 # - *correct*: force and energy are right to 1 %, no contactor is deeper in its target than 1e-3 of an element, and forces are in
-#   equilibrium, along normals and in pairs, to 1e-3;
+#   equilibrium, along normals and in pairs, to 1e-3; with mortar, whose conditions hold in the mean over the facets around a
+#   contactor, gaps are these means and normals those of its own facets;
 # - a *named error*: the method says what it cannot do, which is what it should do where a case contradicts itself;
 # - *wrong*: anything else, with the figure that shows it.
 #

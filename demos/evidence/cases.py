@@ -77,7 +77,8 @@ class Column:
 
 
 COLUMNS = (
-    Column("united", "united"),
+    Column("united", "united", words="nodes on facets"),
+    Column("mortar", "mortar", words="integrals over facets"),
     Column("penalty", "penalty", 10.0, words="10 E/h of the softer body"),
     Column("penalty_stiff", "penalty", 100.0, True, "100 E/h of the stiffer body"),
     Column("penalty_surface", "penalty_surface", 10.0, words="10 E/h of the softer body"),
@@ -113,7 +114,7 @@ class Trial:
             options: of ``UnitedProblem``.
         """
         options.setdefault("petsc_options_prefix", "stability_")
-        options.setdefault("rtol", 1e-10 if self.column.method == "united" else 1e-8)
+        options.setdefault("rtol", 1e-10 if self.column.method in methods.OWN else 1e-8)
         return methods.create(self.column.method, F, u, parameter=self.column.parameter(E, h), **options)
 
     def load(self, problem: uem.UnitedProblem, steps: int = 1) -> None:
@@ -303,6 +304,12 @@ class BoxScene(Scene):
         """Let two surfaces touch."""
         self.contacts.append(uem.Contact(contactor=contactor, target=target, **options))
         return self.contacts[-1]
+
+    def unite_both(self, trial: Trial, one: uem.Tag, other: uem.Tag) -> None:
+        """Let two surfaces touch, each contactor and target; mortar, which is exact so, in one pass."""
+        self.unite(one, other)
+        if trial.column.method != "mortar":
+            self.unite(other, one)
 
     def solve(self, trial: Trial, h: float, steps: int = 1, **options: Any) -> uem.UnitedProblem:
         """Set the problem up for a method and load it."""

@@ -1,6 +1,7 @@
 """The conditions of frictionless contact, read from the bodies: residuals, places of nodes and facets, and nothing of the method.
 
-Every contactor is compared with every facet of its target, one by one, so that no search is trusted either.
+Every contactor is compared with every facet of its target, one by one, so that no search is trusted either. Of mortar, whose
+conditions hold in the mean, the weighted gaps are its own: the tests of the package compare them with a slow reference.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.optimize import nnls
 import uem_dolfinx as uem
 from evidence.cases import BALANCE, COMM, OVERLAP, BoxScene, Trial
 from evidence.scenes import Array
+from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
@@ -41,6 +43,8 @@ class Place:
 def places(scene: BoxScene, contact: uem.Contact, h: float) -> list[Place]:
     """Places of this rank's contactors (collective)."""
     points, target = contact.pair.points, contact.pair.target
+    if isinstance(contact.pair.coupling, Mortar):
+        return _mean_places(contact)
     if not isinstance(contact.target, uem.Tag):
         p = target.project(points)
         return [Place(float(gap), normal[None], True) for gap, normal in zip(p.gap, p.normal)]
@@ -65,6 +69,20 @@ def places(scene: BoxScene, contact: uem.Contact, h: float) -> list[Place]:
             height = float(np.copysign(np.linalg.norm(arm), inside - away))
         found.append(Place(height, normals, min(away, inside) <= AS_NEAR * h))
     return found
+
+
+def _mean_places(contact: uem.Contact) -> list[Place]:
+    """Places of this rank's contactors with mortar, whose conditions hold in the mean over the facets around each (collective).
+
+    The gap is the weighted one, infinite where the target covers none of a node's facets, and none where their neighbours' equations
+    take in what is hardly covered. Forces lie in the cone of these facets' own normals.
+    """
+    pair, surface = contact.pair, contact.pair.coupling.surface
+    known = COMM.allgather((surface.nodes.ravel(), -surface.normals().reshape(-1, contact.config.gdim)))
+    nodes, normals = (np.concatenate(part) for part in zip(*known))
+    own = contact.config.to_global(pair.nodes)
+    gaps = np.where(pair.off, np.where(pair.placement.details.ratio > 0, 0.0, np.inf), pair.gap)
+    return [Place(float(gap), normals[nodes == node], bool(np.isfinite(gap))) for node, gap in zip(own, gaps)]
 
 
 def _off_cone(normals: Array, force: Array) -> float:

@@ -61,9 +61,10 @@ def mesh_ratio(n: tuple[int, int], two_pass: bool, trial: Trial) -> None:
     """Facets of very different sizes, the upper side as contactor, or both sides."""
     scene = springs(([n[0], 4], [n[1], 4]))
     low, high = scene.side(0, 1, 1), scene.side(1, 1, 0)
-    scene.unite(high, low)
     if two_pass:
-        scene.unite(low, high)
+        scene.unite_both(trial, high, low)
+    else:
+        scene.unite(high, low)
     scene.solve(trial, 1 / max(n))
     if n[1] >= n[0] or two_pass:
         settled(trial, scene, 0.01 * oedometric() / 2, 1 / max(n))

@@ -49,7 +49,7 @@ def draw(panel: Any, points: Sequence[Point], x: str, y: str, title: str = "") -
         power = slope(shown, x, y) if x != "seconds" else None
         text += "" if power is None else f", slope {power:.2f}"
         color, marker = f"C{i}", MARKERS[i % len(MARKERS)]
-        front = {"zorder": 3, "lw": 2.0} if name.startswith("united") else {"lw": 1.0}
+        front = {"zorder": 3, "lw": 2.0} if name.startswith(("united", "mortar")) else {"lw": 1.0}
         panel.loglog([p[x] for p in shown], [p[y] for p in shown], marker + "-", color=color, ms=5, label=text, **front)
         others = [p for p in own if p not in shown and p.get(x) and p.get(y)]
         panel.loglog([p[x] for p in others], [p[y] for p in others], ".", color=color, alpha=0.35, ms=4)

@@ -29,6 +29,7 @@ Point = dict[str, Any]
 #: Parameters that are tried: multiples of E/h of the softer body, of the barrier parts of h.
 SWEEPS: dict[str, tuple[float | None, ...]] = {
     "united": (None,),
+    "mortar": (None,),
     "lagrange": (None,),
     "penalty": (1.0, 10.0, 100.0, 1e3, 1e4),
     "penalty_surface": (1.0, 100.0, 1e4),

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from dolfinx import fem
 
 #: Every method, the package itself first.
-METHODS = ("united", "penalty", "penalty_surface", "lagrange", "augmented", "barrier")
+METHODS = ("united", "mortar", "penalty", "penalty_surface", "lagrange", "augmented", "barrier")
+#: The package's own, by what unites: nodes on facets, or integrals over both surfaces.
+OWN = ("united", "mortar")
 #: Those that need a number.
 NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
 #: Overlap at which Uzawa's multipliers are good enough, as part of the model's size.
@@ -51,7 +53,11 @@ def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None
         raise ValueError(f"'{method}' is not known here: expected one of {', '.join(METHODS)}")
     if (method in NEED_PARAMETER) != (parameter is not None):
         raise ValueError(f"{method} {'needs a parameter' if parameter is None else 'has no parameter'}")
-    if method == "united":
+    if method == "mortar":
+        # scenes make their contacts for all methods alike
+        for contact in options.get("contacts", ()):
+            contact.coupling = "mortar"
+    if method in OWN:
         return uem.UnitedProblem(F, u, **options)
     if method == "lagrange":
         return uem.UnitedProblem(F, u, method=LagrangeSystem, **options)

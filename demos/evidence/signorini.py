@@ -173,6 +173,7 @@ def signorini(
         return uem.Contact(contactor=tags[surfaces[contactor]], target=tags[surfaces[target]], sliding="fixed", name="interface")
 
     kind = "matching" if finer == 1 else "nested" if fine % n == 0 else "not nested"
+    kind += ", coarser contactor" * (finer < 1)
     return Scene(
         "signorini", degree, F, u, bcs, contact, errors, stiffness=min(1.0, ratio) * fine, h=1 / fine,
         facts={"ratio": float(ratio), "meshes": kind + ", graded" * (graded > 1)},

@@ -14,7 +14,7 @@ from evidence.cases_scales import springs
 COMM = MPI.COMM_WORLD
 TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_motion)
 CASES = {case.name: case for m in TABLES for case in m.CASES}
-UNITED = COLUMNS[0]
+UNITED, MORTAR = COLUMNS[:2]
 
 
 def test_names_are_told_apart_on_the_command_line():
@@ -43,6 +43,15 @@ def test_correct(name):
     assert cell["verdict"] == "correct", cell
     assert cell["case"] == name and cell["method"] == "united" and abs(cell["figure"]) <= cell["tolerance"]
     assert cell["iterations"] > 0 and cell["what"]
+
+
+@pytest.mark.parametrize(
+    "name", ["E ratio 1e-09", "vertex ridge", "edge 3D", "off the end", "beside 2D finite", "two-pass 3:4", "chain"]
+)
+def test_correct_with_mortar(name):
+    """Forces along the facets' own normals, gaps closed in the mean."""
+    cell = judge(CASES[name], MORTAR)
+    assert cell["verdict"] == "correct" and cell["method"] == "mortar", cell
 
 
 @pytest.mark.parametrize(
