@@ -200,7 +200,11 @@ class Contact:
 
     @property
     def pressures(self) -> Array:
-        """Normal contact force over tributary reference area at this rank's contactors ``(n_contactors,)`` (collective)."""
+        """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
+
+        The normal force over the node's tributary reference area; with ``coupling="mortar"`` the multiplier, a pressure on what the
+        target covers of the facets as they are now.
+        """
         areas = self.pair.coupling.areas(self.pair.placement, self._areas)
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
 

@@ -49,7 +49,7 @@ class WeightedRows:
     Attributes:
         equations: in the order of the contactors; none is active. They hand forces on.
         gradients: the derivatives of the same gaps, by which contactors move; the same object where all facets are parallel.
-        points: quadrature points of the segments; None where segments are kept.
+        points: quadrature points of the segments, where the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
         near: contactors with a facet near the target ``(n,)``.
@@ -60,7 +60,7 @@ class WeightedRows:
 
     equations: UnitingEquations
     gradients: UnitingEquations
-    points: SegmentPoints | None
+    points: SegmentPoints
     facets: Ints
     covered: Bools
     near: Bools
@@ -308,7 +308,8 @@ class Mortar(NodeToSurface):
     def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
         """Weighted gaps after an increment (collective)."""
         rows: WeightedRows = placement.details
-        return placement.gap + self._along(rows.equations if tested else rows.gradients, du)
+        eq = rows.equations if tested else rows.gradients
+        return eq.gap + self._along(eq, du)
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors near the target that it does not cover, or that it has let go of in this step and hardly covers again.
@@ -371,7 +372,6 @@ class Mortar(NodeToSurface):
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """How forces turn with the facets, and go from node to node where they slide."""
         rows: WeightedRows = placement.details
-        assert rows.points is not None
         pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
         dofs = self.surface.dofs[rows.facets]
         at_nodes = self.config.from_owners(self.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)

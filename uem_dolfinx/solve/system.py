@@ -211,7 +211,9 @@ class BodySystem:
         """Equations of all pairs in their present states, and Q (collective)."""
         equations = [pair.equations() for pair in self.pairs]
         # the derivatives of the gaps tell which motions of a body nothing holds
-        free = self.floating.hold(self.forces.free[: self.config.n_owned], self._join([e.trial for e in equations]))
+        free = self.floating.hold(
+            self.forces.free[: self.config.n_owned], UnitingEquations.join([e.trial for e in equations], self.config.gdim)
+        )
         Q, independent = self._restrict([e.test for e in equations], free)
         return _Rows(equations, independent, Q)
 
@@ -305,9 +307,6 @@ class BodySystem:
         """Q of the present equations (collective)."""
         return self._rows().test
 
-    def _join(self, parts: list[UnitingEquations]) -> UnitingEquations:
-        return UnitingEquations.join(parts, self.config.gdim)
-
     def _restrict(self, parts: list[UnitingEquations], free: Bools) -> tuple[Restriction, IndependentEquations | None]:
         """P and c of the equations of all pairs, and how those that got in each other's way were resolved (collective).
 
@@ -315,7 +314,7 @@ class BodySystem:
             parts: equations of every pair.
             free: components that neither conditions nor supports hold ``(n_owned, gdim)``.
         """
-        equations, independent = self._join(parts), None
+        equations, independent = UnitingEquations.join(parts, self.config.gdim), None
         if self.contestable:
             mutual = np.repeat(self.mutual, [len(part) for part in parts])
             independent = IndependentEquations(self.config, equations, free, mutual)
