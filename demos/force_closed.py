@@ -15,7 +15,8 @@ python3 demos/force_closed.py --plot force_closed.png
 #
 #     p0 = sqrt(P E* / (pi R)),    a = 2 P / (pi p0),    1/E* = 2 (1 - nu^2) / E.
 #
-# With either coupling P is the weight; `--coupling mortar` lets the largest pressure scatter less about p0.
+# Nothing but the slopes of facets tells where along the block it comes to rest. With either coupling, `node_to_surface` or
+# `--coupling mortar`, P is the weight.
 
 # %%
 import common
