@@ -18,7 +18,6 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.coupling import Coupling
-from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
@@ -140,6 +139,8 @@ class Contact:
         coupling: Coupling
         # points have no facets to integrate over
         if self.coupling == "mortar" and self.contactor.dim > 0:
+            from uem_dolfinx.contact.mortar import Mortar
+
             coupling = Mortar(
                 config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how
             )

@@ -99,6 +99,8 @@ class Mortar(NodeToSurface):
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
         self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
+        #: The last search that rows were made from, and these; a search finds the same object as long as nothing moves.
+        self._united: tuple[Projection, WeightedRows] | None = None
         #: Rows that a contact with small or fixed sliding keeps.
         self._kept: WeightedRows | None = None
 
@@ -108,7 +110,9 @@ class Mortar(NodeToSurface):
         """Project contactors and find the segments of their facets (collective); see ``Coupling``."""
         if self.sliding == "finite":
             nearest = self._nearest(points)
-            rows = self._unite(nearest, points)
+            if self._united is None or self._united[0] is not nearest:
+                self._united = nearest, self._unite(nearest, points)
+            rows = self._united[1]
         elif self._kept is None:
             nearest = self._anchor = self.target.project(points)
             rows = self._kept = self._unite(nearest, points)
