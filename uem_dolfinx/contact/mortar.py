@@ -2,8 +2,8 @@
 
 Where a node's part of the contactor is covered by the target, its equation says that the gap vanishes in the mean, weighted with the
 node's dual function. The equations eliminate one component of the node each, like those of ``node_to_surface``; their multipliers
-are pressures, and what they hand on balances in force and moment. Nodes that are farther from the target than a facet keep the
-equation of a node against the surface, until they come nearer.
+are pressures, and what they hand on balances in force and moment. Nodes that are farther from the target than a facet, until they come
+nearer, and corners whose facets do not face it, have the equation of a node against the surface.
 """
 
 from __future__ import annotations
@@ -52,7 +52,6 @@ class WeightedRows:
         points: quadrature points of the segments, where the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
-        near: contactors with a facet near the target ``(n,)``.
         ratio: part of the contactor's share of its facets that is covered ``(n,)``.
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
@@ -63,7 +62,6 @@ class WeightedRows:
     points: SegmentPoints
     facets: Ints
     covered: Bools
-    near: Bools
     ratio: Array
     area: Array
     share: Array
@@ -269,9 +267,8 @@ class Mortar(NodeToSurface):
         equations = gradients = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
             gradients = self._with_gradients(equations, at, dofs, scale)
-        seen = config.to_owners(dofs.ravel(), np.ones(dofs.size))[self.nodes] > 0
         share = np.where(is_covered, size / scale, 1.0)
-        return WeightedRows(equations, gradients, at, facets, is_covered, seen, ratio, size, share)
+        return WeightedRows(equations, gradients, at, facets, is_covered, ratio, size, share)
 
     def _with_gradients(self, equations: UnitingEquations, at: SegmentPoints, dofs: Indices, scale: Array) -> UnitingEquations:
         """The derivatives of the gaps, from rows that hand forces on and the facets' nodes ``dofs (m, nc)`` (collective).
@@ -316,15 +313,14 @@ class Mortar(NodeToSurface):
         return eq.gap + self._along(eq, du)
 
     def off(self, placement: Placement, state: PairState) -> Bools:
-        """Contactors near the target that it does not cover, or that it has let go of in this step and hardly covers again.
+        """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
 
         A target that springs back when its end lets go would cover the contactor's last bit again, for ever.
         """
         rows: WeightedRows = placement.details
         if not self.target.n_nodes:
             return np.zeros(len(self.nodes), dtype=bool)
-        hardly = (state.slips > 0) & (rows.ratio < COVERED_AGAIN)
-        return np.where(rows.near, ~rows.covered | hardly, super().off(placement, state))
+        return np.where(rows.covered, (state.slips > 0) & (rows.ratio < COVERED_AGAIN), super().off(placement, state))
 
     def at_end(self, placement: Placement, state: PairState) -> Bools:
         """No end holds contactors: what is covered of them fades away."""
