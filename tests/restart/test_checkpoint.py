@@ -259,15 +259,16 @@ def test_going_on_is_not_having_stopped(cell, normals, folder):
         assert np.array_equal(bits(whole.u.x.array), bits(first.u.x.array))
 
 
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("sliding", ["finite", "small", "fixed"])
-def test_moving_rigid_surface(sliding, folder):
+def test_moving_rigid_surface(sliding, coupling, folder):
     """The tool is where it was, before the script has moved it again, and the steps after are the same."""
 
     def pressed():
         s = scene(COMM, "triangle", [box("triangle", [0.0, 0.0], [1.0, 1.0], [4, 4])])
         V = compat.function_space(s.mesh, 1, (2,))
         u, ball = fem.Function(V), uem.RigidSphere((0.5, 1.5), 0.5)
-        contact = uem.Contact(s.tag("top", 0, at(1, 1.0)), ball, sliding=sliding)
+        contact = uem.Contact(s.tag("top", 0, at(1, 1.0)), ball, sliding=sliding, coupling=coupling)
         bcs = clamp(V, s.tag("base", 0, at(1, 0.0)))
         problem = uem.UnitedProblem(
             st_venant(u, 1.0), u, bcs=bcs, contacts=[contact], rtol=1e-11,

@@ -29,7 +29,8 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.opposite import FACING, find_opposite
 from uem_dolfinx.geometry.overlaps import Planes, Segments, overlap
 from uem_dolfinx.geometry.projection import Projection, Target
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
@@ -101,6 +102,8 @@ class Mortar(NodeToSurface):
         self._united: tuple[Projection, WeightedRows] | None = None
         #: Rows that a contact with small or fixed sliding keeps.
         self._kept: WeightedRows | None = None
+        #: Motion of a rigid target when they were made.
+        self._kept_at: Motion | None = None
 
     # -- placement -------------------------------------------------------------------------------------------------------
 
@@ -114,6 +117,7 @@ class Mortar(NodeToSurface):
         elif self._kept is None:
             nearest = self._anchor = self.target.project(points)
             rows = self._kept = self._unite(nearest, points)
+            self._kept_at = self.target.motion
         else:
             nearest = self.target.follow(points, self._anchor)
             rows = self._follow(self._kept, nearest)
@@ -146,13 +150,23 @@ class Mortar(NodeToSurface):
             gap = self._along(eq, self.config.x[:n])
         else:
             assert self._anchor is not None
+            eq = self._turned(eq)
             # what the nodes have come nearer, as a displacement along the rows
             lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
             way = np.zeros((n, self.config.gdim))
-            way[self.nodes] = ((nearest.gap - self._anchor.gap) / np.where(lean > FACING, lean, 1.0))[:, None] * eq.direction
+            way[self.nodes] = ((nearest.gap - self._anchor.gap) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
             gap = eq.gap + self._along(eq, way)
         moved = replace(eq, gap=gap)
         return replace(rows, equations=moved, gradients=moved)
+
+    def _turned(self, equations: UnitingEquations) -> UnitingEquations:
+        """Kept rows, which turn with a rigid target."""
+        now, then = self.target.motion, self._kept_at
+        if now is then:
+            return equations
+        still = Motion.none(self.config.gdim)
+        Q = (now or still).Q @ (then or still).Q.T
+        return replace(equations, direction=equations.direction @ Q.T, coefficients=equations.coefficients @ Q.T)
 
     def _along(self, equations: UnitingEquations, values: Array) -> Array:
         """What the left sides of the equations make of the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
