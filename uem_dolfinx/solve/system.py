@@ -211,8 +211,8 @@ class BodySystem:
         """Equations of all pairs in their present states, and Q (collective)."""
         equations = [pair.equations() for pair in self.pairs]
         # the derivatives of the gaps tell which motions of a body nothing holds
-        told = UnitingEquations.join([e.trial for e in equations], self.config.gdim)
-        free = self.floating.hold(self.forces.free[: self.config.n_owned], told)
+        gaps = UnitingEquations.join([e.trial for e in equations], self.config.gdim)
+        free = self.floating.hold(self.forces.free[: self.config.n_owned], gaps)
         Q, independent = self._restrict([e.test for e in equations], free)
         return _Rows(equations, independent, Q)
 
@@ -286,10 +286,9 @@ class BodySystem:
         if not self._pivoting.all_at_once(count):
             active = zlib.crc32(b"".join(pair.trial.active.tobytes() for pair in self.pairs))
             if self._pivoting.repeats(self.comm.allgather(active)) and (self._curvature is not None or self._apart):
-                # with curvature, or P apart from Q, the problem may have no solution, or several; without there is one
-                self._curvature, self._pivoting = None, Pivoting()
-                # rows that hand forces on hold back what no gap does: a loose body would be driven along
-                self._plain = self.floating.motions is None
+                # with curvature, or P apart from Q, the problem may have no solution, or several; without there is one, but for
+                # loose bodies, which the rows of Q would drive along
+                self._curvature, self._pivoting, self._plain = None, Pivoting(), self.floating.motions is None
             return [w.among_the_worst(worst) for w in wrong]
         if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
             return [w.on_first_touch(gap, deepest) for gap, w in zip(gaps, wrong)]
