@@ -42,10 +42,8 @@ class Basis:
         kinds = [0] * n_vertices + ([1] * n_edges + [2] * (len(shape.nodes) - n_vertices - n_edges) if shape.degree == 2 else [])
         self.rank: Ints = np.array(kinds, dtype=np.int64)
         self.T: Array = np.asarray(np.linalg.inv(self.at(shape.nodes)))
-        simplex = shape.cell != "quadrilateral"
-        n = len(self.rank)
-        # Bernstein's functions of one degree have all the same integral
-        self.mean: Array = np.full(n, 1.0 / n) if simplex or shape.degree == 1 else np.full(n, 1.0 / 9.0)
+        # they add up to one, and all have the same integral
+        self.mean: Array = np.full(len(self.rank), 1.0 / len(self.rank))
 
     def at(self, xi: Array) -> Array:
         """Values at ``xi (q, fdim)``: ``(q, nn)``."""

@@ -201,7 +201,7 @@ class Mortar(NodeToSurface):
         A, C = dual_functions(covered, self._precedence(ratio[dofs], dofs))
         turned = turning(surface.shape, x[facets], surface.sign[facets])
         at = SegmentPoints(
-            surface.shape, segments, pairs, surface.nodes[facets], nodes, planes, turned, A, b, phi, N, to_gap, to_shapes
+            segments, pairs, surface.nodes[facets], nodes, planes, turned, A, covered.G, b, phi, N, to_gap, to_shapes
         )
         return self._gather(covered, C, at, facets, ratio[self.nodes], nearest)
 

@@ -23,7 +23,6 @@ class SegmentPoints:
     """Quadrature points of segments with all that derivatives there need.
 
     Attributes:
-        shape: of the contactor facets.
         segments: of ``k`` pairs.
         facet: contactor facet of each pair, among ``m`` ``(k,)``, ascending.
         nodes: global nodes of the contactor facets ``(m, nc)``.
@@ -31,6 +30,7 @@ class SegmentPoints:
         planes: of the contactor facets.
         turning: how area vectors change with the contactor facets' nodes ``(m, nc, gdim, gdim)``.
         A: dual functions in the basis of the facets ``(m, nc, nc)``.
+        G: integrals of the basis and the gap ``(m, nc)``.
         b: functions of the basis at the points ``(q, nc)``.
         phi: the contactor's shape functions there ``(q, nc)``.
         N: the target's ``(q, nt)``.
@@ -38,7 +38,6 @@ class SegmentPoints:
         to_shapes: change of N with it ``(q, nt, gdim)``.
     """
 
-    shape: FacetShape
     segments: Segments
     facet: Ints
     nodes: Ints
@@ -46,6 +45,7 @@ class SegmentPoints:
     planes: Planes
     turning: Array
     A: Array
+    G: Array
     b: Array
     phi: Array
     N: Array
@@ -74,9 +74,8 @@ class SegmentPoints:
         # with the area, and with the normal, of what is not closed
         open_part = weighted * s.gap[:, None]
         n, size = self.planes.normal, self.planes.size
-        area = add_up(e[s.pair], open_part, m)
         turned = add_up(e[s.pair], (open_part[:, :, None] * self.tilt[:, None]).reshape(-1, nc * g), m).reshape(m, nc, g)
-        vector = (area[:, :, None] * n[:, None] + turned) / size[:, None, None]
+        vector = (self.G[:, :, None] * n[:, None] + turned) / size[:, None, None]
         on_facet += np.einsum("mjg,magh->mjah", vector, self.turning).reshape(m, nc, nc * g)
         return (self.A @ on_facet).reshape(m, nc, nc, g), -(self.A[e] @ on_target).reshape(k, nc, nt, g)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.overlaps import Planes
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.search import MeshTarget, balls_that_meet
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
 
@@ -76,20 +76,10 @@ def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reac
     none = np.zeros(0, dtype=np.int64)
     if not len(middle) or not len(y):
         return none, none
-    from scipy.spatial import cKDTree
-
     centre = y.mean(axis=1)
     size = np.linalg.norm(y - centre[:, None], axis=2).max(axis=1)
     outward = Planes.of(target.shape, y, target.facets.sign).normal
-    kinds = np.floor(np.log2(size / size.max()))
-    rows, facets = [none], [none]
-    for kind in np.unique(kinds):
-        members = np.flatnonzero(kinds == kind)
-        hits = cKDTree(centre[members]).query_ball_point(middle, radius + reach + size[members].max(), return_sorted=False)
-        counts = np.fromiter((len(h) for h in hits), np.int64, len(middle))
-        rows.append(np.repeat(np.arange(len(middle)), counts))
-        facets.append(members[np.concatenate([none, *(np.asarray(h, dtype=np.int64) for h in hits)])])
-    i, f = np.concatenate(rows), np.concatenate(facets)
+    i, f = balls_that_meet(middle, radius + reach, centre, size)
     away = centre[f] - middle[i]
     height = np.einsum("kg,kg->k", away, normal[i])
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))

@@ -281,18 +281,34 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
     normal = unit_normals(tab, x)
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
-    size_class = np.floor(np.log2(radius / radius.max()))
-    pairs, facets = [], []
-    for c in np.unique(size_class):
-        members = np.flatnonzero(size_class == c)
-        hits = cKDTree(middle[members]).query_ball_point(points, bound + radius[members].max(), return_sorted=False)
-        counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
-        pairs.append(np.repeat(np.arange(len(points)), counts))
-        facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
-    i, f = np.concatenate(pairs), np.concatenate(facets)
+    i, f = balls_that_meet(points, bound, middle, radius)
     # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
     too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
     return i[~too_far], f[~too_far]
+
+
+def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) -> tuple[Ints, Ints]:
+    """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facets' middles ``(m, gdim)``, m > 0, that may meet.
+
+    There is a tree for each class of facets of like radius.
+
+    Args:
+        points: middles of the first.
+        within: their radii ``(n,)``.
+        middle: of the facets.
+        radius: of the facets ``(m,)``.
+    """
+    from scipy.spatial import cKDTree
+
+    size_class = np.floor(np.log2(radius / radius.max()))
+    rows, facets = [], []
+    for c in np.unique(size_class):
+        members = np.flatnonzero(size_class == c)
+        hits = cKDTree(middle[members]).query_ball_point(points, within + radius[members].max(), return_sorted=False)
+        counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
+        rows.append(np.repeat(np.arange(len(points)), counts))
+        facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
+    return np.concatenate(rows), np.concatenate(facets)

@@ -46,11 +46,13 @@ class _Rows:
 
     Attributes:
         equations: of every pair.
+        trial: all that P is made of; None where Q is made of the same.
         independent: how those that got in each other's way were resolved; None if none could.
         test: Q.
     """
 
     equations: list[LabelledEquations]
+    trial: UnitingEquations | None
     independent: IndependentEquations | None
     test: Restriction
 
@@ -210,18 +212,23 @@ class BodySystem:
     def _rows(self) -> _Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         equations = [pair.equations() for pair in self.pairs]
+        test = trial = UnitingEquations.join([e.test for e in equations], self.config.gdim)
+        if any(e.trial is not e.test for e in equations):
+            trial = UnitingEquations.join([e.trial for e in equations], self.config.gdim)
         # the derivatives of the gaps tell which motions of a body nothing holds
-        gaps = UnitingEquations.join([e.trial for e in equations], self.config.gdim)
-        free = self.floating.hold(self.forces.free[: self.config.n_owned], gaps)
-        Q, independent = self._restrict([e.test for e in equations], free)
-        return _Rows(equations, independent, Q)
+        free = self.floating.hold(self.forces.free[: self.config.n_owned], trial)
+        Q, independent = self._restrict(equations, test, free)
+        return _Rows(equations, None if trial is test else trial, independent, Q)
 
     def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
-        self._apart = any(e.trial is not e.test for e in rows.equations) and not (self._plain or self._contested(rows))
+        # where equations get in each other's way, those of P might eliminate other components than those of Q
+        contested = self.shared or (rows.independent is not None and rows.independent.found)
+        apart = None if self._plain or contested else rows.trial
+        self._apart = apart is not None
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=self._restrict([e.trial for e in rows.equations], rows.test.free)[0] if self._apart else rows.test,
+            trial=rows.test if apart is None else self._restrict(rows.equations, apart, rows.test.free)[0],
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -235,10 +242,6 @@ class BodySystem:
             closed=gap <= CLOSED * self.config.size and self.forces.dirichlet_met(),
             rows=rows,
         )
-
-    def _contested(self, rows: _Rows) -> bool:
-        """Whether equations get in each other's way, so that those of P might eliminate other components than those of Q."""
-        return self.shared or (rows.independent is not None and rows.independent.found)
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
         """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none (collective).
@@ -307,16 +310,13 @@ class BodySystem:
         """Q of the present equations (collective)."""
         return self._rows().test
 
-    def _restrict(self, parts: list[UnitingEquations], free: Bools) -> tuple[Restriction, IndependentEquations | None]:
-        """P and c of the equations of all pairs, and how those that got in each other's way were resolved (collective).
-
-        Args:
-            parts: equations of every pair.
-            free: components that neither conditions nor supports hold ``(n_owned, gdim)``.
-        """
-        equations, independent = UnitingEquations.join(parts, self.config.gdim), None
+    def _restrict(
+        self, labelled: list[LabelledEquations], equations: UnitingEquations, free: Bools
+    ) -> tuple[Restriction, IndependentEquations | None]:
+        """P or Q of equations, with components ``free (n_owned, gdim)``, and how those in each other's way were resolved (collective)."""
+        independent = None
         if self.contestable:
-            mutual = np.repeat(self.mutual, [len(part) for part in parts])
+            mutual = np.repeat(self.mutual, [len(own) for own in labelled])
             independent = IndependentEquations(self.config, equations, free, mutual)
             equations = independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
