@@ -148,7 +148,7 @@ def test_rows_against_slow_quadrature(degree):
     b = Blocks("triangle", (5, 3), degree, wave=0.02, gap=0.01, comm=MPI.COMM_SELF)
     b.pressed()
     pair = b.contact.pair
-    rows, config, surface = pair.placement.details.equations, pair.config, pair.coupling.surface
+    rows, config, surface = pair.placement.details.plain, pair.config, pair.coupling.surface
     target = pair.target.facets
     shape, basis = facet_shape("interval", degree), basis_of(facet_shape("interval", degree))
     total, follows = np.zeros((config.n_local, 2)), np.zeros((config.n_local, config.n_local, 2))
@@ -216,19 +216,24 @@ def test_forces_balance_across_open_gaps(cell, degree):
     assert complete > 1e-5
 
 
+@pytest.mark.parametrize("target", ["mesh", "ball"])
 @pytest.mark.parametrize("cell", CELLS)
-def test_forces_turn_as_the_tangent_says(cell):
-    """Blocks of the curvature against central differences of the forces at constant multipliers, in directions at random."""
+def test_derivatives_of_weighted_gaps(cell, target):
+    """First derivatives against central differences of the gaps, second ones against those of the first, in directions at random."""
     b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF)
+    g, u = b.g, b.u.x.array
+    if target == "ball":
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (g - 1) + [-2.0], 2.0), coupling="mortar")
     problem = b.pressed()
+    pair = b.contact.pair
+    X = pair.config.X
     if cell == "hexahedron":
         # facets stay flat, since what warped ones cover has ends too
-        X, A = b.contact.pair.config.X, np.random.default_rng(2).uniform(-0.05, 0.05, (2, 3, 3))
-        b.u.x.array[:] = np.where(X[:, 2:] < 1e-9, X @ A[0], X @ A[1]).ravel()
+        A = np.random.default_rng(2).uniform(-0.05, 0.05, (2, 3, 3))
+        u[:] = np.where(X[:, 2:] < 1e-9, X @ A[0], X @ A[1]).ravel()
     else:
         disturbed(b, 2, 0.01)
-    pair, g, u = b.contact.pair, b.g, b.u.x.array
-    start = u.copy()
+    start, surface = u.copy(), pair.coupling.surface
 
     def rows_at(displacement):
         u[:] = displacement
@@ -237,34 +242,41 @@ def test_forces_turn_as_the_tangent_says(cell):
 
     rows = rows_at(start)
     # what is covered in part has ends that move, which is left out
-    inner = rows.ratio > 1 - 1e-9
-    pressure = np.where(inner, 1.0 + 0.5 * np.sin(5 * pair.config.X[pair.nodes, 0]), 0.0)
-    surface = pair.coupling.surface
+    inner = rows.ratio > 1 - (1e-9 if target == "mesh" else 0.2)
     at_facets = np.zeros(pair.config.n_local)
-    at_facets[pair.nodes] = pressure
-    which = at_facets[surface.dofs[rows.facets]]
-    edge = (~np.isin(surface.dofs[rows.facets], pair.nodes[inner])).any(axis=1)
-    which[edge] = 0.0
+    at_facets[pair.nodes] = np.where(inner, 1.0 + 0.5 * np.sin(5 * X[pair.nodes, 0]), 0.0)
+    pressure = at_facets[surface.dofs[rows.facets]]
+    pressure[(~np.isin(surface.dofs[rows.facets], pair.nodes[inner])).any(axis=1)] = 0.0
+    assert (pressure != 0).any()
+
+    def gap(displacement):
+        points = rows_at(displacement).points
+        return np.einsum("mj,mji,mi->", pressure, points.A, points.G)
 
     def forces(displacement):
         points = rows_at(displacement).points
-        s, e = points.segments, points.facet
-        force = np.zeros((pair.config.n_local, g))
-        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", which, points.A)[e[s.pair]]) * s.weight
+        s, e, out = points.segments, points.facet, np.zeros((pair.config.n_local, g))
+        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", pressure, points.A)[e[s.pair]]) * s.weight
         push = -amount[:, None] * points.planes.normal[e[s.pair]]
-        for nodes, values in ((points.nodes[e[s.pair]], points.phi), (points.opposite[s.pair], -points.N)):
-            np.add.at(force, nodes, values[..., None] * push[:, None])
-        return force.ravel()
+        on_facet, on_target = points.gap_derivatives()
+        np.add.at(out, points.nodes[e[s.pair]], points.phi[..., None] * push[:, None])
+        np.add.at(out, points.nodes, np.einsum("mj,mjag->mag", pressure, on_facet))
+        if target == "mesh":
+            np.add.at(out, points.opposite[s.pair], -points.N[..., None] * push[:, None])
+            np.add.at(out, points.opposite, np.einsum("kj,kjag->kag", pressure[e], on_target))
+        return out.ravel()
 
-    nodes, blocks = rows.points.force_derivatives(which)
-    assert len(nodes)
+    nodes, blocks = rows.points.curvature(pressure)
+    assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
+    first = forces(start)
     index = (nodes[:, :, None] * g + np.arange(g)).reshape(len(nodes), -1)
-    rng = np.random.default_rng(3)
+    rng, h = np.random.default_rng(3), 1e-6
     for _ in range(3):
         way = rng.standard_normal(len(u))
         if cell == "hexahedron":
             way = np.where(X[:, 2:] < 1e-9, X @ rng.standard_normal((3, 3)), X @ rng.standard_normal((3, 3))).ravel()
-        h = 1e-6
+        slope = (gap(start + h * way) - gap(start - h * way)) / (2 * h)
+        assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
         measured = -(forces(start + h * way) - forces(start - h * way)) / (2 * h)
         told = np.zeros(len(u))
         np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
@@ -370,7 +382,7 @@ def test_parallel_facets():
         b.u.x.array[1::2][high] += tilt * b.contact.pair.config.X[high, 0]
         problem.system.place(returning=False)
         rows = b.contact.pair.placement.details
-        assert (rows.gradients is rows.equations) == same
+        assert (rows.plain is rows.equations) == same
 
 
 # -- ranks, and what is refused ------------------------------------------------------------------------------------------

@@ -199,10 +199,10 @@ class Bernstein(NodeToSurface):
         details = ControlFeet(feet.nearest, feet.corners, feet.left, control)
         return replace(plain, gap=control.of(projection.gap), details=details)
 
-    def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
+    def foreseen(self, placement: Placement, du: Array) -> Array:
         """Control gaps after an increment (collective)."""
         control: ControlGaps = placement.details.control
-        gap = super().foreseen(placement, du, tested)
+        gap = super().foreseen(placement, du)
         f = self.family
         return replace(control, gap=f.config.from_owners(f.nodes, gap[:, None], f.parent)[:, 0]).of(gap)
 

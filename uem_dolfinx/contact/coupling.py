@@ -92,11 +92,8 @@ class Coupling(Protocol):
     def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
         """The placement after the normal return to ``points``, which left the nodal gaps ``gap (n,)`` (collective)."""
 
-    def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
-        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective).
-
-        Trial rows foretell them, or test rows if ``tested``, where the bodies move by these.
-        """
+    def foreseen(self, placement: Placement, du: Array) -> Array:
+        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

@@ -17,11 +17,11 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Basis, Covered, basis_of, dual_functions
-from uem_dolfinx.contact.mortar_tangent import SegmentPoints, opposite_changes, turning
+from uem_dolfinx.contact.mortar_tangent import SegmentPoints, slopes
 from uem_dolfinx.contact.node_to_surface import NEAR, NodeToSurface
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -48,8 +48,8 @@ class WeightedRows:
     """Equations of all contactors, one each.
 
     Attributes:
-        equations: in the order of the contactors; none is active. They hand forces on.
-        gradients: the derivatives of the same gaps, by which contactors move; the same object where all facets are parallel.
+        equations: in the order of the contactors; none is active.
+        plain: the same, along the normals of the contactor's facets alone, without what derivatives of the gaps have beside that.
         points: quadrature points of the segments, where the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
@@ -59,7 +59,7 @@ class WeightedRows:
     """
 
     equations: UnitingEquations
-    gradients: UnitingEquations
+    plain: UnitingEquations
     points: SegmentPoints
     facets: Ints
     covered: Bools
@@ -74,9 +74,10 @@ class Pieces(NamedTuple):
     segments: Segments
     facet: Ints
     to_gap: Array
-    to_shapes: Array
     N: Array
     opposite: Ints
+    y: Array
+    bend: Array | None
 
 
 class Mortar(NodeToSurface):
@@ -126,7 +127,7 @@ class Mortar(NodeToSurface):
         if self.target.n_nodes:
             # forces and their reactions lie on one line through the contactor
             seen = seen.with_rows(np.flatnonzero(rows.covered), {"foot": points[rows.covered]})
-        return Placement(seen, eq.gap, self._can_move(eq) if self.prescribed else None, rows)
+        return Placement(seen, eq.gap, self._can_move(rows.plain) if self.prescribed else None, rows)
 
     def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
         """Nothing is returned."""
@@ -157,7 +158,7 @@ class Mortar(NodeToSurface):
             way[self.nodes] = ((nearest.gap - self._anchor.gap) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
             gap = eq.gap + self._along(eq, way)
         moved = replace(eq, gap=gap)
-        return replace(rows, equations=moved, gradients=moved)
+        return replace(rows, equations=moved, plain=moved)
 
     def _turned(self, equations: UnitingEquations) -> UnitingEquations:
         """Kept rows, which turn with a rigid target."""
@@ -192,17 +193,18 @@ class Mortar(NodeToSurface):
         planes = Planes.of(surface.shape, x, surface.sign).take(facets)
         reach = away[facets].max(axis=1, initial=0.0) / FACING + 0.5 * size[facets]
         placed = self._over_segments if isinstance(self.target, MeshTarget) else self._over_facets
-        segments, pairs, to_gap, to_shapes, N, nodes = placed(planes, x[facets], facets, reach)
+        segments, pairs, to_gap, N, nodes, y, bend = placed(planes, x[facets], facets, reach)
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
         covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
         dofs = surface.dofs[facets]
         part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
         ratio = part / np.where(full > 0, full, 1.0)
         A, C = dual_functions(covered, self._precedence(ratio[dofs], dofs))
-        turned = turning(surface.shape, x[facets], surface.sign[facets])
+        other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
-            segments, pairs, surface.nodes[facets], nodes, planes, turned, A, covered.G, b, phi, N, to_gap, to_shapes
-        )
+            segments, pairs, surface.nodes[facets], nodes, planes, A, covered.G, b, phi, N, to_gap,
+            surface.shape, other, x[facets], y, surface.sign[facets], bend,
+        )  # fmt: skip
         return self._gather(covered, C, at, facets, ratio[self.nodes], nearest)
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
@@ -217,9 +219,8 @@ class Mortar(NodeToSurface):
         mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
         kept = ((weight > 0) & (np.abs(mean) <= reach[e]))[s.pair]
         s = Segments(s.pair[kept], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
-        tab = shape.tabulate(s.eta)
-        to_gap, to_shapes = opposite_changes(planes.normal[e[s.pair]], tangents(tab, found.x[s.pair]), tab.dN)
-        return Pieces(s, e, to_gap, to_shapes, tab.N, found.nodes)
+        to_gap = slopes(shape, found.x, planes.normal[e], s.pair, s.eta)
+        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes, found.x, None)
 
     def _over_facets(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Whole facets against a rigid surface, which covers all that face it."""
@@ -234,8 +235,8 @@ class Mortar(NodeToSurface):
         weight = np.tile(weights, m) * np.abs(np.linalg.det(flat))
         i = np.flatnonzero((lean.reshape(m, q) > FACING).all(axis=1)[row])
         none = np.zeros((len(i), 0))
-        s = Segments(row[i], xi[i], none, weight[i], p.gap[i] / lean[i])
-        return Pieces(s, np.arange(m), p.normal[i] / lean[i, None], np.zeros((len(i), 0, g)), none, np.zeros((m, 0), np.int64))
+        s = Segments(row[i], xi[i], none, weight[i], p.gap[i])
+        return Pieces(s, np.arange(m), p.normal[i], none, np.zeros((m, 0), np.int64), np.zeros((m, 0, g)), p.hessians(i))
 
     def _precedence(self, ratio: Array, dofs: Indices) -> Array:
         """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
@@ -255,7 +256,7 @@ class Mortar(NodeToSurface):
     ) -> WeightedRows:
         """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
         config, n = self.config, len(self.nodes)
-        own, e, normal, dofs = at.nodes, at.facet, -at.planes.normal, self.surface.dofs[facets]
+        own, e, normal = at.nodes, at.facet, -at.planes.normal
         coefficients = C @ self.basis.T
         on_facet = coefficients[:, :, :, None] * normal[:, None, None]
         on_target = (at.A[e] @ covered.N)[..., None] * normal[e][:, None, None]
@@ -278,38 +279,49 @@ class Mortar(NodeToSurface):
         row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
         value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
         gap = np.where(is_covered, gap / scale, nearest.gap)
-        equations = gradients = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
+        plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
-            gradients = self._with_gradients(equations, at, dofs, scale)
+            equations = self._varied(plain, is_covered, at, scale)
         share = np.where(is_covered, size / scale, 1.0)
-        return WeightedRows(equations, gradients, at, facets, is_covered, ratio, size, share)
+        return WeightedRows(equations, plain, at, facets, is_covered, ratio, size, share)
 
-    def _with_gradients(self, equations: UnitingEquations, at: SegmentPoints, dofs: Indices, scale: Array) -> UnitingEquations:
-        """The derivatives of the gaps, from rows that hand forces on and the facets' nodes ``dofs (m, nc)`` (collective).
+    def _varied(self, plain: UnitingEquations, covered: Bools, at: SegmentPoints, scale: Array) -> UnitingEquations:
+        """The derivatives of the gaps, made of ``plain`` rows times ``scale (n,)`` and what is to be added (collective).
 
-        What they have along the normals of other contactors, which are eliminated, is of second order in the angle between
-        neighbouring facets. It is taken by the contactor itself, so that the rows still hold nothing back of a rigid motion.
+        Both leave neither force nor moment behind. What is added must not bring in what rows of other ``covered (n,)`` contactors
+        eliminate: such parts, of second order in the angles between facets, are taken out with the plain rows of these contactors.
         """
-        config, g, d = self.config, self.config.gdim, equations.direction
         on_facet, on_target = at.gap_derivatives()
-        here = d * self.free
-        length = np.einsum("ng,ng->n", here, here)[:, None]
-        here = here / np.where(length > 0, length, 1.0)
-        seen = config.from_owners(self.nodes, np.column_stack([d, here]), dofs.ravel()).reshape(*dofs.shape, 2 * g)
-        along = np.einsum("mjag,mag->mja", on_facet, seen[..., g:])[..., None] * seen[:, None, :, :g]
-        left = config.add_at_owners(at.nodes.ravel(), along.sum(axis=2).reshape(-1, g))[self.nodes] / scale[:, None]
-        more = np.einsum("ng,ng->n", left, here)
-        own = np.arange(len(self.nodes))
-        row, term, value = self._at_owners(
-            [_terms(at.nodes, at.nodes, along - on_facet), _terms(at.nodes[at.facet], at.opposite, -on_target)], scale
-        )
-        parts = [
-            (equations.row, equations.followed, equations.coefficients), (row, term, value),
-            (own, config.to_global(self.nodes), more[:, None] * d - left),
-        ]  # fmt: skip
+        lift = np.zeros((self.config.n_owned, self.config.gdim))
+        lift[self.nodes] = plain.direction * (self.free & covered[:, None])
+        lift /= np.maximum(np.einsum("ng,ng->n", lift, lift), MOSTLY_PRESCRIBED**2)[:, None]
+        terms = [_terms(at.nodes, at.nodes, -on_facet), _terms(at.nodes[at.facet], at.opposite, -on_target)]
+        row, term, value = self._at_owners(terms, scale)
+        while True:
+            follows = np.einsum("kg,kg->k", value, self.config.ask_owners(term, lift))
+            if not self.config.comm.allreduce(bool((np.abs(follows) > NEGLIGIBLE).any()), op=MPI.LOR):
+                break
+            i = np.flatnonzero(follows)
+            less = self._times_rows(plain, self.config.to_global(self.nodes[row[i]]), term[i], follows[i])
+            row, term, value = _add_up_terms(*(np.concatenate(part) for part in zip((row, term, value), less)))
+        parts = ((plain.row, plain.followed, plain.coefficients), (row, term, value))
         row, term, value = _add_up_terms(*(np.concatenate(part) for part in zip(*parts)))
-        by = 1.0 + more
-        return replace(equations, gap=equations.gap / by, row=row, followed=term, coefficients=value / by[row, None])
+        return replace(plain, row=row, followed=term, coefficients=value)
+
+    def _times_rows(self, plain: UnitingEquations, node: Ints, other: Ints, factor: Array) -> tuple[Ints, Ints, Array]:
+        """Terms that rows of ``node (k,)`` get where ``factor (k,)`` times the row of ``other (k,)`` is added to them (collective)."""
+        config, own = self.config, np.arange(len(self.nodes))
+        node, other, factor = Exchange.to(config.comm, config.owner_of(other)).send(node, other, factor)
+        row = np.concatenate([own, plain.row])
+        order = np.argsort(row, kind="stable")
+        term = np.concatenate([config.to_global(self.nodes), plain.followed])[order]
+        value = np.concatenate([-plain.direction, plain.coefficients])[order]
+        first = np.searchsorted(row[order], np.arange(len(own) + 1))
+        its = self._place[other - int(config.index_map.local_range[0])]
+        count = first[its + 1] - first[its]
+        i = np.repeat(np.arange(len(its)), count)
+        k = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + first[its][i]
+        return self._at_owners([(node[i], term[k], factor[i, None] * value[k])], np.ones(len(own)))
 
     def _at_owners(self, parts: Sequence[tuple[Ints, Ints, Array]], scale: Array) -> tuple[Ints, Ints, Array]:
         """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
@@ -320,11 +332,10 @@ class Mortar(NodeToSurface):
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
-    def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
+    def foreseen(self, placement: Placement, du: Array) -> Array:
         """Weighted gaps after an increment (collective)."""
-        rows: WeightedRows = placement.details
-        eq = rows.equations if tested else rows.gradients
-        return eq.gap + self._along(eq, du)
+        eq = placement.details.equations
+        return np.asarray(eq.gap + self._along(eq, du))
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
@@ -344,16 +355,13 @@ class Mortar(NodeToSurface):
 
     def approach(self, placement: Placement, which: Ints) -> UnitingEquations:
         """The equations that the contactors ``which (k,)`` would have if they were active."""
-        part = self._select(placement.details.gradients, which)
+        part = self._select(placement.details.equations, which)
         return replace(part, active=np.ones(len(part), dtype=bool))
 
     def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:
         """One equation for each contactor."""
-        rows: WeightedRows = placement.details
-        test = trial = replace(self._select(rows.equations, which), active=state.active[which])
-        if rows.gradients is not rows.equations:
-            trial = replace(self._select(rows.gradients, which), active=test.active)
-        return LabelledEquations(trial, test, which, np.full(len(which), NORMAL))
+        rows = replace(self._select(placement.details.equations, which), active=state.active[which])
+        return LabelledEquations(rows, rows, which, np.full(len(which), NORMAL))
 
     def _select(self, rows: UnitingEquations, which: Ints) -> UnitingEquations:
         chosen = np.zeros(len(self.nodes), dtype=bool)
@@ -384,12 +392,12 @@ class Mortar(NodeToSurface):
         return self._handed_on(rows, state.lam / rows.share)
 
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
-        """How forces turn with the facets, and go from node to node where they slide."""
+        """Second derivatives of the weighted gaps."""
         rows: WeightedRows = placement.details
         pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
         dofs = self.surface.dofs[rows.facets]
         at_nodes = self.config.from_owners(self.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
-        return rows.points.force_derivatives(at_nodes)
+        return rows.points.curvature(at_nodes)
 
     def areas(self, placement: Placement, areas: Array) -> Array:
         """Integrals of the dual functions over what is covered."""

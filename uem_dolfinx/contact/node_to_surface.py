@@ -166,7 +166,7 @@ class NodeToSurface:
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
-    def foreseen(self, placement: Placement, du: Array, tested: bool = False) -> Array:
+    def foreseen(self, placement: Placement, du: Array) -> Array:
         """Nodal gaps after an increment (collective)."""
         p = placement.projection
         move = du[self.nodes]

@@ -192,9 +192,9 @@ class ContactPair:
         self._set_active(state)
         return bool(self.config.comm.allreduce(gone or moved, op=MPI.LOR))
 
-    def foreseen(self, du: Array, tested: bool = False) -> Array:
+    def foreseen(self, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment; see ``Coupling.foreseen`` (collective)."""
-        return self.coupling.foreseen(self.placement, du, tested)
+        return self.coupling.foreseen(self.placement, du)
 
     def wrong(
         self, gap: Array, lam: Array, stiffness: Array, force_rounding: Array, gap_rounding: float, swept: bool

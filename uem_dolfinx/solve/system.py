@@ -90,8 +90,8 @@ class BodySystem:
         self._factored: object = None
         self._curvature: PETSc.Mat | None = None
         self._pivoting = Pivoting()
-        #: Whether P differs from Q, and whether it may not, for the rest of an iteration.
-        self._apart = self._plain = False
+        #: Whether P differs from Q.
+        self._apart = False
         #: Whether the last exchange has let go of a body that loads drive.
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
@@ -180,7 +180,6 @@ class BodySystem:
         5. Take the equations that follow, Q'F with them, and who breaks the conditions of contact.
         """
         forces, pairs = self.forces, self.pairs
-        self._plain = False
         if forces.stiffness is None and pairs:
             # what tells tension from rounding
             forces.update_tangent()
@@ -224,7 +223,7 @@ class BodySystem:
         """What the loop sees of these rows, with P (collective)."""
         # where equations get in each other's way, those of P might eliminate other components than those of Q
         contested = self.shared or (rows.independent is not None and rows.independent.found)
-        apart = None if self._plain or contested else rows.trial
+        apart = None if contested else rows.trial
         self._apart = apart is not None
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
@@ -261,7 +260,7 @@ class BodySystem:
             increment = du.array_r.reshape(-1, config.gdim)
             left = accuracy if self.solver.iterative else 0.0
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            foreseen = [pair.foreseen(increment, self._plain) for pair in self.pairs]
+            foreseen = [pair.foreseen(increment) for pair in self.pairs]
             wrong = []
             for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
                 along = self._along(pair)
@@ -288,10 +287,9 @@ class BodySystem:
         deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, worst))
         if not self._pivoting.all_at_once(count):
             active = zlib.crc32(b"".join(pair.trial.active.tobytes() for pair in self.pairs))
-            if self._pivoting.repeats(self.comm.allgather(active)) and (self._curvature is not None or self._apart):
-                # with curvature, or P apart from Q, the problem may have no solution, or several; without there is one, but for
-                # loose bodies, which the rows of Q would drive along
-                self._curvature, self._pivoting, self._plain = None, Pivoting(), self.floating.motions is None
+            if self._pivoting.repeats(self.comm.allgather(active)) and self._curvature is not None:
+                # with curvature the problem may have no solution, or several; without there is one
+                self._curvature, self._pivoting = None, Pivoting()
             return [w.among_the_worst(worst) for w in wrong]
         if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
             return [w.on_first_touch(gap, deepest) for gap, w in zip(gaps, wrong)]
