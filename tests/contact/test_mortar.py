@@ -216,69 +216,106 @@ def test_forces_balance_across_open_gaps(cell, degree):
     assert complete > 1e-5
 
 
-@pytest.mark.parametrize("target", ["mesh", "ball"])
-@pytest.mark.parametrize("cell", CELLS)
-def test_derivatives_of_weighted_gaps(cell, target):
-    """First derivatives against central differences of the gaps, second ones against those of the first, in directions at random."""
-    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF)
-    g, u = b.g, b.u.x.array
-    if target == "ball":
-        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (g - 1) + [-2.0], 2.0), coupling="mortar")
-    problem = b.pressed()
-    pair = b.contact.pair
-    X = pair.config.X
-    if cell == "hexahedron":
-        # facets stay flat, since what warped ones cover has ends too
-        A = np.random.default_rng(2).uniform(-0.05, 0.05, (2, 3, 3))
-        u[:] = np.where(X[:, 2:] < 1e-9, X @ A[0], X @ A[1]).ravel()
-    else:
-        disturbed(b, 2, 0.01)
-    start, surface = u.copy(), pair.coupling.surface
+class WeightedGap:
+    """Sum of weighted gaps times multipliers as a function of the displacement, from the points of the segments.
 
-    def rows_at(displacement):
-        u[:] = displacement
-        problem.system.place(returning=False)
-        return pair.placement.details
+    Args:
+        b: blocks, of a problem already.
+        system: of it.
+    """
 
-    rows = rows_at(start)
-    # what is covered in part has ends that move, which is left out
-    inner = rows.ratio > 1 - (1e-9 if target == "mesh" else 0.2)
-    at_facets = np.zeros(pair.config.n_local)
-    at_facets[pair.nodes] = np.where(inner, 1.0 + 0.5 * np.sin(5 * X[pair.nodes, 0]), 0.0)
-    pressure = at_facets[surface.dofs[rows.facets]]
-    pressure[(~np.isin(surface.dofs[rows.facets], pair.nodes[inner])).any(axis=1)] = 0.0
-    assert (pressure != 0).any()
+    def __init__(self, b, system):
+        self.b, self.system, self.pair, self.g = b, system, b.contact.pair, b.g
+        self.start = b.u.x.array.copy()
+        X, surface = self.pair.config.X, self.pair.coupling.surface
+        self.X, self.dofs = X, surface.dofs[self.points(self.start).facets]
+        self.pressure = (1.0 + 0.5 * np.sin(5 * X[:, 0]))[self.dofs]
 
-    def gap(displacement):
-        points = rows_at(displacement).points
-        return np.einsum("mj,mji,mi->", pressure, points.A, points.G)
+    def points(self, displacement):
+        self.b.u.x.array[:] = displacement
+        self.system.place(returning=False)
+        return self.pair.placement.details
 
-    def forces(displacement):
-        points = rows_at(displacement).points
-        s, e, out = points.segments, points.facet, np.zeros((pair.config.n_local, g))
-        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", pressure, points.A)[e[s.pair]]) * s.weight
+    def leave_out_ends(self):
+        """No multipliers where the end of the target moves over facets in 3D, which derivatives leave out; the rows."""
+        rows = self.points(self.start)
+        inner = rows.ratio > (1 - 1e-9 if self.g == 3 and self.pair.target.n_nodes else 0.5)
+        self.pressure[np.isin(self.dofs, self.pair.nodes[~inner]).any(axis=1)] = 0.0
+        assert (self.pressure != 0).any()
+        return rows
+
+    def value(self, displacement):
+        points = self.points(displacement).points
+        return np.einsum("mj,mji,mi->", self.pressure, points.duals.A, points.covered.G)
+
+    def forces(self, displacement):
+        points, g = self.points(displacement).points, self.g
+        s, e, out = points.segments, points.facet, np.zeros((self.pair.config.n_local, g))
+        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", self.pressure, points.duals.A)[e[s.pair]]) * s.weight
         push = -amount[:, None] * points.planes.normal[e[s.pair]]
         on_facet, on_target = points.gap_derivatives()
         np.add.at(out, points.nodes[e[s.pair]], points.phi[..., None] * push[:, None])
-        np.add.at(out, points.nodes, np.einsum("mj,mjag->mag", pressure, on_facet))
-        if target == "mesh":
+        np.add.at(out, points.nodes, np.einsum("mj,mjag->mag", self.pressure, on_facet))
+        if points.opposite.shape[1]:
             np.add.at(out, points.opposite[s.pair], -points.N[..., None] * push[:, None])
-            np.add.at(out, points.opposite, np.einsum("kj,kjag->kag", pressure[e], on_target))
+            np.add.at(out, points.opposite, np.einsum("kj,kjag->kag", self.pressure[e], on_target))
         return out.ravel()
 
-    nodes, blocks = rows.points.curvature(pressure)
-    assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
-    first = forces(start)
-    index = (nodes[:, :, None] * g + np.arange(g)).reshape(len(nodes), -1)
-    rng, h = np.random.default_rng(3), 1e-6
-    for _ in range(3):
-        way = rng.standard_normal(len(u))
-        if cell == "hexahedron":
-            way = np.where(X[:, 2:] < 1e-9, X @ rng.standard_normal((3, 3)), X @ rng.standard_normal((3, 3))).ravel()
-        slope = (gap(start + h * way) - gap(start - h * way)) / (2 * h)
+    def ways(self, cell, h=1e-6):
+        """Displacements at random; facets of hexahedra stay flat, since quadrature of warped ones has further terms."""
+        rng, low = np.random.default_rng(3), self.X[:, -1:] < 1e-9
+        for _ in range(3):
+            way = rng.standard_normal(self.start.shape)
+            if cell == "hexahedron":
+                way = np.where(low, self.X @ rng.standard_normal((3, 3)), self.X @ rng.standard_normal((3, 3))).ravel()
+            yield way, [self.start + side * h * way for side in (1, -1)], 2 * h
+
+
+def leaning(b, cell):
+    """Displace both blocks, so that facets are no longer parallel."""
+    if cell == "hexahedron":
+        X, A = b.contact.pair.config.X, np.random.default_rng(2).uniform(-0.05, 0.05, (2, 3, 3))
+        b.u.x.array[:] = np.where(X[:, 2:] < 1e-9, X @ A[0], X @ A[1]).ravel()
+    else:
+        disturbed(b, 2, 0.01)
+
+
+@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+def test_rows_are_derivatives_of_the_gaps(cell, target):
+    """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
+        "lower" if target == "end" else "upper"
+    ))  # fmt: skip
+    if target == "ball":
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+    problem = b.pressed()
+    leaning(b, cell)
+    phi = WeightedGap(b, problem.system)
+    phi.leave_out_ends()
+    first = phi.forces(phi.start)
+    for way, (ahead, behind), h in phi.ways(cell):
+        slope = (phi.value(ahead) - phi.value(behind)) / h
         assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
-        measured = -(forces(start + h * way) - forces(start - h * way)) / (2 * h)
-        told = np.zeros(len(u))
+
+
+@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+def test_curvature_against_differences(cell, target):
+    """Blocks of the curvature against central differences of what the rows hand on at constant multipliers."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
+        "lower" if target == "end" else "upper"
+    ))  # fmt: skip
+    if target == "ball":
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+    problem = b.pressed()
+    leaning(b, cell)
+    phi = WeightedGap(b, problem.system)
+    rows = phi.leave_out_ends()
+    nodes, blocks = rows.points.curvature(phi.pressure)
+    assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
+    index = (nodes[:, :, None] * b.g + np.arange(b.g)).reshape(len(nodes), -1)
+    for way, (ahead, behind), h in phi.ways(cell):
+        measured = -(phi.forces(ahead) - phi.forces(behind)) / h
+        told = np.zeros(len(phi.start))
         np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
 

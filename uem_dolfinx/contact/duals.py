@@ -117,8 +117,47 @@ def add_up(place: Ints, values: Array, n: int) -> Array:
     return out
 
 
-def dual_functions(covered: Covered, precedence: Array) -> tuple[Array, Array]:
-    """Dual functions of facets as combinations of the functions b, and their integrals with them, ``(m, nn, nn)`` each.
+@dataclass(frozen=True)
+class Duals:
+    """Dual functions of ``m`` facets.
+
+    Attributes:
+        A: combinations of the functions b ``(m, nn, nn)``.
+        C: their integrals with the functions b ``(m, nn, nn)``.
+        own: nodes with a dual function of their own, the foremost not among them ``(m, nn)``.
+        foremost: node whose dual function makes their sum one ``(m,)``.
+        gap: coefficients of the gap's projection onto the functions b ``(m, nn)``.
+    """
+
+    A: Array
+    C: Array
+    own: Bools
+    foremost: Ints
+    gap: Array
+
+    def at_end(self, facet: Ints, b: Array, gap: Array) -> Array:
+        """How weighted gaps grow with what is covered, at places of the covered part's boundary.
+
+        The derivative of ``psi`` counts too: ``d int psi_j g = (b_j G_j + psi_j (g - sum_k b_k G_k)) ds`` with the gap's projection G.
+
+        Args:
+            facet: of the places ``(q,)``.
+            b: functions there ``(q, nn)``.
+            gap: there ``(q,)``.
+
+        Returns:
+            For the nodes of each facet ``(q, nn)``.
+        """
+        mean = self.gap[facet]
+        psi = np.einsum("qjb,qb->qj", self.A[facet], b)
+        grown = b * mean + psi * (gap - np.einsum("qb,qb->q", b, mean))[:, None]
+        grown = np.where(self.own[facet], grown, 0.0)
+        grown[np.arange(len(b)), self.foremost[facet]] += gap - grown.sum(axis=1)
+        return grown
+
+
+def dual_functions(covered: Covered, precedence: Array) -> Duals:
+    """Dual functions of facets.
 
     Args:
         covered: integrals over the facets.
@@ -128,18 +167,18 @@ def dual_functions(covered: Covered, precedence: Array) -> tuple[Array, Array]:
     kept: Bools = HARDLY_COVERED * covered.full <= covered.D
     row, foremost = np.arange(m), np.argmax(precedence, axis=1)
     # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
-    other = kept & (np.arange(nn) != foremost[:, None])
-    A = np.zeros((m, nn, nn))
-    some = np.flatnonzero(other.any(axis=1))
+    own = kept & (np.arange(nn) != foremost[:, None])
+    A, mean = np.zeros((m, nn, nn)), np.zeros((m, nn))
+    some = np.flatnonzero(own.any(axis=1))
     if len(some):
-        scaled = covered.M[some] / covered.D[some].sum(axis=1)[:, None, None]
+        size = covered.D[some].sum(axis=1)
         # functions that are not kept take no part in the inverse but through their sum
-        A[some] = (covered.D[some] / covered.D[some].sum(axis=1)[:, None])[:, :, None] * np.linalg.pinv(scaled, hermitian=True)
-        A[some] *= other[some][:, :, None]
+        inverse = np.linalg.pinv(covered.M[some] / size[:, None, None], hermitian=True)
+        A[some] = (covered.D[some] / size[:, None])[:, :, None] * inverse * own[some][:, :, None]
+        mean[some] = np.einsum("mij,mj->mi", inverse, covered.G[some] / size[:, None])
     A[row, foremost] = 1.0 - A.sum(axis=1)
     C, j = np.zeros((m, nn, nn)), np.arange(nn)
-    C[:, j, j] = np.where(other, covered.D, 0.0)
-    C[row, foremost] = np.where(other, 0.0, covered.D)
-    empty = covered.D.sum(axis=1) <= 0.0
-    A[empty] = 0.0
-    return A, C
+    C[:, j, j] = np.where(own, covered.D, 0.0)
+    C[row, foremost] = np.where(own, 0.0, covered.D)
+    A[covered.D.sum(axis=1) <= 0.0] = 0.0
+    return Duals(A, C, own, foremost, mean)

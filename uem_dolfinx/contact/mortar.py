@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from mpi4py import MPI
 
@@ -43,13 +43,24 @@ PARALLEL = 1e-10
 COVERED_AGAIN = 0.5
 
 
+#: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
+#: little is covered there, far from the target, and the end of what is covers moves faster than the contactor.
+#: [heuristic; part of the component; -]
+MOSTLY_OWN = 0.5
+
+
+#: Rows that terms belong to, the nodes they follow and the coefficients.
+Terms: TypeAlias = tuple[Ints, Ints, Array]
+
+
 @dataclass(frozen=True)
 class WeightedRows:
     """Equations of all contactors, one each.
 
     Attributes:
-        equations: in the order of the contactors; none is active.
-        plain: the same, along the normals of the contactor's facets alone, without what derivatives of the gaps have beside that.
+        equations: in the order of the contactors; none is active. Their left sides are the derivatives of the gaps.
+        plain: the same, along the normals of the contactor's facets alone.
+        beside: terms that the derivatives have beside the plain rows'; none where all facets are parallel.
         points: quadrature points of the segments, where the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
@@ -60,6 +71,7 @@ class WeightedRows:
 
     equations: UnitingEquations
     plain: UnitingEquations
+    beside: Terms
     points: SegmentPoints
     facets: Ints
     covered: Bools
@@ -101,6 +113,8 @@ class Mortar(NodeToSurface):
         self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
         #: The last search that rows were made from, and these; a search finds the same object as long as nothing moves.
         self._united: tuple[Projection, WeightedRows] | None = None
+        #: Rows and active contactors for which these were last taken apart, and the equations that were left, as returned by ``_apart``.
+        self._taken_apart: tuple[WeightedRows, Bools, UnitingEquations, Array] | None = None
         #: Rows that a contact with small or fixed sliding keeps.
         self._kept: WeightedRows | None = None
         #: Motion of a rigid target when they were made.
@@ -199,13 +213,13 @@ class Mortar(NodeToSurface):
         dofs = surface.dofs[facets]
         part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
         ratio = part / np.where(full > 0, full, 1.0)
-        A, C = dual_functions(covered, self._precedence(ratio[dofs], dofs))
+        duals = dual_functions(covered, self._precedence(ratio[dofs], dofs))
         other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
-            segments, pairs, surface.nodes[facets], nodes, planes, A, covered.G, b, phi, N, to_gap,
+            segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
             surface.shape, other, x[facets], y, surface.sign[facets], bend,
         )  # fmt: skip
-        return self._gather(covered, C, at, facets, ratio[self.nodes], nearest)
+        return self._gather(at, facets, ratio[self.nodes], nearest)
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Segments against a mesh (collective)."""
@@ -251,16 +265,14 @@ class Mortar(NodeToSurface):
         well = 1.0 + self.basis.rank + 0.5 * np.round(np.minimum(ratio, 1.0), 6) + code
         return np.where(ratio >= HARDLY_COVERED, well, ratio * (1 + code))
 
-    def _gather(
-        self, covered: Covered, C: Array, at: SegmentPoints, facets: Ints, ratio: Array, nearest: Projection
-    ) -> WeightedRows:
+    def _gather(self, at: SegmentPoints, facets: Ints, ratio: Array, nearest: Projection) -> WeightedRows:
         """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
         config, n = self.config, len(self.nodes)
-        own, e, normal = at.nodes, at.facet, -at.planes.normal
+        own, e, normal, A, C = at.nodes, at.facet, -at.planes.normal, at.duals.A, at.duals.C
         coefficients = C @ self.basis.T
         on_facet = coefficients[:, :, :, None] * normal[:, None, None]
-        on_target = (at.A[e] @ covered.N)[..., None] * normal[e][:, None, None]
-        area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", at.A, covered.G)
+        on_target = (A[e] @ at.covered.N)[..., None] * normal[e][:, None, None]
+        area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", A, at.covered.G)
         f, i = np.nonzero(area > 0)
         values = np.column_stack([on_facet[f, i, i], gap[f, i], area[f, i, None] * normal[f]])
         total = config.add_at_owners(own[f, i], values)[self.nodes]
@@ -279,36 +291,64 @@ class Mortar(NodeToSurface):
         row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
         value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
         gap = np.where(is_covered, gap / scale, nearest.gap)
+        beside: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
-            equations = self._varied(plain, is_covered, at, scale)
+            beside = self._beside(at, scale, direction)
+            equations = _with_terms(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
-        return WeightedRows(equations, plain, at, facets, is_covered, ratio, size, share)
+        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share)
 
-    def _varied(self, plain: UnitingEquations, covered: Bools, at: SegmentPoints, scale: Array) -> UnitingEquations:
-        """The derivatives of the gaps, made of ``plain`` rows times ``scale (n,)`` and what is to be added (collective).
-
-        Both leave neither force nor moment behind. What is added must not bring in what rows of other ``covered (n,)`` contactors
-        eliminate: such parts, of second order in the angles between facets, are taken out with the plain rows of these contactors.
-        """
+    def _beside(self, at: SegmentPoints, scale: Array, direction: Array) -> Terms:
+        """What the derivatives of the gaps have beside the plain rows of ``direction (n, gdim)``, over ``scale (n,)`` (collective)."""
         on_facet, on_target = at.gap_derivatives()
-        lift = np.zeros((self.config.n_owned, self.config.gdim))
-        lift[self.nodes] = plain.direction * (self.free & covered[:, None])
-        lift /= np.maximum(np.einsum("ng,ng->n", lift, lift), MOSTLY_PRESCRIBED**2)[:, None]
         terms = [_terms(at.nodes, at.nodes, -on_facet), _terms(at.nodes[at.facet], at.opposite, -on_target)]
         row, term, value = self._at_owners(terms, scale)
-        while True:
-            follows = np.einsum("kg,kg->k", value, self.config.ask_owners(term, lift))
-            if not self.config.comm.allreduce(bool((np.abs(follows) > NEGLIGIBLE).any()), op=MPI.LOR):
-                break
-            i = np.flatnonzero(follows)
-            less = self._times_rows(plain, self.config.to_global(self.nodes[row[i]]), term[i], follows[i])
-            row, term, value = _add_up_terms(*(np.concatenate(part) for part in zip((row, term, value), less)))
-        parts = ((plain.row, plain.followed, plain.coefficients), (row, term, value))
-        row, term, value = _add_up_terms(*(np.concatenate(part) for part in zip(*parts)))
-        return replace(plain, row=row, followed=term, coefficients=value)
+        own = np.zeros(len(scale))
+        itself = term == self.config.to_global(self.nodes)[row]
+        own[row[itself]] = -np.einsum("kg,kg->k", value[itself], direction[row[itself]])
+        kept = (own > MOSTLY_OWN - 1)[row]
+        return row[kept], term[kept], value[kept]
 
-    def _times_rows(self, plain: UnitingEquations, node: Ints, other: Ints, factor: Array) -> tuple[Ints, Ints, Array]:
+    def _apart(self, rows: WeightedRows, active: Bools) -> tuple[UnitingEquations, Array]:
+        """The equations without what those of other ``active (n,)`` contactors eliminate, as they would follow in circles (collective).
+
+        Such parts, of second order in the angles between facets, are taken out with the plain rows of these contactors: those leave
+        neither force nor moment behind either.
+
+        Returns:
+            The equations, and what each was divided by so that it has its direction ``(n,)``.
+        """
+        if rows.equations is rows.plain:
+            return rows.plain, np.ones(len(self.nodes))
+        kept = self._taken_apart
+        same = kept is not None and kept[0] is rows and np.array_equal(kept[1], active)
+        if self.config.comm.allreduce(same, op=MPI.LAND):
+            assert kept is not None
+            return kept[2], kept[3]
+        plain, own = rows.plain, self.config.to_global(self.nodes)
+        lift = np.zeros((self.config.n_owned, self.config.gdim))
+        lift[self.nodes] = plain.direction * (self.free & (rows.covered & active)[:, None])
+        lift /= np.maximum(np.einsum("ng,ng->n", lift, lift), MOSTLY_PRESCRIBED**2)[:, None]
+        beside = rows.beside
+        while True:
+            row, term, value = beside
+            follows = np.einsum("kg,kg->k", value, self.config.ask_owners(term, lift))
+            i = np.flatnonzero((np.abs(follows) > NEGLIGIBLE) & (term != own[row]))
+            if not self.config.comm.allreduce(len(i)):
+                break
+            beside = _add_up_terms(beside, self._times_rows(plain, own[row[i]], term[i], follows[i]))
+        # what it has along its own direction
+        itself = np.flatnonzero(term == own[row])
+        by = np.ones(len(own))
+        by[row[itself]] -= follows[itself]
+        value[itself] -= follows[itself, None] * plain.direction[row[itself]]
+        made = _with_terms(plain, beside)
+        made = replace(made, gap=made.gap / by, coefficients=made.coefficients / by[made.row, None])
+        self._taken_apart = rows, active.copy(), made, by
+        return made, by
+
+    def _times_rows(self, plain: UnitingEquations, node: Ints, other: Ints, factor: Array) -> Terms:
         """Terms that rows of ``node (k,)`` get where ``factor (k,)`` times the row of ``other (k,)`` is added to them (collective)."""
         config, own = self.config, np.arange(len(self.nodes))
         node, other, factor = Exchange.to(config.comm, config.owner_of(other)).send(node, other, factor)
@@ -323,12 +363,12 @@ class Mortar(NodeToSurface):
         k = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + first[its][i]
         return self._at_owners([(node[i], term[k], factor[i, None] * value[k])], np.ones(len(own)))
 
-    def _at_owners(self, parts: Sequence[tuple[Ints, Ints, Array]], scale: Array) -> tuple[Ints, Ints, Array]:
+    def _at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
         """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
         node, term, value = (np.concatenate(part) for part in zip(*parts))
         node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
         row = self._place[node - int(self.config.index_map.local_range[0])]
-        return _add_up_terms(row, term, value / scale[row, None])
+        return _add_up_terms((row, term, value / scale[row, None]))
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
@@ -360,7 +400,7 @@ class Mortar(NodeToSurface):
 
     def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:
         """One equation for each contactor."""
-        rows = replace(self._select(placement.details.equations, which), active=state.active[which])
+        rows = replace(self._select(self._apart(placement.details, state.active)[0], which), active=state.active[which])
         return LabelledEquations(rows, rows, which, np.full(len(which), NORMAL))
 
     def _select(self, rows: UnitingEquations, which: Ints) -> UnitingEquations:
@@ -375,13 +415,14 @@ class Mortar(NodeToSurface):
         rows: WeightedRows = placement.details
         mu = np.zeros(len(self.nodes))
         mu[equations.contactor] = multipliers
-        nodes, values = self._handed_on(rows, mu)
+        made, by = self._apart(rows, state.active)
+        nodes, values = self._handed_on(made, mu)
         force = np.asarray(self.config.add_at_owners(nodes, values)[self.nodes])
-        return mu * rows.share, np.einsum("ng,ng->n", force, rows.equations.direction), force
+        return mu / by * rows.share, np.einsum("ng,ng->n", force, rows.equations.direction), force
 
-    def _handed_on(self, rows: WeightedRows, mu: Array) -> tuple[Ints, Array]:
+    def _handed_on(self, equations: UnitingEquations, mu: Array) -> tuple[Ints, Array]:
         """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
-        eq = rows.equations
+        eq = equations
         own, terms = mu != 0, mu[eq.row] != 0
         nodes = np.concatenate([self.config.to_global(self.nodes[own]), eq.followed[terms]])
         return nodes, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
@@ -389,7 +430,8 @@ class Mortar(NodeToSurface):
     def nodal_forces(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """What the equations hand on of the state's multipliers."""
         rows: WeightedRows = placement.details
-        return self._handed_on(rows, state.lam / rows.share)
+        made, by = self._apart(rows, state.active)
+        return self._handed_on(made, state.lam / rows.share * by)
 
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """Second derivatives of the weighted gaps."""
@@ -411,17 +453,24 @@ class Mortar(NodeToSurface):
             self._kept = None
 
 
-def _terms(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> tuple[Ints, Ints, Array]:
+def _terms(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> Terms:
     """Terms of rows of nodes ``rows (m, nr)`` that follow ``followed (m, nf)`` with ``values (m, nr, nf, gdim)``, zeros left out."""
     m, i, a = np.nonzero(values.any(axis=3) & which)
     return rows[m, i], followed[m, a], values[m, i, a]
 
 
-def _add_up_terms(row: Ints, term: Ints, value: Array) -> tuple[Ints, Ints, Array]:
-    """Terms of the same row and node added up."""
+def _add_up_terms(*parts: Terms) -> Terms:
+    """Terms of several lists, those of the same row and node added up."""
+    row, term, value = (np.concatenate(part) for part in zip(*parts))
     order = np.lexsort((term, row))
     row, term, value = row[order], term[order], value[order]
     if not len(row):
         return row, term, value
     first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(term, prepend=-1) != 0))
     return row[first], term[first], np.add.reduceat(value, first, axis=0)
+
+
+def _with_terms(equations: UnitingEquations, terms: Terms) -> UnitingEquations:
+    """The equations with more terms."""
+    row, term, value = _add_up_terms((equations.row, equations.followed, equations.coefficients), terms)
+    return replace(equations, row=row, followed=term, coefficients=value)

@@ -7,21 +7,22 @@ minus its product with n, there is ``t . dy/deta = 0`` and ``t . n = -1``, so th
     d gap = t . (dx - dy + gamma da) + gamma n . da.
 
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
-in the second derivatives. The ends of the target, and the change of dual functions on partly covered facets, are left out.
+in the second derivatives. The ends of the
+target move too, and dual functions with them; in the second derivatives they are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.contact.duals import add_up, basis_of
-from uem_dolfinx.geometry.overlaps import Planes, Segments, locate
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.duals import Covered, Duals, add_up, basis_of
+from uem_dolfinx.geometry.overlaps import SLIVER, Planes, Segments, locate
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, tangents
 
 
@@ -35,8 +36,8 @@ class SegmentPoints:
         nodes: global nodes of the contactor facets ``(m, nc)``.
         opposite: of the target facets, pair by pair ``(k, nt)``; without any where the target is rigid.
         planes: of the contactor facets.
-        A: dual functions in the basis of the facets ``(m, nc, nc)``.
-        G: integrals of the basis and the gap ``(m, nc)``.
+        duals: dual functions of the contactor facets.
+        covered: integrals over them.
         b: functions of the basis at the points ``(q, nc)``.
         phi: the contactor's shape functions there ``(q, nc)``.
         N: the target's ``(q, nt)``.
@@ -54,8 +55,8 @@ class SegmentPoints:
     nodes: Ints
     opposite: Ints
     planes: Planes
-    A: Array
-    G: Array
+    duals: Duals
+    covered: Covered
     b: Array
     phi: Array
     N: Array
@@ -104,13 +105,31 @@ class SegmentPoints:
         on_target = add_up(s.pair, its, k).reshape(k, nc, nt * g)
         # with the area, and on a mesh with the direction, of what is not closed
         n, size = self.planes.normal, self.planes.size
-        vector = self.G[:, :, None] * n[:, None]
+        vector = self.covered.G[:, :, None] * n[:, None]
         if nt:
             leaning = (weighted * s.gap[:, None])[:, :, None] * self.tilt[:, None]
             vector = vector + add_up(e[s.pair], leaning.reshape(-1, nc * g), m).reshape(m, nc, g)
         vector = vector / size[:, None, None]
         on_facet += np.einsum("mjg,magh->mjah", vector, self.turning).reshape(m, nc, nc * g)
-        return (self.A @ on_facet).reshape(m, nc, nc, g), -(self.A[e] @ on_target).reshape(k, nc, nt, g)
+        on_facet = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
+        on_target = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
+        if self.other is not None and self.other.dim == 1:
+            self._add_ends(self.other, on_facet, on_target)
+        return on_facet, on_target
+
+    def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
+        """Add how weighted gaps change where the target, with facets of such a ``shape``, ends over contactor facets."""
+        which = self._partly_covered()
+        sides = self._sides(shape, which).at_ends()
+        e = self.facet[which][sides.pair]
+        way = -self.duals.at_end(e, sides.b, sides.gap)[:, :, None, None] * sides.way[:, None]
+        nc = self.nodes.shape[1]
+        np.add.at(on_facet, e, way[:, :, :nc])
+        np.add.at(on_target, which[sides.pair], way[:, :, nc:])
+
+    def _partly_covered(self) -> Ints:
+        """Pairs whose contactor facets are not covered altogether ``(p,)``."""
+        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.planes.size)[self.facet])
 
     # -- second derivatives ----------------------------------------------------------------------------------------------
 
@@ -129,7 +148,7 @@ class SegmentPoints:
         place[pressing] = np.arange(len(pressing))
         q = np.flatnonzero(place[self.segments.pair] >= 0)
         pair, e, k = place[self.segments.pair[q]], self.facet[pressing], len(pressing)
-        amount = np.einsum("mj,mjb->mb", pressure[e], self.A[e])
+        amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
         force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * self.segments.weight[q]
         n, size, gap, t = self.planes.normal[e], self.planes.size[e], self.segments.gap[q], self.to_gap[q]
         motions = _Motions(self.phi[q], self.N[q], gap / size[pair], self.turning[e][pair])
@@ -139,7 +158,9 @@ class SegmentPoints:
             tab = self.other.tabulate(self.segments.eta[q])
             for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
                 half += sum_of_products(pair, force, slide, change, k)
-            half += self._sides(self.other, pressing, amount)
+            sides = self._sides(self.other, pressing).between()
+            step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
+            half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
         elif self.bend is not None:
             for row, unit in zip(np.moveaxis(self.bend[q], 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(q), 1))), k)
@@ -161,7 +182,88 @@ class SegmentPoints:
             twice = -0.5 * ring[None, :, None, :, None] * skew(self.sign[e, None] * open_force)[:, None, :, None, :]
             more[:, :c, :, :c] += twice
         blocks.reshape(k, nc + nt, g, nc + nt, g)[:, :nc, :, :nc] += more
-        return np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1), -blocks
+        nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
+        if self.other is None or self.other.dim > 1:
+            return nodes, -blocks
+        more_nodes, more_blocks = self._curvature_of_ends(self.other, pressure)
+        # the blocks of ends have the nodes of two target facets
+        room = more_nodes.shape[1] - nodes.shape[1]
+        nodes = np.concatenate([np.pad(nodes, ((0, 0), (0, room)), constant_values=-1), more_nodes])
+        return nodes, -np.concatenate([np.pad(blocks, ((0, 0), (0, room * g), (0, room * g))), more_blocks])
+
+    def _curvature_of_ends(self, shape: FacetShape, pressure: Array) -> tuple[Ints, Array]:
+        """Second derivatives with the places where the target ends over contactor facets, in 2D.
+
+        With multipliers l, and f the foremost node, the weighted gaps grow with the end's coordinate s by
+
+            h = l_f gap + sum_j (l_j - l_f) (b_j G_j + psi_j (gap - sum_k b_k G_k)).
+
+        Its changes with the displacement, at s, and with s times those of s are what is to be added.
+
+        Args:
+            shape: of the target's facets.
+            pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
+
+        Returns:
+            Global nodes ``(p, nc + 2 nt)`` and blocks.
+        """
+        nc, nt = self.nodes.shape[1], self.opposite.shape[1]
+        which = self._partly_covered()
+        which = which[(pressure[self.facet[which]] != 0).any(axis=1)]
+        sides = self._sides(shape, which).at_ends()
+        pair = which[sides.pair]
+        e = self.facet[pair]
+        l, fore = pressure[e], pressure[e, self.duals.foremost[e]]
+        more = np.where(self.duals.own[e], l - fore[:, None], 0.0)
+        A, D, size, mean, b = self.duals.A[e], self.covered.D[e], self.planes.size[e], self.duals.gap[e], sides.b
+        inverse = np.linalg.pinv(self.covered.M[e] / size[:, None, None], hermitian=True) / size[:, None, None]
+        # quadratic functions' differences are derivatives
+        forward = np.sign(np.einsum("qg,qg->q", sides.outward, self.x[e, 1] - self.x[e, 0])) / size
+        ahead, behind = (basis_of(self.shape).at(sides.xi + half) for half in (0.5, -0.5))
+        b_s = forward[:, None] * (ahead - behind)
+        psi = np.einsum("qjb,qb->qj", A, b)
+        c, c_s = np.einsum("qij,qj->qi", inverse, b), np.einsum("qij,qj->qi", inverse, b_s)
+        left = sides.gap - np.einsum("qb,qb->q", b, mean)
+        bc = np.einsum("qb,qb->q", b, c)
+        psi_s = b * c + D * (c_s - c * bc[:, None])
+        mean_slope = np.einsum("qb,qb->q", b_s, mean) + bc * left
+        h_s = b_s * mean + (b * c + psi_s) * left[:, None] + psi * (sides.slope - mean_slope)[:, None]
+        h_s = fore * sides.slope + np.einsum("qj,qj->q", more, h_s)
+        h = fore * sides.gap + np.einsum("qj,qj->q", more, b * mean + psi * left[:, None])
+        # changes of h with the gap at the end, and with its projection
+        with_gap = fore + np.einsum("qj,qj->q", more, psi)
+        with_mean = more * b - np.einsum("qj,qj->q", more, psi)[:, None] * b
+        n, way, motions = self.planes.normal[e], -sides.way, sides.motions
+        change = with_gap[:, None, None] * (motions.along(sides.t) + motions.of_area(2 * (sides.gap / size)[:, None] * n))
+        change += 0.5 * h_s[:, None, None] * way
+        # the coordinate's own second derivative
+        tab = self.shape.tabulate(sides.xi)
+        stretch = np.zeros(way.shape)
+        stretch[:, :nc] = (forward[:, None] * tab.dN[:, :, 0])[:, :, None] * sides.outward[:, None]
+        change -= h[:, None, None] * stretch
+        half = _outer(way, change)
+        half += _outer(h[:, None, None] * motions.along(n) / size[:, None, None], motions.of_area(sides.outward))
+        nodes = [np.concatenate([self.nodes[e], self.opposite[pair], np.full((len(pair), nt), -1)], axis=1)]
+        blocks = [np.pad(half, ((0, 0), (0, nt * 2), (0, nt * 2)))]
+        # the projection of the gap has to do with all that is opposite of the facet
+        i, j = np.nonzero(e[:, None] == self.facet[None, :])
+        s = self.segments
+        q = np.flatnonzero(np.isin(s.pair, j))
+        at = _Motions(self.phi[q], self.N[q], s.gap[q] / self.planes.size[self.facet[s.pair[q]]], self.turning[self.facet[s.pair[q]]])
+        normal, extent = self.planes.normal[self.facet[s.pair[q]]], self.planes.size[self.facet[s.pair[q]]]
+        gaps = at.along(self.to_gap[q]) + at.of_area(2 * (s.gap[q] / extent)[:, None] * normal)
+        weighted = (s.weight[q, None] * self.b[q])[:, :, None, None] * gaps[:, None]
+        total = add_up(s.pair[q], weighted.reshape(len(q), nc * (nc + nt) * 2), len(self.facet))
+        total = total.reshape(len(self.facet), nc, (nc + nt), 2)
+        factor = np.einsum("qj,qji->qi", with_mean, inverse)
+        its = np.einsum("qi,qiag->qag", factor[i], total[j])
+        wide, wide_way = np.zeros((len(i), nc + 2 * nt, 2)), np.zeros((len(i), nc + 2 * nt, 2))
+        wide[:, :nc], wide[:, nc + nt :] = its[:, :nc], its[:, nc:]
+        wide_way[:, : nc + nt] = way[i]
+        nodes.append(np.concatenate([self.nodes[e[i]], self.opposite[pair[i]], self.opposite[j]], axis=1))
+        blocks.append(_outer(wide_way, wide))
+        out = np.concatenate(blocks)
+        return np.concatenate(nodes), out + out.transpose(0, 2, 1)
 
     def _slides(
         self, motions: _Motions, shape: FacetShape, tab: Tabulated, y: Array, n: Array, t: Array
@@ -178,28 +280,29 @@ class SegmentPoints:
                 change -= 0.5 * sum(bend[:, e, None, None] * other for e, other in enumerate(slides))
             yield slide, change
 
-    def _sides(self, shape: FacetShape, pressing: Ints, amount: Array) -> Array:
-        """Half the blocks of the motion of sides of target facets across contactor facets ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+    def _sides(self, shape: FacetShape, which: Ints) -> _Sides:
+        """Sides of target facets over contactor facets.
 
         Args:
             shape: of the target's facets.
-            pressing: pairs ``(p,)``.
-            amount: multipliers in the basis of their contactor facets ``(p, nc)``.
+            which: pairs ``(p,)``.
         """
-        e, y = self.facet[pressing], self.y[pressing]
+        e, y = self.facet[which], self.y[which]
         planes = self.planes.take(e)
         own, its = planes.coordinates(self.x[e]), planes.coordinates(y)
-        pair, at, eta, out, weight = (_ends if shape.dim == 1 else _edges)(self.shape, own, shape, its)
+        pair, at, eta, out, weight, corners = (_ends if shape.dim == 1 else _edges)(self.shape, own, shape, its)
+        # a side that two facets of the target share is found twice over a contactor facet
+        code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], corners], axis=1)])
+        _, same, count = np.unique(code, axis=0, return_inverse=True, return_counts=True)
+        alone = count[same.ravel()] == (1 if shape.dim == 1 else len(forms.quadrature_rule("interval", 2 * self.shape.degree + 2)[1]))
         xi = locate(self.shape, own[pair, :, :-1], at)
-        tab, n, size = shape.tabulate(eta), planes.normal[pair], planes.size[pair]
+        tab, phi = shape.tabulate(eta), self.shape.functions(xi)
         outward = np.einsum("qf,qfg->qg", out, planes.axes[pair, :-1])
-        t = to_gap(area_vectors(tab, y[pair]), n)
-        gap = np.einsum("qa,qa->q", tab.N, its[pair, :, -1]) - np.einsum("qa,qa->q", self.shape.functions(xi), own[pair, :, -1])
-        motions = _Motions(self.shape.functions(xi), tab.N, gap / size, self.turning[e][pair])
-        along = motions.along(outward)
-        force = np.einsum("qb,qb->q", basis_of(self.shape).at(xi), amount[pair])
+        t = to_gap(area_vectors(tab, y[pair]), planes.normal[pair])
+        gap = np.einsum("qa,qa->q", tab.N, its[pair, :, -1]) - np.einsum("qa,qa->q", phi, own[pair, :, -1])
+        motions = _Motions(phi, tab.N, gap / planes.size[pair], self.turning[e][pair])
         slope = np.einsum("qg,qg->q", t, outward)
-        return -0.5 * sum_of_products(pair, force * weight * slope, along, along, len(pressing))
+        return _Sides(pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone)
 
 
 @dataclass(frozen=True)
@@ -217,6 +320,9 @@ class _Motions:
     N: Array
     part: Array
     turning: Array
+
+    def __getitem__(self, which: Bools) -> _Motions:
+        return _Motions(self.phi[which], self.N[which], self.part[which], self.turning[which])
 
     @property
     def nc(self) -> int:
@@ -238,7 +344,49 @@ class _Motions:
         return np.asarray((c[:, None, None] @ self.turning)[:, :, 0])
 
 
-def _ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array]:
+@dataclass(frozen=True)
+class _Sides:
+    """Points on sides of target facets over contactor facets.
+
+    Attributes:
+        pair: ascending ``(q,)``.
+        xi: reference coordinates on the contactor's facets ``(q, fdim)``.
+        b: functions of the contactor's basis there ``(q, nc)``.
+        gap: ``(q,)``.
+        t: change of the gap with the place ``(q, gdim)``.
+        slope: of the gap outward across the side ``(q,)``.
+        outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
+        motions: of the points past the target.
+        way: of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
+        weight: of the quadrature, a length in 3D ``(q,)``.
+        end: whether the target ends there ``(q,)``.
+    """
+
+    pair: Ints
+    xi: Array
+    b: Array
+    gap: Array
+    t: Array
+    slope: Array
+    outward: Array
+    motions: _Motions
+    way: Array
+    weight: Array
+    end: Bools
+
+    def at_ends(self) -> _Sides:
+        """Those where the target ends."""
+        return self._take(self.end)
+
+    def between(self) -> _Sides:
+        """Those between two facets."""
+        return self._take(~self.end)
+
+    def _take(self, which: Bools) -> _Sides:
+        return _Sides(*(getattr(self, f.name)[which] for f in fields(self)))
+
+
+def _ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
     """Ends of target facets over contactor facets: pairs ``(q,)``, places in the plane and on the target, outward directions, weights.
 
     Args:
@@ -251,10 +399,10 @@ def _ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple
     pair, l = np.nonzero((its[:, :2, 0] > 0) & (its[:, :2, 0] < size[:, None]))
     at = its[pair, l, :1]
     out = np.sign(at - its[pair, 1 - l, :1])
-    return pair, at, other.nodes[l], out, np.ones(len(pair))
+    return pair, at, other.nodes[l], out, np.ones(len(pair)), l[:, None]
 
 
-def _edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array]:
+def _edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
     """Points on the straight sides of target facets over contactor facets; as ``_ends``, with weights that are lengths."""
     ring = np.array(other.ring)
     start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
@@ -281,7 +429,14 @@ def _edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tupl
     middle = its[:, ring, :2].mean(axis=1)[pair]
     out *= np.sign(np.einsum("qf,qf->q", out, a - middle))[:, None]
     eta = other.nodes[ring[side]] * (1 - part[:, None]) + other.nodes[np.roll(ring, -1)[side]] * part[:, None]
-    return pair, a + part[:, None] * (b - a), eta, out, first * length * np.tile(weights, len(pair) // k)
+    corners = np.stack([ring[side], np.roll(ring, -1)[side]], axis=1)
+    return pair, a + part[:, None] * (b - a), eta, out, first * length * np.tile(weights, len(pair) // k), corners
+
+
+def _outer(left: Array, right: Array) -> Array:
+    """Products of linear functions of the nodes ``(q, nn, gdim)``, each with its own: ``(q, nn gdim, nn gdim)``."""
+    k = left.shape[1] * left.shape[2]
+    return left.reshape(-1, k, 1) * right.reshape(-1, 1, k)
 
 
 def slopes(shape: FacetShape, y: Array, normal: Array, pair: Ints, eta: Array) -> Array:
