@@ -1,7 +1,8 @@
 """The conditions of frictionless contact, read from the bodies: residuals, places of nodes and facets, and nothing of the method.
 
 Every contactor is compared with every facet of its target, one by one, so that no search is trusted either. Of mortar, whose
-conditions hold in the mean, the weighted gaps are its own: the tests of the package compare them with a slow reference.
+conditions hold in the mean, the weighted gaps are its own: the tests of the package compare them with a slow reference. Its forces
+lie along the normals of the target, where this takes them.
 """
 
 from __future__ import annotations
@@ -72,17 +73,23 @@ def places(scene: BoxScene, contact: uem.Contact, h: float) -> list[Place]:
 
 
 def _mean_places(contact: uem.Contact) -> list[Place]:
-    """Places of this rank's contactors with mortar, whose conditions hold in the mean over the facets around each (collective).
+    """Places of this rank's contactors with mortar, whose conditions hold in the mean over the facets around each.
 
     The gap is the weighted one, infinite where the target covers none of a node's facets, and none where their neighbours' equations
-    take in what is hardly covered. Forces lie in the cone of these facets' own normals.
+    take in what is hardly covered.
     """
-    pair, surface = contact.pair, contact.pair.coupling.surface
-    known = COMM.allgather((surface.nodes.ravel(), -surface.normals().reshape(-1, contact.config.gdim)))
-    nodes, normals = (np.concatenate(part) for part in zip(*known))
-    own = contact.config.to_global(pair.nodes)
+    pair = contact.pair
     gaps = np.where(pair.off, np.where(pair.placement.details.ratio > 0, 0.0, np.inf), pair.gap)
-    return [Place(float(gap), normals[nodes == node], bool(np.isfinite(gap))) for node, gap in zip(own, gaps)]
+    return [Place(float(gap), np.zeros((0, contact.config.gdim)), bool(np.isfinite(gap))) for gap in gaps]
+
+
+def _target_normals(contact: uem.Contact) -> dict[int, Array]:
+    """Inward normals of the target's facets around each of this rank's nodes, what mortar's forces lie along (collective)."""
+    facets = contact.pair.target.facets
+    known = COMM.allgather((facets.nodes.ravel(), -facets.normals().reshape(-1, contact.config.gdim)))
+    nodes, normals = (np.concatenate(part) for part in zip(*known))
+    own = contact.config.to_global(np.arange(contact.config.n_owned))
+    return {i: normals[nodes == node] for i, node in enumerate(own) if (nodes == node).any()}
 
 
 def _off_cone(normals: Array, force: Array) -> float:
@@ -130,12 +137,17 @@ def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALAN
     trial.check("overlap", overlap(scene, h), OVERLAP)
     astray = work = lost = 0.0
     for node in np.flatnonzero(contactor & ~target & free.all(axis=1)):
-        astray += _off_cone(np.concatenate(normals[node]), r[node])
+        if len(cone := np.concatenate(normals[node])):
+            astray += _off_cone(cone, r[node])
         force = float(np.linalg.norm(r[node]))
         if np.isfinite(gaps[node]):
             work += force * gaps[node]
         else:
             lost += force
+    for contact in scene.contacts:
+        if isinstance(contact.pair.coupling, Mortar) and contact.pair.target.n_nodes:
+            cones = _target_normals(contact)
+            astray += sum(_off_cone(cones[i], r[i]) for i in cones if free[i].all() and not contactor[i])
     trial.check("force off the normals", COMM.allreduce(astray) / scale, BALANCE)
     trial.check("force times gap", COMM.allreduce(work) / (scale * h), OVERLAP)
     trial.check("force off the target", COMM.allreduce(lost) / scale, BALANCE)

@@ -330,7 +330,8 @@ class Mortar(NodeToSurface):
         lift = np.zeros((self.config.n_owned, self.config.gdim))
         lift[self.nodes] = plain.direction * (self.free & (rows.covered & active)[:, None])
         lift /= np.maximum(np.einsum("ng,ng->n", lift, lift), MOSTLY_PRESCRIBED**2)[:, None]
-        beside = rows.beside
+        beside, gap, known = rows.beside, plain.gap.copy(), np.zeros((self.config.n_owned, 1))
+        known[self.nodes, 0] = plain.gap
         while True:
             row, term, value = beside
             follows = np.einsum("kg,kg->k", value, self.config.ask_owners(term, lift))
@@ -338,13 +339,14 @@ class Mortar(NodeToSurface):
             if not self.config.comm.allreduce(len(i)):
                 break
             beside = _add_up_terms(beside, self._times_rows(plain, own[row[i]], term[i], follows[i]))
+            np.add.at(gap, row[i], follows[i] * self.config.ask_owners(term[i], known)[:, 0])
         # what it has along its own direction
         itself = np.flatnonzero(term == own[row])
         by = np.ones(len(own))
         by[row[itself]] -= follows[itself]
         value[itself] -= follows[itself, None] * plain.direction[row[itself]]
         made = _with_terms(plain, beside)
-        made = replace(made, gap=made.gap / by, coefficients=made.coefficients / by[made.row, None])
+        made = replace(made, gap=gap / by, coefficients=made.coefficients / by[made.row, None])
         self._taken_apart = rows, active.copy(), made, by
         return made, by
 
