@@ -8,21 +8,22 @@ nearer, and corners whose facets do not face it, have the equation of a node aga
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Basis, Covered, basis_of, dual_functions
-from uem_dolfinx.contact.mortar_tangent import SegmentPoints, slopes
+from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, terms_of, with_terms
+from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.node_to_surface import NEAR, NodeToSurface
+from uem_dolfinx.contact.segment_motions import slopes
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -33,7 +34,6 @@ from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import Exchange
 
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
 #: [convention; radians; test_mortar.py::test_parallel_facets]
@@ -41,43 +41,6 @@ PARALLEL = 1e-10
 #: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
 #: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
 COVERED_AGAIN = 0.5
-
-
-#: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
-#: little is covered there, far from the target, and the end of what is covers moves faster than the contactor.
-#: [heuristic; part of the component; -]
-MOSTLY_OWN = 0.5
-
-
-#: Rows that terms belong to, the nodes they follow and the coefficients.
-Terms: TypeAlias = tuple[Ints, Ints, Array]
-
-
-@dataclass(frozen=True)
-class WeightedRows:
-    """Equations of all contactors, one each.
-
-    Attributes:
-        equations: in the order of the contactors; none is active. Their left sides are the derivatives of the gaps.
-        plain: the same, along the normals of the contactor's facets alone.
-        beside: terms that the derivatives have beside the plain rows'; none where all facets are parallel.
-        points: quadrature points of the segments, where the rows were made.
-        covered: contactors whose equation comes from segments ``(n,)``.
-        facets: numbers of the contactor's facets near the target ``(m,)``.
-        ratio: part of the contactor's share of its facets that is covered ``(n,)``.
-        area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
-        share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
-    """
-
-    equations: UnitingEquations
-    plain: UnitingEquations
-    beside: Terms
-    points: SegmentPoints
-    facets: Ints
-    covered: Bools
-    ratio: Array
-    area: Array
-    share: Array
 
 
 class Pieces(NamedTuple):
@@ -105,16 +68,13 @@ class Mortar(NodeToSurface):
         super().__init__(config, nodes, target, **how)
         self._valleys, self.surface = None, surface
         self.basis: Basis = basis_of(surface.shape)
-        self._place = np.full(config.n_local, -1, dtype=np.int64)
-        self._place[nodes] = np.arange(len(nodes))
+        self._elimination = Elimination(config, nodes, self.free)
         # tells equal nodes apart, alike in any partition
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
         self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
         #: The last search that rows were made from, and these; a search finds the same object as long as nothing moves.
         self._united: tuple[Projection, WeightedRows] | None = None
-        #: Rows and active contactors for which these were last taken apart, and the equations that were left, as returned by ``_apart``.
-        self._taken_apart: tuple[WeightedRows, Bools, UnitingEquations, Array] | None = None
         #: Rows that a contact with small or fixed sliding keeps.
         self._kept: WeightedRows | None = None
         #: Motion of a rigid target when they were made.
@@ -283,8 +243,8 @@ class Mortar(NodeToSurface):
         direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
         # a row follows its own facets' other nodes where it takes them in, and the target's
         other = ~np.eye(own.shape[1], dtype=bool)
-        terms = [_terms(own, own, -on_facet, other & (coefficients != 0)), _terms(own[e], at.opposite, on_target)]
-        row, term, value = self._at_owners(terms, scale)
+        terms = [terms_of(own, own, -on_facet, other & (coefficients != 0)), terms_of(own[e], at.opposite, on_target)]
+        row, term, value = self._elimination.at_owners(terms, scale)
         # the rest keep their places on the target
         alone = np.flatnonzero(~is_covered)
         k, a = np.nonzero(nearest.nodes[alone] >= 0)
@@ -294,83 +254,10 @@ class Mortar(NodeToSurface):
         beside: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
-            beside = self._beside(at, scale, direction)
-            equations = _with_terms(plain, beside)
+            beside = self._elimination.beside(at, scale, direction)
+            equations = with_terms(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
         return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share)
-
-    def _beside(self, at: SegmentPoints, scale: Array, direction: Array) -> Terms:
-        """What the derivatives of the gaps have beside the plain rows of ``direction (n, gdim)``, over ``scale (n,)`` (collective)."""
-        on_facet, on_target = at.gap_derivatives()
-        terms = [_terms(at.nodes, at.nodes, -on_facet), _terms(at.nodes[at.facet], at.opposite, -on_target)]
-        row, term, value = self._at_owners(terms, scale)
-        own = np.zeros(len(scale))
-        itself = term == self.config.to_global(self.nodes)[row]
-        own[row[itself]] = -np.einsum("kg,kg->k", value[itself], direction[row[itself]])
-        kept = (own > MOSTLY_OWN - 1)[row]
-        return row[kept], term[kept], value[kept]
-
-    def _apart(self, rows: WeightedRows, active: Bools) -> tuple[UnitingEquations, Array]:
-        """The equations without what those of other ``active (n,)`` contactors eliminate, as they would follow in circles (collective).
-
-        Such parts, of second order in the angles between facets, are taken out with the plain rows of these contactors: those leave
-        neither force nor moment behind either.
-
-        Returns:
-            The equations, and what each was divided by so that it has its direction ``(n,)``.
-        """
-        if rows.equations is rows.plain:
-            return rows.plain, np.ones(len(self.nodes))
-        kept = self._taken_apart
-        same = kept is not None and kept[0] is rows and np.array_equal(kept[1], active)
-        if self.config.comm.allreduce(same, op=MPI.LAND):
-            assert kept is not None
-            return kept[2], kept[3]
-        plain, own = rows.plain, self.config.to_global(self.nodes)
-        lift = np.zeros((self.config.n_owned, self.config.gdim))
-        lift[self.nodes] = plain.direction * (self.free & (rows.covered & active)[:, None])
-        lift /= np.maximum(np.einsum("ng,ng->n", lift, lift), MOSTLY_PRESCRIBED**2)[:, None]
-        beside, gap, known = rows.beside, plain.gap.copy(), np.zeros((self.config.n_owned, 1))
-        known[self.nodes, 0] = plain.gap
-        while True:
-            row, term, value = beside
-            follows = np.einsum("kg,kg->k", value, self.config.ask_owners(term, lift))
-            i = np.flatnonzero((np.abs(follows) > NEGLIGIBLE) & (term != own[row]))
-            if not self.config.comm.allreduce(len(i)):
-                break
-            beside = _add_up_terms(beside, self._times_rows(plain, own[row[i]], term[i], follows[i]))
-            np.add.at(gap, row[i], follows[i] * self.config.ask_owners(term[i], known)[:, 0])
-        # what it has along its own direction
-        itself = np.flatnonzero(term == own[row])
-        by = np.ones(len(own))
-        by[row[itself]] -= follows[itself]
-        value[itself] -= follows[itself, None] * plain.direction[row[itself]]
-        made = _with_terms(plain, beside)
-        made = replace(made, gap=gap / by, coefficients=made.coefficients / by[made.row, None])
-        self._taken_apart = rows, active.copy(), made, by
-        return made, by
-
-    def _times_rows(self, plain: UnitingEquations, node: Ints, other: Ints, factor: Array) -> Terms:
-        """Terms that rows of ``node (k,)`` get where ``factor (k,)`` times the row of ``other (k,)`` is added to them (collective)."""
-        config, own = self.config, np.arange(len(self.nodes))
-        node, other, factor = Exchange.to(config.comm, config.owner_of(other)).send(node, other, factor)
-        row = np.concatenate([own, plain.row])
-        order = np.argsort(row, kind="stable")
-        term = np.concatenate([config.to_global(self.nodes), plain.followed])[order]
-        value = np.concatenate([-plain.direction, plain.coefficients])[order]
-        first = np.searchsorted(row[order], np.arange(len(own) + 1))
-        its = self._place[other - int(config.index_map.local_range[0])]
-        count = first[its + 1] - first[its]
-        i = np.repeat(np.arange(len(its)), count)
-        k = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + first[its][i]
-        return self._at_owners([(node[i], term[k], factor[i, None] * value[k])], np.ones(len(own)))
-
-    def _at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
-        """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
-        node, term, value = (np.concatenate(part) for part in zip(*parts))
-        node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
-        row = self._place[node - int(self.config.index_map.local_range[0])]
-        return _add_up_terms((row, term, value / scale[row, None]))
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
@@ -402,7 +289,9 @@ class Mortar(NodeToSurface):
 
     def equations(self, placement: Placement, points: Array, state: PairState, which: Ints) -> LabelledEquations:
         """One equation for each contactor."""
-        rows = replace(self._select(self._apart(placement.details, state.active)[0], which), active=state.active[which])
+        rows = replace(
+            self._select(self._elimination.apart(placement.details, state.active)[0], which), active=state.active[which]
+        )
         return LabelledEquations(rows, rows, which, np.full(len(which), NORMAL))
 
     def _select(self, rows: UnitingEquations, which: Ints) -> UnitingEquations:
@@ -417,7 +306,7 @@ class Mortar(NodeToSurface):
         rows: WeightedRows = placement.details
         mu = np.zeros(len(self.nodes))
         mu[equations.contactor] = multipliers
-        made, by = self._apart(rows, state.active)
+        made, by = self._elimination.apart(rows, state.active)
         nodes, values = self._handed_on(made, mu)
         force = np.asarray(self.config.add_at_owners(nodes, values)[self.nodes])
         return mu / by * rows.share, np.einsum("ng,ng->n", force, rows.equations.direction), force
@@ -432,7 +321,7 @@ class Mortar(NodeToSurface):
     def nodal_forces(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """What the equations hand on of the state's multipliers."""
         rows: WeightedRows = placement.details
-        made, by = self._apart(rows, state.active)
+        made, by = self._elimination.apart(rows, state.active)
         return self._handed_on(made, state.lam / rows.share * by)
 
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
@@ -453,26 +342,3 @@ class Mortar(NodeToSurface):
         super().commit()
         if self.sliding == "small":
             self._kept = None
-
-
-def _terms(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> Terms:
-    """Terms of rows of nodes ``rows (m, nr)`` that follow ``followed (m, nf)`` with ``values (m, nr, nf, gdim)``, zeros left out."""
-    m, i, a = np.nonzero(values.any(axis=3) & which)
-    return rows[m, i], followed[m, a], values[m, i, a]
-
-
-def _add_up_terms(*parts: Terms) -> Terms:
-    """Terms of several lists, those of the same row and node added up."""
-    row, term, value = (np.concatenate(part) for part in zip(*parts))
-    order = np.lexsort((term, row))
-    row, term, value = row[order], term[order], value[order]
-    if not len(row):
-        return row, term, value
-    first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(term, prepend=-1) != 0))
-    return row[first], term[first], np.add.reduceat(value, first, axis=0)
-
-
-def _with_terms(equations: UnitingEquations, terms: Terms) -> UnitingEquations:
-    """The equations with more terms."""
-    row, term, value = _add_up_terms((equations.row, equations.followed, equations.coefficients), terms)
-    return replace(equations, row=row, followed=term, coefficients=value)

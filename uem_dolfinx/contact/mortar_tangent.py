@@ -14,14 +14,26 @@ target move too, and dual functions with them; in the second derivatives they ar
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.duals import Covered, Duals, add_up, basis_of
+from uem_dolfinx.contact.segment_motions import (
+    Motions,
+    Sides,
+    dual_tangents,
+    edges,
+    ends,
+    outer,
+    ring_of,
+    side_rule,
+    skew,
+    sum_of_products,
+    to_gap,
+)  # fmt: skip
 from uem_dolfinx.geometry.overlaps import SLIVER, Planes, Segments, locate
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, tangents
 
@@ -77,7 +89,7 @@ class SegmentPoints:
             quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
             out[:, 0], out[:, 1] = -quarter, quarter
         else:
-            ring = _ring(self.shape)
+            ring = ring_of(self.shape)
             # of a ring of corners, the area vector is half the sum of the products of each with the next
             out[:, : len(ring)] = 0.5 * skew(np.einsum("ab,mbg->mag", ring.T, self.x[:, : len(ring)]))
         return out * self.sign[:, None, None, None]
@@ -111,11 +123,11 @@ class SegmentPoints:
             vector = vector + add_up(e[s.pair], leaning.reshape(-1, nc * g), m).reshape(m, nc, g)
         vector = vector / size[:, None, None]
         on_facet += np.einsum("mjg,magh->mjah", vector, self.turning).reshape(m, nc, nc * g)
-        on_facet = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
-        on_target = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
+        by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
+        by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
         if self.other is not None and self.other.dim == 1:
-            self._add_ends(self.other, on_facet, on_target)
-        return on_facet, on_target
+            self._add_ends(self.other, by_node, by_pair)
+        return by_node, by_pair
 
     def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
         """Add how weighted gaps change where the target, with facets of such a ``shape``, ends over contactor facets."""
@@ -151,7 +163,7 @@ class SegmentPoints:
         amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
         force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * self.segments.weight[q]
         n, size, gap, t = self.planes.normal[e], self.planes.size[e], self.segments.gap[q], self.to_gap[q]
-        motions = _Motions(self.phi[q], self.N[q], gap / size[pair], self.turning[e][pair])
+        motions = Motions(self.phi[q], self.N[q], gap / size[pair], self.turning[e][pair])
         turned = t + 2 * n[pair] if nt else n[pair]
         half = sum_of_products(pair, force, motions.along(t), motions.of_area(turned / size[pair, None]), k)
         if self.other is not None:
@@ -177,7 +189,7 @@ class SegmentPoints:
             square -= grown[:, :, :, None, None] * grown[:, None, None]
         more = amount[:, None, None, None, None] * square
         if g == 3:
-            ring = _ring(self.shape)
+            ring = ring_of(self.shape)
             c = len(ring)
             twice = -0.5 * ring[None, :, None, :, None] * skew(self.sign[e, None] * open_force)[:, None, :, None, :]
             more[:, :c, :, :c] += twice
@@ -213,8 +225,8 @@ class SegmentPoints:
         sides = self._sides(shape, which).at_ends()
         pair = which[sides.pair]
         e = self.facet[pair]
-        l, fore = pressure[e], pressure[e, self.duals.foremost[e]]
-        more = np.where(self.duals.own[e], l - fore[:, None], 0.0)
+        fore = pressure[e, self.duals.foremost[e]]
+        more = np.where(self.duals.own[e], pressure[e] - fore[:, None], 0.0)
         A, D, size, mean, b = self.duals.A[e], self.covered.D[e], self.planes.size[e], self.duals.gap[e], sides.b
         inverse = np.linalg.pinv(self.covered.M[e] / size[:, None, None], hermitian=True) / size[:, None, None]
         # quadratic functions' differences are derivatives
@@ -241,15 +253,17 @@ class SegmentPoints:
         stretch = np.zeros(way.shape)
         stretch[:, :nc] = (forward[:, None] * tab.dN[:, :, 0])[:, :, None] * sides.outward[:, None]
         change -= h[:, None, None] * stretch
-        half = _outer(way, change)
-        half += _outer(h[:, None, None] * motions.along(n) / size[:, None, None], motions.of_area(sides.outward))
+        half = outer(way, change)
+        half += outer(h[:, None, None] * motions.along(n) / size[:, None, None], motions.of_area(sides.outward))
         nodes = [np.concatenate([self.nodes[e], self.opposite[pair], np.full((len(pair), nt), -1)], axis=1)]
         blocks = [np.pad(half, ((0, 0), (0, nt * 2), (0, nt * 2)))]
         # the projection of the gap has to do with all that is opposite of the facet
         i, j = np.nonzero(e[:, None] == self.facet[None, :])
         s = self.segments
         q = np.flatnonzero(np.isin(s.pair, j))
-        at = _Motions(self.phi[q], self.N[q], s.gap[q] / self.planes.size[self.facet[s.pair[q]]], self.turning[self.facet[s.pair[q]]])
+        at = Motions(
+            self.phi[q], self.N[q], s.gap[q] / self.planes.size[self.facet[s.pair[q]]], self.turning[self.facet[s.pair[q]]]
+        )
         normal, extent = self.planes.normal[self.facet[s.pair[q]]], self.planes.size[self.facet[s.pair[q]]]
         gaps = at.along(self.to_gap[q]) + at.of_area(2 * (s.gap[q] / extent)[:, None] * normal)
         weighted = (s.weight[q, None] * self.b[q])[:, :, None, None] * gaps[:, None]
@@ -261,12 +275,12 @@ class SegmentPoints:
         wide[:, :nc], wide[:, nc + nt :] = its[:, :nc], its[:, nc:]
         wide_way[:, : nc + nt] = way[i]
         nodes.append(np.concatenate([self.nodes[e[i]], self.opposite[pair[i]], self.opposite[j]], axis=1))
-        blocks.append(_outer(wide_way, wide))
+        blocks.append(outer(wide_way, wide))
         out = np.concatenate(blocks)
         return np.concatenate(nodes), out + out.transpose(0, 2, 1)
 
     def _slides(
-        self, motions: _Motions, shape: FacetShape, tab: Tabulated, y: Array, n: Array, t: Array
+        self, motions: Motions, shape: FacetShape, tab: Tabulated, y: Array, n: Array, t: Array
     ) -> Iterator[tuple[Array, Array]]:
         """How the points opposite slide on their facets ``y (q, nt, gdim)``, and what changes with that, for each of the coordinates."""
         tangent = tangents(tab, y)
@@ -280,7 +294,7 @@ class SegmentPoints:
                 change -= 0.5 * sum(bend[:, e, None, None] * other for e, other in enumerate(slides))
             yield slide, change
 
-    def _sides(self, shape: FacetShape, which: Ints) -> _Sides:
+    def _sides(self, shape: FacetShape, which: Ints) -> Sides:
         """Sides of target facets over contactor facets.
 
         Args:
@@ -290,221 +304,18 @@ class SegmentPoints:
         e, y = self.facet[which], self.y[which]
         planes = self.planes.take(e)
         own, its = planes.coordinates(self.x[e]), planes.coordinates(y)
-        pair, at, eta, out, weight, corners = (_ends if shape.dim == 1 else _edges)(self.shape, own, shape, its)
+        pair, at, eta, out, weight, corners = (ends if shape.dim == 1 else edges)(self.shape, own, shape, its)
         # a side that two facets of the target share is found twice over a contactor facet
         code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], corners], axis=1)])
         _, same, count = np.unique(code, axis=0, return_inverse=True, return_counts=True)
-        alone = count[same.ravel()] == (1 if shape.dim == 1 else len(forms.quadrature_rule("interval", 2 * self.shape.degree + 2)[1]))
+        alone = count[same.ravel()] == len(side_rule(self.shape)[1])
         xi = locate(self.shape, own[pair, :, :-1], at)
         tab, phi = shape.tabulate(eta), self.shape.functions(xi)
         outward = np.einsum("qf,qfg->qg", out, planes.axes[pair, :-1])
         t = to_gap(area_vectors(tab, y[pair]), planes.normal[pair])
         gap = np.einsum("qa,qa->q", tab.N, its[pair, :, -1]) - np.einsum("qa,qa->q", phi, own[pair, :, -1])
-        motions = _Motions(phi, tab.N, gap / planes.size[pair], self.turning[e][pair])
+        motions = Motions(phi, tab.N, gap / planes.size[pair], self.turning[e][pair])
         slope = np.einsum("qg,qg->q", t, outward)
-        return _Sides(pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone)
-
-
-@dataclass(frozen=True)
-class _Motions:
-    """Motions of contactor points past the target, as linear functions of the nodes' displacements.
-
-    Attributes:
-        phi: the contactor's shape functions ``(q, nc)``.
-        N: the target's ``(q, nt)``.
-        part: gap over the size of the facet ``(q,)``.
-        turning: of its area vector ``(q, nc, gdim, gdim)``.
-    """
-
-    phi: Array
-    N: Array
-    part: Array
-    turning: Array
-
-    def __getitem__(self, which: Bools) -> _Motions:
-        return _Motions(self.phi[which], self.N[which], self.part[which], self.turning[which])
-
-    @property
-    def nc(self) -> int:
-        """Nodes of a contactor facet."""
-        return self.phi.shape[1]
-
-    def along(self, c: Array) -> Array:
-        """``c . (dx - dy + gamma da)`` for ``c (q, gdim)``, without ``da`` on a rigid target ``(q, nc + nt, gdim)``."""
-        out = np.concatenate([self.phi, -self.N], axis=1)[:, :, None] * c[:, None]
-        if self.N.shape[1]:
-            out[:, : self.nc] += self.part[:, None, None] * self._turned(c)
-        return np.asarray(out)
-
-    def of_area(self, c: Array) -> Array:
-        """``c . da`` for ``c (q, gdim)``: ``(q, nc + nt, gdim)``."""
-        return np.concatenate([self._turned(c), np.zeros((*self.N.shape, c.shape[1]))], axis=1)
-
-    def _turned(self, c: Array) -> Array:
-        return np.asarray((c[:, None, None] @ self.turning)[:, :, 0])
-
-
-@dataclass(frozen=True)
-class _Sides:
-    """Points on sides of target facets over contactor facets.
-
-    Attributes:
-        pair: ascending ``(q,)``.
-        xi: reference coordinates on the contactor's facets ``(q, fdim)``.
-        b: functions of the contactor's basis there ``(q, nc)``.
-        gap: ``(q,)``.
-        t: change of the gap with the place ``(q, gdim)``.
-        slope: of the gap outward across the side ``(q,)``.
-        outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
-        motions: of the points past the target.
-        way: of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
-        weight: of the quadrature, a length in 3D ``(q,)``.
-        end: whether the target ends there ``(q,)``.
-    """
-
-    pair: Ints
-    xi: Array
-    b: Array
-    gap: Array
-    t: Array
-    slope: Array
-    outward: Array
-    motions: _Motions
-    way: Array
-    weight: Array
-    end: Bools
-
-    def at_ends(self) -> _Sides:
-        """Those where the target ends."""
-        return self._take(self.end)
-
-    def between(self) -> _Sides:
-        """Those between two facets."""
-        return self._take(~self.end)
-
-    def _take(self, which: Bools) -> _Sides:
-        return _Sides(*(getattr(self, f.name)[which] for f in fields(self)))
-
-
-def _ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
-    """Ends of target facets over contactor facets: pairs ``(q,)``, places in the plane and on the target, outward directions, weights.
-
-    Args:
-        shape: of the contactor's facets.
-        own: their nodes in their planes ``(p, nc, 2)``.
-        other: of the target's facets.
-        its: their nodes ``(p, nt, 2)``.
-    """
-    size = own[:, 1, 0]
-    pair, l = np.nonzero((its[:, :2, 0] > 0) & (its[:, :2, 0] < size[:, None]))
-    at = its[pair, l, :1]
-    out = np.sign(at - its[pair, 1 - l, :1])
-    return pair, at, other.nodes[l], out, np.ones(len(pair)), l[:, None]
-
-
-def _edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
-    """Points on the straight sides of target facets over contactor facets; as ``_ends``, with weights that are lengths."""
-    ring = np.array(other.ring)
-    start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
-    low, high = np.zeros(start.shape[:2]), np.ones(start.shape[:2])
-    frame = own[:, shape.ring, :2]
-    turn = np.sign(cross(frame[:, 1] - frame[:, 0], frame[:, 2] - frame[:, 0]))[:, None]
-    for a in range(frame.shape[1]):
-        corner, along = frame[:, None, a], (frame[:, (a + 1) % frame.shape[1]] - frame[:, a])[:, None]
-        before, after = turn * cross(along, start - corner), turn * cross(along, end - corner)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            met = before / (before - after)
-        low = np.where((before < 0) & (after >= 0), np.maximum(low, met), low)
-        high = np.where((before >= 0) & (after < 0), np.minimum(high, met), high)
-        high = np.where((before < 0) & (after < 0), -1.0, high)
-    pair, side = np.nonzero(high > low)
-    points, weights = forms.quadrature_rule("interval", 2 * shape.degree + 2)
-    k = len(weights)
-    low, high = low[pair, side], high[pair, side]
-    part = (low[:, None] + (high - low)[:, None] * points[:, 0]).ravel()
-    pair, side, first = np.repeat(pair, k), np.repeat(side, k), np.repeat(high - low, k)
-    a, b = start[pair, side], end[pair, side]
-    length = np.linalg.norm(b - a, axis=1)
-    out = np.stack([(b - a)[:, 1], -(b - a)[:, 0]], axis=1) / length[:, None]
-    middle = its[:, ring, :2].mean(axis=1)[pair]
-    out *= np.sign(np.einsum("qf,qf->q", out, a - middle))[:, None]
-    eta = other.nodes[ring[side]] * (1 - part[:, None]) + other.nodes[np.roll(ring, -1)[side]] * part[:, None]
-    corners = np.stack([ring[side], np.roll(ring, -1)[side]], axis=1)
-    return pair, a + part[:, None] * (b - a), eta, out, first * length * np.tile(weights, len(pair) // k), corners
-
-
-def _outer(left: Array, right: Array) -> Array:
-    """Products of linear functions of the nodes ``(q, nn, gdim)``, each with its own: ``(q, nn gdim, nn gdim)``."""
-    k = left.shape[1] * left.shape[2]
-    return left.reshape(-1, k, 1) * right.reshape(-1, 1, k)
-
-
-def slopes(shape: FacetShape, y: Array, normal: Array, pair: Ints, eta: Array) -> Array:
-    """Changes of the gap with ``x - y`` at points ``eta (q, fdim)`` of target facets ``(q, gdim)``.
-
-    Args:
-        shape: of the target's facets.
-        y: their nodes, pair by pair ``(k, nt, gdim)``.
-        normal: of the contactor's facets, pair by pair ``(k, gdim)``.
-        pair: of each point ``(q,)``.
-        eta: reference coordinates.
-    """
-    if shape.affine:
-        middle = shape.tabulate(np.tile(shape.middle, (len(y), 1)))
-        return to_gap(area_vectors(middle, y), normal)[pair]
-    return to_gap(area_vectors(shape.tabulate(eta), y[pair]), normal[pair])
-
-
-def to_gap(across: Array, normal: Array) -> Array:
-    """Vectors along the target's normals ``across (q, gdim)``, of any length, whose product with the contactor's is -1."""
-    return -across / np.einsum("qg,qg->q", across, normal)[:, None]
-
-
-def dual_tangents(tangent: Array, n: Array) -> Array:
-    """Vectors across ``n (q, gdim)`` whose products with tangents ``(q, fdim, gdim)`` are 1 with the same and 0 with the other."""
-    if tangent.shape[1] == 1:
-        across = np.stack([-n[:, 1], n[:, 0]], axis=1)[:, None]
-    else:
-        across = np.stack([np.cross(tangent[:, 1], n), np.cross(n, tangent[:, 0])], axis=1)
-    return np.asarray(across / np.einsum("qfg,qfg->qf", across, tangent)[:, :, None])
-
-
-def sum_of_products(pair: Ints, weight: Array, left: Array, right: Array, k: int) -> Array:
-    """Sums of ``weight left' right`` over the points of each of ``k`` pairs.
-
-    Args:
-        pair: of the points, ascending ``(q,)``.
-        weight: ``(q,)``.
-        left: a linear function of the nodes each ``(q, nn, gdim)``.
-        right: likewise.
-        k: number of pairs.
-    """
-    size = left.shape[1] * left.shape[2]
-    left, right = (left * weight[:, None, None]).reshape(-1, size), right.reshape(-1, size)
-    out, count = np.zeros((k, size, size)), np.bincount(pair, minlength=k)
-    first = np.cumsum(count) - count
-    for c in np.unique(count[count > 0]):
-        which = np.flatnonzero(count == c)
-        rows = first[which, None] + np.arange(c)
-        out[which] = left[rows].transpose(0, 2, 1) @ right[rows]
-    return out
-
-
-def _ring(shape: FacetShape) -> Array:
-    """1 where a corner follows another around the facet, -1 where it goes before it ``(n_corners, n_corners)``."""
-    ring, n = shape.ring, len(shape.ring)
-    out = np.zeros((n, n))
-    out[ring, np.roll(ring, -1)] = 1.0
-    return out - out.T
-
-
-def skew(v: Array) -> Array:
-    """Matrices of the cross products with ``v (..., 3)`` from the left ``(..., 3, 3)``."""
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return out - np.swapaxes(out, -1, -2)
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Cross products of vectors in a plane ``(..., 2)``."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        return Sides(
+            pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone
+        )

@@ -164,7 +164,7 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, ru
     corners, count = corners[found], count[found]
     polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
     a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
-    area = 0.5 * np.abs(_cross(b - a, c - a))
+    area = 0.5 * np.abs(cross(b - a, c - a))
     at = np.einsum("qk,kpg->pqg", points, np.stack([a, b, c]))
     return np.repeat(found[polygon], len(weights)), at.reshape(-1, 2), (area[:, None] * weights).ravel()
 
@@ -192,7 +192,7 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     m, k, _ = corners.shape
     i = np.arange(k)
     real = i < count[:, None]
-    inside_by = _cross(along[:, None], corners - start[:, None])
+    inside_by = cross(along[:, None], corners - start[:, None])
     after = np.where(i + 1 < count[:, None], i + 1, 0)
     following, beyond_by = np.take_along_axis(corners, after[..., None], axis=1), np.take_along_axis(inside_by, after, axis=1)
     inside = inside_by >= 0
@@ -209,11 +209,12 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
 def _areas(corners: Array, count: Ints) -> Array:
     """Signed areas of polygons ``(m,)``."""
     arm = corners - corners[:, :1]
-    part = _cross(arm[:, 1:-1], arm[:, 2:])
+    part = cross(arm[:, 1:-1], arm[:, 2:])
     return 0.5 * np.where(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1, part, 0.0).sum(axis=1)
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross(a: Array, b: Array) -> Array:
+    """Cross products of vectors in a plane ``(..., 2)``."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
@@ -243,5 +244,5 @@ def _solve(A: Array, b: Array) -> Array:
     """Solutions of small systems ``A (q, f, f)`` for ``b (q, f)``, f = 1 or 2."""
     if A.shape[1] == 1:
         return b / A[:, 0]
-    det = _cross(A[:, :, 0], A[:, :, 1])
-    return np.stack([_cross(b, A[:, :, 1]), _cross(A[:, :, 0], b)], axis=1) / det[:, None]
+    det = cross(A[:, :, 0], A[:, :, 1])
+    return np.stack([cross(b, A[:, :, 1]), cross(A[:, :, 0], b)], axis=1) / det[:, None]

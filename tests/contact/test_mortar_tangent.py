@@ -1,0 +1,118 @@
+"""Derivatives of mortar's weighted gaps: rows and curvature against differences."""
+
+from __future__ import annotations
+
+from itertools import product
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from helpers import CELLS
+from mortar_scenes import Blocks, disturbed
+
+import uem_dolfinx as uem
+
+
+class WeightedGap:
+    """Sum of weighted gaps times multipliers as a function of the displacement, from the points of the segments.
+
+    Args:
+        b: blocks, of a problem already.
+        system: of it.
+    """
+
+    def __init__(self, b, system):
+        self.b, self.system, self.pair, self.g = b, system, b.contact.pair, b.g
+        self.start = b.u.x.array.copy()
+        X, surface = self.pair.config.X, self.pair.coupling.surface
+        self.X, self.dofs = X, surface.dofs[self.points(self.start).facets]
+        self.pressure = (1.0 + 0.5 * np.sin(5 * X[:, 0]))[self.dofs]
+
+    def points(self, displacement):
+        self.b.u.x.array[:] = displacement
+        self.system.place(returning=False)
+        return self.pair.placement.details
+
+    def leave_out_ends(self):
+        """No multipliers where the end of the target moves over facets in 3D, which derivatives leave out; the rows."""
+        rows = self.points(self.start)
+        inner = rows.ratio > (1 - 1e-9 if self.g == 3 and self.pair.target.n_nodes else 0.5)
+        self.pressure[np.isin(self.dofs, self.pair.nodes[~inner]).any(axis=1)] = 0.0
+        assert (self.pressure != 0).any()
+        return rows
+
+    def value(self, displacement):
+        points = self.points(displacement).points
+        return np.einsum("mj,mji,mi->", self.pressure, points.duals.A, points.covered.G)
+
+    def forces(self, displacement):
+        points, g = self.points(displacement).points, self.g
+        s, e, out = points.segments, points.facet, np.zeros((self.pair.config.n_local, g))
+        amount = np.einsum("qb,qb->q", points.b, np.einsum("mj,mjb->mb", self.pressure, points.duals.A)[e[s.pair]]) * s.weight
+        push = -amount[:, None] * points.planes.normal[e[s.pair]]
+        on_facet, on_target = points.gap_derivatives()
+        np.add.at(out, points.nodes[e[s.pair]], points.phi[..., None] * push[:, None])
+        np.add.at(out, points.nodes, np.einsum("mj,mjag->mag", self.pressure, on_facet))
+        if points.opposite.shape[1]:
+            np.add.at(out, points.opposite[s.pair], -points.N[..., None] * push[:, None])
+            np.add.at(out, points.opposite, np.einsum("kj,kjag->kag", self.pressure[e], on_target))
+        return out.ravel()
+
+    def ways(self, cell, h=1e-6):
+        """Displacements at random; facets of hexahedra stay flat, since quadrature of warped ones has further terms."""
+        rng, low = np.random.default_rng(3), self.X[:, -1:] < 1e-9
+        for _ in range(3):
+            way = rng.standard_normal(self.start.shape)
+            if cell == "hexahedron":
+                way = np.where(low, self.X @ rng.standard_normal((3, 3)), self.X @ rng.standard_normal((3, 3))).ravel()
+            yield way, [self.start + side * h * way for side in (1, -1)], 2 * h
+
+
+def leaning(b, cell):
+    """Displace both blocks, so that facets are no longer parallel."""
+    if cell == "hexahedron":
+        X, A = b.contact.pair.config.X, np.random.default_rng(2).uniform(-0.05, 0.05, (2, 3, 3))
+        b.u.x.array[:] = np.where(X[:, 2:] < 1e-9, X @ A[0], X @ A[1]).ravel()
+    else:
+        disturbed(b, 2, 0.01)
+
+
+@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+def test_rows_are_derivatives_of_the_gaps(cell, target):
+    """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
+        "lower" if target == "end" else "upper"
+    ))  # fmt: skip
+    if target == "ball":
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+    problem = b.pressed()
+    leaning(b, cell)
+    phi = WeightedGap(b, problem.system)
+    phi.leave_out_ends()
+    first = phi.forces(phi.start)
+    for way, (ahead, behind), h in phi.ways(cell):
+        slope = (phi.value(ahead) - phi.value(behind)) / h
+        assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
+
+
+@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+def test_curvature_against_differences(cell, target):
+    """Blocks of the curvature against central differences of what the rows hand on at constant multipliers."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
+        "lower" if target == "end" else "upper"
+    ))  # fmt: skip
+    if target == "ball":
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+    problem = b.pressed()
+    leaning(b, cell)
+    phi = WeightedGap(b, problem.system)
+    rows = phi.leave_out_ends()
+    nodes, blocks = rows.points.curvature(phi.pressure)
+    assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
+    index = (nodes[:, :, None] * b.g + np.arange(b.g)).reshape(len(nodes), -1)
+    for way, (ahead, behind), h in phi.ways(cell):
+        measured = -(phi.forces(ahead) - phi.forces(behind)) / h
+        told = np.zeros(len(phi.start))
+        np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()

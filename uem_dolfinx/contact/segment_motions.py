@@ -1,0 +1,219 @@
+"""Motions of points of contactor facets past a target: as linear functions of both bodies' nodes, and across the target's sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.overlaps import cross
+from uem_dolfinx.geometry.shapes import FacetShape, area_vectors
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Motions of contactor points past the target, as linear functions of the nodes' displacements.
+
+    Attributes:
+        phi: the contactor's shape functions ``(q, nc)``.
+        N: the target's ``(q, nt)``.
+        part: gap over the size of the facet ``(q,)``.
+        turning: of its area vector ``(q, nc, gdim, gdim)``.
+    """
+
+    phi: Array
+    N: Array
+    part: Array
+    turning: Array
+
+    def __getitem__(self, which: Bools) -> Motions:
+        return Motions(self.phi[which], self.N[which], self.part[which], self.turning[which])
+
+    @property
+    def nc(self) -> int:
+        """Nodes of a contactor facet."""
+        return self.phi.shape[1]
+
+    def along(self, c: Array) -> Array:
+        """``c . (dx - dy + gamma da)`` for ``c (q, gdim)``, without ``da`` on a rigid target ``(q, nc + nt, gdim)``."""
+        out = np.concatenate([self.phi, -self.N], axis=1)[:, :, None] * c[:, None]
+        if self.N.shape[1]:
+            out[:, : self.nc] += self.part[:, None, None] * self._turned(c)
+        return np.asarray(out)
+
+    def of_area(self, c: Array) -> Array:
+        """``c . da`` for ``c (q, gdim)``: ``(q, nc + nt, gdim)``."""
+        return np.concatenate([self._turned(c), np.zeros((*self.N.shape, c.shape[1]))], axis=1)
+
+    def _turned(self, c: Array) -> Array:
+        return np.asarray((c[:, None, None] @ self.turning)[:, :, 0])
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Points on sides of target facets over contactor facets.
+
+    Attributes:
+        pair: ascending ``(q,)``.
+        xi: reference coordinates on the contactor's facets ``(q, fdim)``.
+        b: functions of the contactor's basis there ``(q, nc)``.
+        gap: ``(q,)``.
+        t: change of the gap with the place ``(q, gdim)``.
+        slope: of the gap outward across the side ``(q,)``.
+        outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
+        motions: of the points past the target.
+        way: of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
+        weight: of the quadrature, a length in 3D ``(q,)``.
+        end: whether the target ends there ``(q,)``.
+    """
+
+    pair: Ints
+    xi: Array
+    b: Array
+    gap: Array
+    t: Array
+    slope: Array
+    outward: Array
+    motions: Motions
+    way: Array
+    weight: Array
+    end: Bools
+
+    def at_ends(self) -> Sides:
+        """Those where the target ends."""
+        return self._take(self.end)
+
+    def between(self) -> Sides:
+        """Those between two facets."""
+        return self._take(~self.end)
+
+    def _take(self, which: Bools) -> Sides:
+        return Sides(*(getattr(self, f.name)[which] for f in fields(self)))
+
+
+def ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
+    """Ends of target facets over contactor facets: pairs ``(q,)``, places in the plane and on the target, outward directions, weights.
+
+    Args:
+        shape: of the contactor's facets.
+        own: their nodes in their planes ``(p, nc, 2)``.
+        other: of the target's facets.
+        its: their nodes ``(p, nt, 2)``.
+    """
+    size = own[:, 1, 0]
+    pair, corner = np.nonzero((its[:, :2, 0] > 0) & (its[:, :2, 0] < size[:, None]))
+    at = its[pair, corner, :1]
+    out = np.sign(at - its[pair, 1 - corner, :1])
+    return pair, at, other.nodes[corner], out, np.ones(len(pair)), corner[:, None]
+
+
+def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
+    """Points on the straight sides of target facets over contactor facets; as ``ends``, with weights that are lengths."""
+    ring = np.array(other.ring)
+    start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
+    low, high = np.zeros(start.shape[:2]), np.ones(start.shape[:2])
+    frame = own[:, shape.ring, :2]
+    turn = np.sign(cross(frame[:, 1] - frame[:, 0], frame[:, 2] - frame[:, 0]))[:, None]
+    for j in range(frame.shape[1]):
+        corner, along = frame[:, None, j], (frame[:, (j + 1) % frame.shape[1]] - frame[:, j])[:, None]
+        before, after = turn * cross(along, start - corner), turn * cross(along, end - corner)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            met = before / (before - after)
+        low = np.where((before < 0) & (after >= 0), np.maximum(low, met), low)
+        high = np.where((before >= 0) & (after < 0), np.minimum(high, met), high)
+        high = np.where((before < 0) & (after < 0), -1.0, high)
+    pair, side = np.nonzero(high > low)
+    points, weights = side_rule(shape)
+    k = len(weights)
+    low, high = low[pair, side], high[pair, side]
+    part = (low[:, None] + (high - low)[:, None] * points[:, 0]).ravel()
+    pair, side, first = np.repeat(pair, k), np.repeat(side, k), np.repeat(high - low, k)
+    a, b = start[pair, side], end[pair, side]
+    length = np.linalg.norm(b - a, axis=1)
+    out = np.stack([(b - a)[:, 1], -(b - a)[:, 0]], axis=1) / length[:, None]
+    middle = its[:, ring, :2].mean(axis=1)[pair]
+    out = out * np.sign(np.einsum("qf,qf->q", out, a - middle))[:, None]
+    eta = other.nodes[ring[side]] * (1 - part[:, None]) + other.nodes[np.roll(ring, -1)[side]] * part[:, None]
+    corners = np.stack([ring[side], np.roll(ring, -1)[side]], axis=1)
+    return pair, a + part[:, None] * (b - a), eta, out, first * length * np.tile(weights, len(pair) // k), corners
+
+
+def side_rule(shape: FacetShape) -> tuple[Array, Array]:
+    """Quadrature on sides over contactor facets of a ``shape`` in 3D; the one end that a side has in 2D."""
+    if shape.dim == 1:
+        return np.zeros((1, 0)), np.ones(1)
+    return forms.quadrature_rule("interval", 2 * shape.degree + 2)
+
+
+def outer(left: Array, right: Array) -> Array:
+    """Products of linear functions of the nodes ``(q, nn, gdim)``, each with its own: ``(q, nn gdim, nn gdim)``."""
+    k = left.shape[1] * left.shape[2]
+    return left.reshape(-1, k, 1) * right.reshape(-1, 1, k)
+
+
+def slopes(shape: FacetShape, y: Array, normal: Array, pair: Ints, eta: Array) -> Array:
+    """Changes of the gap with ``x - y`` at points ``eta (q, fdim)`` of target facets ``(q, gdim)``.
+
+    Args:
+        shape: of the target's facets.
+        y: their nodes, pair by pair ``(k, nt, gdim)``.
+        normal: of the contactor's facets, pair by pair ``(k, gdim)``.
+        pair: of each point ``(q,)``.
+        eta: reference coordinates.
+    """
+    if shape.affine:
+        middle = shape.tabulate(np.tile(shape.middle, (len(y), 1)))
+        return to_gap(area_vectors(middle, y), normal)[pair]
+    return to_gap(area_vectors(shape.tabulate(eta), y[pair]), normal[pair])
+
+
+def to_gap(across: Array, normal: Array) -> Array:
+    """Vectors along the target's normals ``across (q, gdim)``, of any length, whose product with the contactor's is -1."""
+    return -across / np.einsum("qg,qg->q", across, normal)[:, None]
+
+
+def dual_tangents(tangent: Array, n: Array) -> Array:
+    """Vectors across ``n (q, gdim)`` whose products with tangents ``(q, fdim, gdim)`` are 1 with the same and 0 with the other."""
+    if tangent.shape[1] == 1:
+        across = np.stack([-n[:, 1], n[:, 0]], axis=1)[:, None]
+    else:
+        across = np.stack([np.cross(tangent[:, 1], n), np.cross(n, tangent[:, 0])], axis=1)
+    return np.asarray(across / np.einsum("qfg,qfg->qf", across, tangent)[:, :, None])
+
+
+def sum_of_products(pair: Ints, weight: Array, left: Array, right: Array, k: int) -> Array:
+    """Sums of ``weight left' right`` over the points of each of ``k`` pairs.
+
+    Args:
+        pair: of the points, ascending ``(q,)``.
+        weight: ``(q,)``.
+        left: a linear function of the nodes each ``(q, nn, gdim)``.
+        right: likewise.
+        k: number of pairs.
+    """
+    size = left.shape[1] * left.shape[2]
+    left, right = (left * weight[:, None, None]).reshape(-1, size), right.reshape(-1, size)
+    out, count = np.zeros((k, size, size)), np.bincount(pair, minlength=k)
+    first = np.cumsum(count) - count
+    for c in np.unique(count[count > 0]):
+        which = np.flatnonzero(count == c)
+        rows = first[which, None] + np.arange(c)
+        out[which] = left[rows].transpose(0, 2, 1) @ right[rows]
+    return out
+
+
+def ring_of(shape: FacetShape) -> Array:
+    """1 where a corner follows another around the facet, -1 where it goes before it ``(n_corners, n_corners)``."""
+    ring, n = shape.ring, len(shape.ring)
+    out = np.zeros((n, n))
+    out[ring, np.roll(ring, -1)] = 1.0
+    return out - out.T
+
+
+def skew(v: Array) -> Array:
+    """Matrices of the cross products with ``v (..., 3)`` from the left ``(..., 3, 3)``."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
