@@ -109,20 +109,27 @@ class SegmentPoints:
         """
         s, e, g = self.segments, self.facet, self.to_gap.shape[1]
         (m, nc), (k, nt) = self.nodes.shape, self.opposite.shape
-        weighted = s.weight[:, None] * self.b
-        lean = (weighted[:, :, None] * self.tilt[:, None, :]).reshape(-1, nc, 1, g)
-        own = (lean * self.phi[:, None, :, None]).reshape(len(lean), nc * nc * g)
-        its = (lean * self.N[:, None, :, None]).reshape(len(lean), nc * nt * g)
-        on_facet = add_up(e[s.pair], own, m).reshape(m, nc, nc * g)
-        on_target = add_up(s.pair, its, k).reshape(k, nc, nt * g)
-        # with the area, and on a mesh with the direction, of what is not closed
-        n, size = self.planes.normal, self.planes.size
+        n, size, weighted = self.planes.normal, self.planes.size, s.weight[:, None] * self.b
         vector = self.covered.G[:, :, None] * n[:, None]
-        if nt:
-            leaning = (weighted * s.gap[:, None])[:, :, None] * self.tilt[:, None]
-            vector = vector + add_up(e[s.pair], leaning.reshape(-1, nc * g), m).reshape(m, nc, g)
+        if self.other is not None and self.shape.affine and self.other.affine:
+            # the same all over a pair
+            tilt = np.zeros((k, g))
+            tilt[s.pair] = self.tilt
+            own, gap = np.split(
+                add_up(s.pair, _products(weighted, np.column_stack([self.phi, s.gap])), k).reshape(k, nc, -1), [nc], axis=2
+            )
+            on_facet = add_up(e, (own[..., None] * tilt[:, None, None]).reshape(k, -1), m).reshape(m, nc, nc * g)
+            on_target = (self.covered.N[..., None] * tilt[:, None, None]).reshape(k, nc, nt * g)
+            vector = vector + add_up(e, (gap * tilt[:, None]).reshape(k, -1), m).reshape(m, nc, g)
+        else:
+            lean = _products(weighted, self.tilt)
+            on_facet = add_up(e[s.pair], _products(lean, self.phi), m).reshape(m, nc, g, nc).swapaxes(2, 3).reshape(m, nc, nc * g)
+            on_target = add_up(s.pair, _products(lean, self.N), k).reshape(k, nc, g, nt).swapaxes(2, 3).reshape(k, nc, nt * g)
+            if nt:
+                vector = vector + add_up(e[s.pair], lean * s.gap[:, None], m).reshape(m, nc, g)
+        # with the area, and on a mesh with the direction, of what is not closed
         vector = vector / size[:, None, None]
-        on_facet += np.einsum("mjg,magh->mjah", vector, self.turning).reshape(m, nc, nc * g)
+        on_facet += (vector[:, None] @ self.turning).swapaxes(1, 2).reshape(m, nc, nc * g)
         by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
         by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
         if self.other is not None and self.other.dim == 1:
@@ -154,46 +161,33 @@ class SegmentPoints:
         Returns:
             Global nodes of the pairs that press ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
         """
-        (nc, nt), g = (self.nodes.shape[1], self.opposite.shape[1]), self.to_gap.shape[1]
-        pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1))
-        place = np.full(len(self.facet), -1, dtype=np.int64)
-        place[pressing] = np.arange(len(pressing))
-        q = np.flatnonzero(place[self.segments.pair] >= 0)
-        pair, e, k = place[self.segments.pair[q]], self.facet[pressing], len(pressing)
+        nc, nt, g = self.nodes.shape[1], self.opposite.shape[1], self.to_gap.shape[1]
+        some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
+        pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1) & some)
+        e, k = self.facet[pressing], len(pressing)
         amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
-        force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * self.segments.weight[q]
-        n, size, gap, t = self.planes.normal[e], self.planes.size[e], self.segments.gap[q], self.to_gap[q]
-        motions = Motions(self.phi[q], self.N[q], gap / size[pair], self.turning[e][pair])
+        pair, force, gap, t, eta, motions = self._loaded(pressing, amount)
+        n, size = self.planes.normal[e], self.planes.size[e]
         turned = t + 2 * n[pair] if nt else n[pair]
         half = sum_of_products(pair, force, motions.along(t), motions.of_area(turned / size[pair, None]), k)
         if self.other is not None:
-            tab = self.other.tabulate(self.segments.eta[q])
+            tab = self.other.tabulate(eta)
             for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
                 half += sum_of_products(pair, force, slide, change, k)
             sides = self._sides(self.other, pressing).between()
             step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
             half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
         elif self.bend is not None:
-            for row, unit in zip(np.moveaxis(self.bend[q], 1, 0), np.eye(g)):
-                half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(q), 1))), k)
+            # there are as many pairs as facets, and points in their order
+            bend = self.bend[np.isin(self.segments.pair, pressing)]
+            for row, unit in zip(np.moveaxis(bend, 1, 0), np.eye(g)):
+                half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
         blocks = half + half.transpose(0, 2, 1)
-        # what is not closed, times how the size of the facet and the direction change to the second order
-        open_force = add_up(pair, (force * gap)[:, None] * turned, k) / size[:, None]
-        amount = np.bincount(pair, force * gap, minlength=k) / size**2
-        turn = self.turning[e]
-        square = np.einsum("pigh,pjgk->pihjk", turn, turn)
-        if nt:
-            square *= 2.0
-        else:
-            grown = np.einsum("pg,pigh->pih", n, turn)
-            square -= grown[:, :, :, None, None] * grown[:, None, None]
-        more = amount[:, None, None, None, None] * square
-        if g == 3:
-            ring = ring_of(self.shape)
-            c = len(ring)
-            twice = -0.5 * ring[None, :, None, :, None] * skew(self.sign[e, None] * open_force)[:, None, :, None, :]
-            more[:, :c, :, :c] += twice
-        blocks.reshape(k, nc + nt, g, nc + nt, g)[:, :nc, :, :nc] += more
+        # what is not closed, with the second order of the facet's size and direction: once for each facet
+        _, first, of_facet = np.unique(e, return_index=True, return_inverse=True)
+        blocks.reshape(k, nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += self._opened(
+            e[first], add_up(of_facet[pair], np.column_stack([force * gap, (force * gap)[:, None] * turned]), len(first))
+        )
         nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
         if self.other is None or self.other.dim > 1:
             return nodes, -blocks
@@ -202,6 +196,47 @@ class SegmentPoints:
         room = more_nodes.shape[1] - nodes.shape[1]
         nodes = np.concatenate([np.pad(nodes, ((0, 0), (0, room)), constant_values=-1), more_nodes])
         return nodes, -np.concatenate([np.pad(blocks, ((0, 0), (0, room * g), (0, room * g))), more_blocks])
+
+    def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Motions]:
+        """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, t, eta and motions.
+
+        Where all facets are affine, t is the same all over a pair: one point stands for all of them, with sums for values.
+        """
+        k, s, e = len(pressing), self.segments, self.facet[pressing]
+        place = np.full(len(self.facet), -1, dtype=np.int64)
+        place[pressing] = np.arange(k)
+        q = np.flatnonzero(place[s.pair] >= 0)
+        pair = place[s.pair[q]]
+        force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * s.weight[q]
+        phi, N, gap, size, turning = self.phi[q], self.N[q], s.gap[q], self.planes.size[e], self.turning[e]
+        if self.other is None or not (self.shape.affine and self.other.affine):
+            return pair, force, gap, self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
+        total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap]), k)
+        one = q[np.searchsorted(pair, np.arange(k))]
+        phi, N, gap = np.split(total, [phi.shape[1], phi.shape[1] + N.shape[1]], axis=1)
+        return np.arange(k), np.ones(k), gap[:, 0], self.to_gap[one], s.eta[one], Motions(phi, N, gap[:, 0] / size, turning)
+
+    def _opened(self, e: Ints, open_force: Array) -> Array:
+        """Second derivatives of open gaps with the sizes and directions of contactor facets ``e (p,)``, ``(p, nc, gdim, nc, gdim)``.
+
+        Args:
+            e: facets.
+            open_force: forces times gaps, and these times ``t + 2 n``, or n on a rigid target ``(p, 1 + gdim)``.
+        """
+        turn, n, size = self.turning[e], self.planes.normal[e], self.planes.size[e]
+        square = np.einsum("pigh,pjgk->pihjk", turn, turn)
+        if self.other is not None:
+            square *= 2.0
+        else:
+            grown = (n[:, None, None] @ turn)[:, :, 0]
+            square -= grown[:, :, :, None, None] * grown[:, None, None]
+        out = (open_force[:, 0] / size**2)[:, None, None, None, None] * square
+        if turn.shape[2] == 3:
+            ring = ring_of(self.shape)
+            c = len(ring)
+            vector = self.sign[e, None] * open_force[:, 1:] / size[:, None]
+            out[:, :c, :, :c] -= 0.5 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
+        return np.asarray(out)
 
     def _curvature_of_ends(self, shape: FacetShape, pressure: Array) -> tuple[Ints, Array]:
         """Second derivatives with the places where the target ends over contactor facets, in 2D.
@@ -319,3 +354,8 @@ class SegmentPoints:
         return Sides(
             pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone
         )
+
+
+def _products(left: Array, right: Array) -> Array:
+    """Products of all columns of ``left (q, a)`` with all of ``right (q, b)``: ``(q, a b)``."""
+    return (left[:, :, None] * right[:, None, :]).reshape(len(left), -1)
