@@ -11,7 +11,7 @@ python3 demos/stability.py --methods united --quick
 #
 # - *correct*: force and energy are right to 1 %, no contactor is deeper in its target than 1e-3 of an element, and forces are in
 #   equilibrium, along normals and in pairs, to 1e-3; with mortar, whose conditions hold in the mean over the facets around a
-#   contactor, gaps are these means and normals those of its own facets;
+#   contactor, gaps are these means, and forces lie along the target's normals, but for 1e-2 where a mesh ends over a facet;
 # - a *named error*: the method says what it cannot do, which is what it should do where a case contradicts itself;
 # - *wrong*: anything else, with the figure that shows it.
 #

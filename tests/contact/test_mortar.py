@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from helpers import CELLS, M, at, box, clamp, complementary, factors, highest, linear, modulus, refused, run, scene, st_venant
 from mortar_scenes import COMM, Blocks, disturbed
@@ -227,6 +228,24 @@ def test_off_the_end_and_back():
         cuts += step.cuts
     assert cuts == 0 and min(forces[16:19]) == 0.0
     assert forces[-1] == pytest.approx(forces[1], rel=1e-6) and forces[1] > 1e-3
+
+
+def test_a_round_body_rests_on_a_flat_one():
+    """Nothing holds a block with a round base along the floor: facets that lean do not drive it, and it rests where it is put down."""
+    upper = box("quadrilateral", [0.2, 0.0], [0.8, 0.5], [8, 4])
+    upper = replace(upper, x=upper.x + np.outer(0.3 * (upper.x[:, 0] - 0.5) ** 2, [0.0, 1.0]))
+    lower = box("quadrilateral", [0.0, -0.5], [1.0, 0.0], [7, 3])
+    drawn = scene(COMM, "quadrilateral", [lower, box("quadrilateral", [0.2, 0.0], [0.8, 0.5], [8, 4])])
+    s = scene(COMM, "quadrilateral", [lower, upper])
+    s.drawing = drawn.drawing
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    contact = uem.Contact(s.tag("base", 1, at(1, 0.0)), s.tag("floor", 0, at(1, 0.0)), coupling="mortar")
+    bcs = clamp(V, s.tag("ground", 0, at(1, -0.5)))
+    upon = modulus(s, 0.0, 1.0)
+    problem = uem.UnitedProblem(linear(u, 1.0) + 1e-3 * upon * v[1] * ufl.dx, u, bcs=bcs, contacts=[contact])
+    assert run(problem)[-1].newton_iterations <= 8
+    assert contact.resultant().force == pytest.approx([0.0, 0.3e-3], abs=1e-10)
 
 
 def test_parallel_facets():
