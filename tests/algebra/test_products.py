@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from equation_scenes import CASES, Case
 from helpers import gathered_matrix
 from petsc4py import PETSc
-from test_restriction import CASES, Case, cases
 
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
@@ -47,7 +47,7 @@ def product(K: PETSc.Mat, P: Restriction, Q: Restriction) -> np.ndarray:
     return q.T @ k @ p + np.diag(np.where(np.abs(p).max(axis=0) == 0, np.diag(k), 0.0))
 
 
-@cases
+@pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("reserving", [False, True])
 def test_united_matrix_follows_its_equations(name, reserving):
     """Symmetric or not, P'KP and Q'KP are the dense products to rounding, and PETSc's PtAP, from one change to the next."""
