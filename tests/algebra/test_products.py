@@ -86,5 +86,5 @@ def test_matrix_stays_while_its_places_do():
     K.scale(2.0)
     P = turned(case, 0.3, some)
     second = united.update(P, P, K, None)
-    assert second.handle == first.handle
+    assert second.handle == first.handle and second.getBlockSize() == K.getBlockSize()
     assert np.abs(gathered_matrix(second) - product(K, P, P)).max() <= EXACT * np.abs(gathered_matrix(K)).max()

@@ -155,6 +155,8 @@ class UnitedMatrix:
             local = (all_columns[own] - self._first).astype(PETSc.IntType)
             arrays = (inside, local, self._values[: len(local)]), (starts - inside, all_columns[~own], self._values[len(local) :])
         self.A = PETSc.Mat().createAIJWithArrays(K.getSizes(), arrays, bsize=g, comm=K.comm)
+        # multigrid looks for it, and petsc4py 3.18 forgets it
+        self.A.setBlockSize(g)
 
 
 def _product(H: PETSc.Mat, P: PETSc.Mat, Q: PETSc.Mat) -> PETSc.Mat:
