@@ -119,6 +119,24 @@ def test_modes_that_are_nearly_alike(away, modes):
     assert near_null_space(triangles(1, away)) == modes
 
 
+def test_places_of_earlier_products(comm):
+    """A contactor that follows one node after the other: the places of two are kept, with a third only its own."""
+    config = Configuration(blocks(comm, "triangle", 5, 5, gap=0.5).u)
+    solver, K = UnitedSolver(config, "thresholds_", ITERATIVE), mass(config)
+    x = np.concatenate(comm.allgather(config.X[: config.n_owned]))
+    contactor, *followed = (
+        int(np.abs(x - place).sum(axis=1).argmin()) for place in ((0.4, 0.9), (0.2, -0.2), (0.6, -0.2), (0.6, -0.8))
+    )
+    entries, handles = [], []
+    for node in (*followed[:2], followed[0], followed[2]):
+        solver.set_operator(united(config, [(contactor, [0.0, 1.0], node)]), K, None)
+        entries.append(comm.allreduce(solver.A.getInfo()["nz_used"]) - comm.allreduce(K.getInfo()["nz_used"]))
+        handles.append(solver.A.handle)
+    own = entries[0]
+    assert own > 0 and entries == [own, 2 * own, 2 * own, own]
+    assert handles[1] == handles[2] != handles[3]
+
+
 @pytest.mark.parametrize("asked, given", [(3e-10, True), (3e-11, False)])
 def test_accuracy_of_an_iterative_solve(asked, given):
     """A Newton iteration gets the accuracy that it asks for, unless it is near rounding."""

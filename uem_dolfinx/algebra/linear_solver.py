@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError
@@ -152,9 +153,10 @@ class UnitedSolver:
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
         self.ksp = self._create_ksp()
-        self._key: object = None
-        self._P: PETSc.Mat | None = None
         self.A: Any = None
+        #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
+        self._united, self._unsymmetric = (UnitedMatrix(config, not self.iterative) for _ in range(2))
+        self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
         #: Whether the preconditioner has yet to see the present matrix.
         self._new = False
         #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
@@ -179,7 +181,8 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self._key = self._P = self.A = self._made_with = None
+        self.A = self._crossed = self._made_with = None
+        self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
         self.ksp.destroy()
         self.ksp = self._create_ksp()
 
@@ -224,32 +227,18 @@ class UnitedSolver:
                 self._adapt(False)
             self._set_unsymmetric(restriction, test, K, curvature)
             return
-        key: object = (K.handle, self.config.comm.allgather(restriction.fingerprint(values=False)))
-        reuse = key == self._key and self.A is not None
-        P = None if restriction.M is None else restriction.P
-        with timed("united matrix P'KP" if P is not None else "cross out prescribed components"):
-            if P is None:
-                if reuse:
-                    K.copy(self.A, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                else:
-                    self.A = K.copy()
+        if restriction.M is None and curvature is None:
+            with timed("cross out prescribed components"):
+                if self._crossed is None or self._crossed[0] != K:
+                    self._crossed = K, K.copy()
+                self.A = K.copy(self._crossed[1], PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
                 restriction.cross_out(self.A)
-            elif reuse:
-                P.copy(self._P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                K.PtAP(self._P, result=self.A)
-            else:
-                self._P = P
-                self.A = K.PtAP(self._P)
-            if curvature is not None:
-                # an equation that depends on others acts on nodes that P does not join, and without equations P joins none
-                alone = restriction.stacked or restriction.M is None
-                pattern = PETSc.Mat.Structure
-                fits = pattern.DIFFERENT_NONZERO_PATTERN if alone else pattern.SUBSET_NONZERO_PATTERN
-                self.A.axpy(1.0, curvature.PtAP(restriction.P), fits)
-                key = None if alone else key
-            _stiffen_idle(self.A, K, restriction)
+                _stiffen_idle(self.A, K, restriction)
+        else:
+            restriction.P  # noqa: B018
+            with timed("united matrix P'KP"):
+                self.A = self._united.update(restriction, restriction, K, curvature)
         self._keep_preconditioner(restriction.equations)
-        self._key = key
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         if self._new and self.needs_near_null_space:
             self.A.setBlockSize(self.config.gdim)
@@ -278,16 +267,13 @@ class UnitedSolver:
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
+        P.P, Q.P  # noqa: B018
         with timed("united matrix Q'KP"):
-            G = K if curvature is None else K.copy()
-            if curvature is not None:
-                G.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-            A = Q.P.transposeMatMult(G.matMult(P.P))
-            _stiffen_idle(A, K, P)
+            A = self._unsymmetric.update(P, Q, K, curvature)
         if self.iterative:
             self.ksp.setOperators(A, self.A)
             return
-        self._key, self._new, self.A = None, True, A
+        self._new, self.A = True, A
         self.ksp.getPC().setReusePreconditioner(False)
         self.ksp.setOperators(A)
 

@@ -52,7 +52,8 @@ class Restriction:
         self._sizes = ((g * n, g * config.index_map.size_global),) * 2
         self._first = g * int(config.index_map.local_range[0])
         self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
-        #: Eliminated nodes, and those that only hold their place in the sparsity of P.
+        #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
+        self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift = self._eliminate()
         #: Columns of P that are in use ``(n_owned, gdim)``.
@@ -63,7 +64,7 @@ class Restriction:
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
         self.d = self._vector(closure)
         #: Rows of the eliminated nodes, columns of the nodes they follow.
-        self.M: Any = self._matrix(*self._coupling_entries) if self._n_rows else None
+        self.M: Any = self._matrix(*self._coupling_entries(equations.active)) if self._n_rows else None
         #: Number of terms with M in the series of P and c.
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
@@ -108,11 +109,10 @@ class Restriction:
             self._sizes, bsize=self.config.gdim, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
         )
 
-    @cached_property
-    def _coupling_entries(self) -> tuple[Ints, Ints, Array]:
-        """Local rows, global columns and values of M, zeros stored so that the sparsity does not depend on directions."""
-        g, eq = self.config.gdim, self.equations
-        values = self.lift[eq.row][:, :, None] * eq.coefficients[:, None, :]
+    def _coupling_entries(self, which: Bools) -> tuple[Ints, Ints, Array]:
+        """Local rows, global columns and values of M for some equations, zeros stored so that no place depends on directions."""
+        g, eq = self.config.gdim, self.equations.select(which)
+        values = self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :]
         rows = np.broadcast_to((eq.node[eq.row, None] * g + np.arange(g))[:, :, None], values.shape)
         columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
         return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
@@ -156,12 +156,13 @@ class Restriction:
     @timed("restriction matrix P")
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
+        active = self.equations.active
         if self.chain == 0 or not self.stacked:
-            P = self._rows_of_P()
+            P = self._rows_of_P(active)
             # a followed component that is prescribed is no unknown
             P.diagonalScale(None, self._vector(self.used.astype(float)))
             return P
-        P, power, reach = self._rows_of_P(coupled=False), self.M, 1
+        P, power, reach = self._rows_of_P(np.zeros_like(active)), self.M, 1
         # (1 + M)(1 + M^2)(1 + M^4)... T: twice as many equations follow one another with each product
         while True:
             P.axpy(1.0, power.matMult(P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -170,14 +171,19 @@ class Restriction:
                 return P
             power = power.matMult(power)
 
-    def _rows_of_P(self, coupled: bool = True) -> PETSc.Mat:
-        """T, with the entries of M in the rows of the eliminated nodes if coupled."""
+    @property
+    def reserved(self) -> PETSc.Mat:
+        """A matrix with the places of P, and with those that equations would take if they held and followed no others."""
+        return self._rows_of_P(np.ones_like(self.equations.active))
+
+    def _rows_of_P(self, which: Bools) -> PETSc.Mat:
+        """T, with the entries of M of some equations in the rows of the eliminated nodes."""
         g, n = self.config.gdim, self.config.n_owned
         k = np.arange(g)
         block = np.broadcast_to((self.nodes[:, None] * g + k)[:, :, None], self.frames.shape).ravel().astype(np.int64)
         parts = [(block, self._first + block.reshape(-1, g, g).transpose(0, 2, 1).ravel(), self.frames.ravel())]
-        if coupled and self._n_rows:
-            parts.append(self._coupling_entries)
+        if which.any():
+            parts.append(self._coupling_entries(which))
         rows, columns, values = _sum_duplicates(*(np.concatenate(p) for p in zip(*parts)))
         plain = np.ones((n, g), dtype=bool)
         plain[self.nodes] = False
