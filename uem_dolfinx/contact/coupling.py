@@ -29,16 +29,30 @@ class LabelledEquations:
         test: rows of Q: how contact forces are handed on, ``Q'r = 0``; the same object unless the two differ. Equations of both are
             in the same order and eliminate the same nodes.
         contactor: place of each equation's contactor among the pair's ``(m,)``.
-        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
+        kind: ``NORMAL``, the number of a corner's further axis, or minus the number of a tangent along which friction holds ``(m,)``.
+        untilted: test rows as they are without the friction of contactors that slip; None where ``test`` is not tilted.
+        holding: trial rows, of which those that friction resists are active as well; None where there is no friction.
     """
 
     trial: UnitingEquations
     test: UnitingEquations
     contactor: Ints
     kind: Ints
+    untilted: UnitingEquations | None = None
+    holding: UnitingEquations | None = None
 
     def __len__(self) -> int:
         return len(self.contactor)
+
+    @property
+    def upright(self) -> UnitingEquations:
+        """Test rows without the friction of contactors that slip."""
+        return self.test if self.untilted is None else self.untilted
+
+    @property
+    def resisting(self) -> UnitingEquations:
+        """Rows of all relative motions that the contact resists."""
+        return self.trial if self.holding is None else self.holding
 
 
 @dataclass(frozen=True)
@@ -94,6 +108,9 @@ class Coupling(Protocol):
 
     def foreseen(self, placement: Placement, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+
+    def relative(self, placement: Placement, du: Array) -> Array:
+        """How an increment of the owned nodes ``(n_owned, gdim)`` moves contactors relative to the target ``(n, gdim)`` (collective)."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

@@ -134,7 +134,7 @@ class FloatingBodies:
 
     def _equations(self) -> UnitingEquations:
         """Uniting equations of all pairs, the derivatives of their gaps."""
-        return UnitingEquations.join([pair.equations().trial for pair in self._pairs], self._forces.config.gdim)
+        return UnitingEquations.join([pair.equations().resisting for pair in self._pairs], self._forces.config.gdim)
 
     def _fall(self, place: Callable[[], None], freely: bool, small_loads: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).
