@@ -29,6 +29,8 @@ class FrictionalPair(ContactPair):
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
     """
 
+    rough = True
+
     def __init__(self, *args: Any, mu: Array, free: Bools, **how: Any):
         super().__init__(*args, **how)
         self.mu, self.free = mu, free

@@ -55,6 +55,8 @@ class ContactPair:
     """
 
     placement: Placement
+    #: Whether there is friction.
+    rough = False
 
     def __init__(
         self,

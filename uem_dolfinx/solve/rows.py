@@ -95,14 +95,17 @@ class Rows:
 
 
 def make_rows(
-    meetings: Meetings, pairs: Sequence[ContactPair], hold: Callable[[UnitingEquations], Bools], prescribed: Array
+    meetings: Meetings,
+    pairs: Sequence[ContactPair],
+    hold: Callable[[UnitingEquations, UnitingEquations], Bools],
+    prescribed: Array,
 ) -> Rows:
     """Equations of all pairs in their present states, and Q (collective).
 
     Args:
         meetings: of the pairs.
         pairs: of all contacts.
-        hold: free components ``(n_owned, gdim)``, for rows of all relative motions that the contacts resist.
+        hold: free components ``(n_owned, gdim)``, for the rows of P and those of all relative motions that the contacts resist.
         prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
 
     Raises:
@@ -114,7 +117,7 @@ def make_rows(
         trial = UnitingEquations.join([e.trial for e in equations], g)
     rubbing = any(e.holding is not None for e in equations)
     # the derivatives of the gaps tell which motions of a body nothing holds
-    free = hold(UnitingEquations.join([e.resisting for e in equations], g) if rubbing else trial)
+    free = hold(trial, UnitingEquations.join([e.resisting for e in equations], g) if rubbing else trial)
     Q, independent = meetings.restrict(equations, upright, free, prescribed)
     tilted = Q
     if any(e.test is not e.upright for e in equations):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mpi4py import MPI
 
@@ -22,6 +22,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
 from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.floating import FloatingBodies
@@ -175,9 +176,9 @@ class BodySystem:
         """Equations of all pairs in their present states, and Q (collective)."""
         return make_rows(self.meetings, self.pairs, self._held, self.forces.prescribed)
 
-    def _held(self, resisting: UnitingEquations) -> Bools:
+    def _held(self, trial: UnitingEquations, resisting: UnitingEquations) -> Bools:
         """Components free but for those that hold neutral motions ``(n_owned, gdim)`` (collective)."""
-        return self.floating.hold(self.forces.free[: self.config.n_owned], resisting)
+        return self.floating.hold(self.forces.free[: self.config.n_owned], trial, resisting)
 
     def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
@@ -228,13 +229,20 @@ class BodySystem:
             forces = self._read_forces(rows, rows.test.pass_on(F), increment)
             left = accuracy if self.solver.iterative else 0.0
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            foreseen = [pair.foreseen(increment) for pair in self.pairs]
+            foreseen = [pair.foreseen(increment, self._plain) for pair in self.pairs]
+            sliding = self._sliding(F, forces)
+            moved = increment if sliding is None else increment + sliding
             wrong = []
             for pair, gap, (lam, _, force) in zip(self.pairs, foreseen, forces):
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, lam, force, along, least, near, self._swept, increment))
+                wrong.append(pair.wrong(gap, lam, force, along, least, near, self._swept, moved))
             count = self._count(wrong)
+            if not count and sliding is not None:
+                raise FrictionError(
+                    "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
+                    "Dirichlet condition, give it inertia, or take less load"
+                )
             if not count or self._adrift:
                 self._take(forces)
                 return None
@@ -246,6 +254,22 @@ class BodySystem:
             self._adrift = self.floating.adrift
             residual = rows.test.transpose(self.forces.residual)
         return self._state(rows, residual, state.rounding, state.changed, False)
+
+    def _sliding(self, F: PETSc.Vec, forces: list[tuple[Array, Array, Array]]) -> Array | None:
+        """How bodies slide without end that friction alone could hold, but does not, ``(n_owned, gdim)``; None if none does (collective).
+
+        Args:
+            F: of the bodies, foreseen.
+            forces: of the contacts, foreseen.
+        """
+        if self.floating.motions is None or not any(pair.rough for pair in self.pairs):
+            return None
+        left = F.array_r.reshape(-1, self.config.gdim).copy()
+        every = left.copy()
+        for pair, (lam, _, force) in zip(self.pairs, forces):
+            state = replace(pair.trial, lam=lam, force=force)
+            left -= self.config.add_at_owners(*pair.coupling.nodal_forces(pair.placement, state))
+        return self.floating.slide(left, every)
 
     def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
         """Which of the wrong contactors are exchanged now (collective)."""
