@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
-from evidence.scenes import Array, Blocks, blocks, clamp, linear, modulus
+from evidence.scenes import Array, Blocks, at, blocks, clamp, linear, modulus
 
 import uem_dolfinx as uem
 
@@ -45,17 +45,25 @@ def driven(
     law: Any = linear,
     E: float = 1.0,
     n: Any = (3, 4),
+    target: Any = None,
+    walls: bool = False,
     how: dict[str, Any] | None = None,
     options: dict[str, Any] | None = None,
     **scene: Any,
 ) -> Driven:
-    """A block on another one that is wider, or on a plane; all of its top is driven."""
+    """A block on another one that is wider, or on a plane; all of its top is driven. ``walls`` hold it in the second direction."""
     b = blocks(MPI.COMM_WORLD, cell, *n, overhang=0.5, **scene)
     g = b.gdim
-    target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
+    if target is None:
+        target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
     contact = uem.Contact(b.high, target, friction=mu, **(how or {}))
     top = fem.Function(b.V)
-    bcs = [*clamp(b.V, b.bottom), fem.dirichletbc(top, fem.locate_dofs_topological(b.V, b.top.dim, b.top.entities))]
+    sides = [clamp(b.V, b.scene.tag("side", 1, at(1, end)), 1) for end in (0.0, 1.0) if walls]
+    bcs = [
+        *sum(sides, []),
+        *clamp(b.V, b.bottom),
+        fem.dirichletbc(top, fem.locate_dofs_topological(b.V, b.top.dim, b.top.entities)),
+    ]
     problem = uem.UnitedProblem(law(b.u, modulus(b.scene, E, E)), b.u, bcs=bcs, contacts=[contact], **(options or {}))
     return Driven(b, problem, contact, top)
 

@@ -3,12 +3,15 @@
 The tests to read first are ``test_a_block_slides_at_mu_times_its_load`` and ``test_friction_holds_a_block``.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from friction_scenes import driven, loose
-from helpers import CELLS, highest, refused
+from friction_scenes import driven, history, loose
+from helpers import CELLS, factors, highest, refused, rotation, st_venant
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.3, 0.9])
@@ -101,3 +104,141 @@ def test_the_coefficient_may_be_a_function_of_place():
 def test_coefficients_that_are_none(mu, words):
     error = uem.InputTypeError if isinstance(mu, str) else uem.InputError
     refused(error, words, lambda: driven("quadrilateral", mu))
+
+
+def test_what_slides_away():
+    """A load beyond mu times the weight has no equilibrium, whatever the step: a named error, and the last state is kept."""
+    scene = loose("quadrilateral", 0.3, rigid=True)
+    scene.under(0.29999, -1.0)
+    before = scene.problem.u.x.array.copy()
+    refused(uem.FrictionError, "drive a body over its target", lambda: scene.under(0.30001, -1.0))
+    assert np.array_equal(scene.problem.u.x.array, before)
+    scene.under(-0.29999, -1.0)
+    assert abs(scene.contact.resultant().force[0] - 0.29999) <= 1e-9
+
+
+@pytest.mark.parametrize("cell, law", [("quadrilateral", st_venant), ("tetrahedron", st_venant)])
+def test_slip_converges_quadratically(cell, law):
+    """Finite sliding and finite strains over a base that bends: the tangent of the tilted rows is exact."""
+    scene = driven(cell, 0.4, law=law, n=(2, 3), options={"rtol": 1e-11})
+    g = scene.problem.config.gdim
+    side = [0.03] * (g - 2)
+    scene.to(*[0.0] * (g - 1), -0.05)
+    found = []
+    for x in (0.1, 0.14, 0.18):
+        found += factors(scene.to(x, *side, -0.05))
+    assert scene.states[0] == 0
+    assert len(found) >= 3 and max(found) <= 50.0
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_tangent_by_differences(cell):
+    """K and the curvature of tilted rows are the derivative of ``F - sum lambda (n - mu s)``, all contactors slipping."""
+    mu = 0.4
+    scene = driven(cell, mu)
+    problem, pair = scene.problem, scene.contact.pair
+    x, g, n = problem.config.X, problem.config.gdim, len(pair.nodes)
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+
+    def residual(u, direction):
+        friction = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
+        pair.trial = replace(pair.trial, active=np.ones(n, bool), lam=lam, nodal=lam, friction=friction)
+        problem.u.x.array[:] = u.ravel()
+        problem.system.place(returning=False)
+        problem.forces.assemble()
+        pair.trial = replace(pair.trial, force=lam[:, None] * (pair.projection.normal - mu * pair.directions))
+        r = problem.forces.residual
+        r.axpy(-1.0, compat.petsc_vector(scene.contact.force))
+        return r
+
+    residual(smooth, np.tile([1.0, *[0.5] * (g - 1)], (n, 1)))
+    s = pair.directions
+    residual(smooth, s)
+    problem.system._apart = True
+    du = problem.forces.vector(way[: problem.config.n_owned])
+    plain = problem.forces.update_tangent() * du
+    full = plain + problem.system.curvature() * du
+    difference = residual(smooth + 1e-5 * way, s) - residual(smooth - 1e-5 * way, s)
+    difference.scale(0.5e5)
+    assert (difference - full).norm() <= 1e-7 * (difference - plain).norm()
+
+
+def test_mirror_image():
+    """A scene driven to the other side is its own mirror image."""
+    places = [(0.0, -0.02), (0.01, -0.02), (0.06, -0.02), (0.02, -0.02)]
+    there = driven("quadrilateral", 0.3)
+    back = driven("quadrilateral", 0.3, pose=lambda x: x * [-1.0, 1.0] + [1.0, 0.0])
+    u, v = history(there, *places), history(back, *((-x, y) for x, y in places))
+    assert np.abs(u - v * [-1.0, 1.0]).max() <= 1e-10
+
+
+def test_space_is_the_plane_pulled_out():
+    """Between walls without friction a block in space slides as one in the plane."""
+    places = [(0.0, -0.02), (0.02, -0.02), (0.1, -0.02), (0.03, -0.02)]
+    plane = history(driven("quadrilateral", 0.3, rigid=True), *places)
+    scene = driven("hexahedron", 0.3, rigid=True, walls=True)
+    space = history(scene, *((x, 0.0, y) for x, y in places))
+    drawing = scene.blocks.scene.drawing
+    flat = driven("quadrilateral", 0.3, rigid=True).blocks.scene.drawing
+    _, of = np.unique(np.round(drawing[:, [0, 2]], 9), axis=0, return_inverse=True)
+    _, place = np.unique(np.round(flat, 9), axis=0, return_index=True)
+    # nodes of both blocks coincide where they touch
+    high = drawing[:, 2] > 1e-9
+    assert np.abs(space[:, high][:, :, [0, 2]] - plane[:, place[of]][:, high]).max() <= 1e-9
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("angle, scale", [(0.7, 1.0), (0.0, 1e3), (2.5, 1e-3)])
+def test_pose_and_units(cell, angle, scale):
+    """Turned, and drawn in other units, it is the same."""
+    g = 3 if cell == "hexahedron" else 2
+    R = rotation(g, angle)
+    places = np.zeros((4, g))
+    places[:, -1] = -0.02
+    places[1:, 0] = 0.02, 0.06, 0.03
+    places[2:, : g - 1] += 0.01
+    still = history(driven(cell, 0.3), *places)
+    turned = driven(cell, 0.3, E=1 / scale**2, pose=lambda x: scale * x @ R.T)
+    moved = history(turned, *(scale * places @ R.T))
+    assert np.abs(moved @ R / scale - still).max() <= 2e-8
+
+
+def test_a_loop_closes():
+    """Driven forth and back twice, forces of the second loop repeat; its area is what friction takes, and what is lost of the work."""
+    scene = driven("quadrilateral", 0.3, rigid=True, n=(3, 8))
+    scene.to(0.0, -0.02)
+    way = np.concatenate([np.linspace(a, b, 9)[1:] for a, b in ((0.0, 0.03), (0.03, -0.03), (-0.03, 0.03))])
+    loops, work, last = [], [0.0], None
+    for x in [*way, *np.linspace(0.03, -0.03, 9)[1:], *np.linspace(-0.03, 0.03, 9)[1:]]:
+        scene.to(x, -0.02)
+        force = -scene.contact.resultant().force[0]
+        if last is not None:
+            work.append(work[-1] + 0.5 * (force + last[1]) * (x - last[0]))
+        last = x, force
+        loops.append((force, scene.contact.dissipation))
+    forces, lost = np.array(loops).T
+    assert np.abs(forces[8:24] - forces[24:]).max() <= 1e-8 * forces.max()
+    area = work[-1] - work[len(work) - 17]
+    assert lost[-1] - lost[-17] == pytest.approx(area, rel=1e-10)
+    assert (np.diff(lost) >= 0).all()
+
+
+def test_a_moving_plane_takes_the_block_along():
+    """A rigid target that moves drags what sticks to it to rounding, and slips under what does not."""
+    plane = uem.RigidPlane([0.0, 0.0], [0.0, 1.0])
+    for mu, sticks in ((20.0, True), (0.05, False)):
+        scene = driven("quadrilateral", mu, target=plane.move([0.0, 0.0]))
+        scene.to(0.0, -0.01)
+        plane.move([0.004, 0.0])
+        scene.to(0.0, -0.01)
+        pair = scene.contact.pair
+        u = scene.problem.config.displacement[pair.nodes, 0]
+        if sticks:
+            assert highest(scene.problem.comm, np.abs(pair.slip)) <= 1e-15
+            assert np.abs(u - u.mean()).max(initial=0.0) <= 1e-3
+        else:
+            assert scene.states[0] == 0
+            f = scene.contact.resultant().force
+            assert f[0] == pytest.approx(0.05 * f[1], rel=1e-10)

@@ -251,9 +251,12 @@ class Contact:
 
     @property
     def status(self) -> fem.Function:
-        """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective)."""
+        """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective).
+
+        With friction a contactor that a corner of the target holds sticks.
+        """
         state = self.pair.trial
-        sticks = np.zeros(len(state.active), bool) if state.friction is None else state.friction.stick
+        sticks = np.zeros(len(state.active), bool) if state.friction is None else state.friction.stick | state.in_corner
         return self._field("status", np.where(state.active, np.where(sticks, 1.0, 2.0), 0.0))
 
     @property

@@ -94,6 +94,9 @@ class Coupling(Protocol):
     def with_nodal_gaps(self) -> Coupling:
         """The same contactors and target with nodal gaps, for methods that push nodes."""
 
+    def rub(self, mu: Array) -> None:
+        """Take the contactors' coefficients of friction ``(n,)``."""
+
     def place(self, points: Array, state: PairState) -> Placement:
         """Project contactors at ``points (n, gdim)`` (collective)."""
 

@@ -34,6 +34,7 @@ class FrictionalPair(ContactPair):
     def __init__(self, *args: Any, mu: Array, free: Bools, **how: Any):
         super().__init__(*args, **how)
         self.mu, self.free = mu, free
+        self.coupling.rub(mu)
         n, g = len(self.nodes), self.config.gdim
         self.trial = self.committed = replace(self.trial, friction=FrictionState.initial(n, g))
         #: Where the anchors are ``(n, gdim)``.
@@ -262,7 +263,7 @@ class FrictionalPair(ContactPair):
     def _anchored(self) -> FrictionState:
         """The state in which contactors that do not stick are anchored where they are."""
         f, p, x = self._rub(), self.projection, self.points
-        loose = ~f.stick | ~self.trial.active
+        loose = ~f.stick | ~self.rubbing
         below = x - p.gap[:, None] * p.normal
         if not self.target.n_nodes:
             motion: Motion | None = self.target.motion

@@ -97,6 +97,11 @@ class NodeToSurface:
             chords=self.chords,
         )
 
+    def rub(self, mu: Array) -> None:
+        """Take the contactors' coefficients of friction ``(n,)``, with which they leave corners."""
+        if self._valleys is not None:
+            self._valleys.mu = mu
+
     @property
     def followed(self) -> Indices:
         """Local nodes of the target."""
