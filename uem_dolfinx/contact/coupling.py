@@ -32,6 +32,7 @@ class LabelledEquations:
         kind: ``NORMAL``, the number of a corner's further axis, or minus the number of a tangent along which friction holds ``(m,)``.
         untilted: test rows as they are without the friction of contactors that slip; None where ``test`` is not tilted.
         holding: trial rows, of which those that friction resists are active as well; None where there is no friction.
+        turning: trial rows, and those across the directions of slip, in which friction resists as well; None where there is no friction.
     """
 
     trial: UnitingEquations
@@ -40,6 +41,7 @@ class LabelledEquations:
     kind: Ints
     untilted: UnitingEquations | None = None
     holding: UnitingEquations | None = None
+    turning: UnitingEquations | None = None
 
     def __len__(self) -> int:
         return len(self.contactor)
@@ -53,6 +55,11 @@ class LabelledEquations:
     def resisting(self) -> UnitingEquations:
         """Rows of all relative motions that the contact resists."""
         return self.trial if self.holding is None else self.holding
+
+    @property
+    def stopping(self) -> UnitingEquations:
+        """Rows of the relative motions that the contact does not let go on without end."""
+        return self.trial if self.turning is None else self.turning
 
 
 @dataclass(frozen=True)

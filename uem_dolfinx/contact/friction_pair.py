@@ -203,6 +203,11 @@ class FrictionalPair(ContactPair):
             direction[normal] += tilt
             coefficients[terms] += weights * tilt[row]
             tilted = replace(untilted, direction=direction, coefficients=coefficients)
+        turning = trial
+        if g == 3:
+            across = np.cross(self.projection.normal[who], self.directions[who])
+            more = (np.zeros(len(who)), self.slipping[who], row, test.followed[terms], weights * across[row])
+            turning = UnitingEquations.join([trial, UnitingEquations(test.node[normal], across, *more)], g)
         return LabelledEquations(
             trial,
             tilted,
@@ -210,6 +215,7 @@ class FrictionalPair(ContactPair):
             np.concatenate([own.kind, *(np.full(len(who), -r) for r in range(1, g))]),
             untilted,
             replace(trial, active=np.concatenate([own.trial.active, *resisted])),
+            turning,
         )
 
     def forces(self, equations: LabelledEquations, multipliers: Array, du: Array | None = None) -> tuple[Array, Array, Array]:

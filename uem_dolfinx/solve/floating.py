@@ -97,7 +97,7 @@ class FloatingBodies:
 
         Args:
             free: components without Dirichlet condition ``(n_owned, gdim)``.
-            equations: rows of P.
+            equations: rows of the relative motions that contacts do not let go on without end.
             resisting: rows of all relative motions that contacts resist, the same object without friction.
         """
         if self.motions is None:

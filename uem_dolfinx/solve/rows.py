@@ -105,7 +105,7 @@ def make_rows(
     Args:
         meetings: of the pairs.
         pairs: of all contacts.
-        hold: free components ``(n_owned, gdim)``, for the rows of P and those of all relative motions that the contacts resist.
+        hold: free components ``(n_owned, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
         prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
 
     Raises:
@@ -115,9 +115,12 @@ def make_rows(
     upright = trial = UnitingEquations.join([e.upright for e in equations], g)
     if any(e.trial is not e.upright for e in equations):
         trial = UnitingEquations.join([e.trial for e in equations], g)
-    rubbing = any(e.holding is not None for e in equations)
+    resisting = stopping = trial
+    if any(e.holding is not None for e in equations):
+        resisting = UnitingEquations.join([e.resisting for e in equations], g)
+        stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
-    free = hold(trial, UnitingEquations.join([e.resisting for e in equations], g) if rubbing else trial)
+    free = hold(stopping, resisting)
     Q, independent = meetings.restrict(equations, upright, free, prescribed)
     tilted = Q
     if any(e.test is not e.upright for e in equations):

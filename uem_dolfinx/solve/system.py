@@ -141,9 +141,7 @@ class BodySystem:
         if forces.stiffness is None and pairs:
             # what tells tension from rounding
             forces.update_tangent()
-        for pair in pairs:
-            assert forces.stiffness is not None
-            pair.turn(forces.stiffness[pair.nodes])
+        self._turn()
         F, rounding = forces.residual, self.rounding()
         with timed("uniting equations"):
             rows = self._rows()
@@ -176,9 +174,9 @@ class BodySystem:
         """Equations of all pairs in their present states, and Q (collective)."""
         return make_rows(self.meetings, self.pairs, self._held, self.forces.prescribed)
 
-    def _held(self, trial: UnitingEquations, resisting: UnitingEquations) -> Bools:
+    def _held(self, stopping: UnitingEquations, resisting: UnitingEquations) -> Bools:
         """Components free but for those that hold neutral motions ``(n_owned, gdim)`` (collective)."""
-        return self.floating.hold(self.forces.free[: self.config.n_owned], trial, resisting)
+        return self.floating.hold(self.forces.free[: self.config.n_owned], stopping, resisting)
 
     def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
@@ -296,6 +294,12 @@ class BodySystem:
         assert self.forces.stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
 
+    def _turn(self) -> None:
+        """Take the directions of friction from where the contactors are."""
+        for pair in self.pairs:
+            assert self.forces.stiffness is not None
+            pair.turn(self.forces.stiffness[pair.nodes])
+
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
         return self._rows().test
@@ -332,9 +336,10 @@ class BodySystem:
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` at the present displacement, with the active set of ``state``.
 
-        Q belongs to the present normals: the old Q would take the turned contact forces for a residual.
+        Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
         """
         self.place(returning=False)
+        self._turn()
         return self.restriction().transpose(self.forces.residual)
 
     def accelerate(self) -> None:
