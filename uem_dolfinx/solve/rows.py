@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mpi4py import MPI
 
 import numpy as np
+from petsc4py import PETSc
 
 from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
@@ -132,3 +133,16 @@ def make_rows(
         test = UnitingEquations.join([e.test for e in equations], g)
         tilted = Restriction(Q.config, test, free, prescribed, Q.stacked, like=Q)
     return Rows(equations, None if trial is upright else trial, independent, tilted, Q)
+
+
+def unbalanced(pairs: Sequence[ContactPair], F: PETSc.Vec, forces: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
+    """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
+
+    ``forces`` are those of every pair, as ``Coupling.forces`` returns them.
+    """
+    every = F.array_r.reshape(-1, F.getBlockSize()).copy()
+    left = every.copy()
+    for pair, (lam, nodal, force) in zip(pairs, forces):
+        state = replace(pair.trial, lam=lam, nodal=nodal, force=force)
+        left -= pair.config.add_at_owners(*pair.coupling.nodal_forces(pair.placement, state))
+    return left, every

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 from mpi4py import MPI
 
@@ -15,10 +16,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
 from uem_dolfinx.contact.pair import ContactPair
@@ -27,7 +27,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
-from uem_dolfinx.solve.rows import Meetings, Rows, make_rows
+from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import contact_curvature, slip_terms, together
 
 #: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
@@ -73,8 +73,10 @@ class BodySystem:
         self._factored: object = None
         self._curvature: PETSc.Mat | None = None
         self._pivoting = Pivoting()
-        #: Whether P differs from Q.
-        self._apart = False
+        #: Whether P differs from Q, and whether it may not, for the rest of an iteration.
+        self._apart = self._plain = False
+        #: The state that was settled last, if its united matrix has a negative determinant.
+        self._doubtful: BodyState | None = None
         #: Whether the last exchange has let go of a body that loads drive.
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
@@ -114,13 +116,24 @@ class BodySystem:
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch."""
+        self._doubtful = None
         self.floating.begin_step(lambda: self.place(returning=False))
 
     def end_step(self) -> None:
-        """Refuse an equilibrium that contacts and conditions do not agree about (collective)."""
+        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
         self.floating.end_step()
+        if (state := self._doubtful) is None:
+            return
+        # between this equilibrium and that without friction the united matrix was singular
+        self._factored = None
+        added = together(self._curvature, state.added)
+        if not self.solver.negative_without(state.rows.upright, self.forces.tangent.K, added):
+            raise FrictionError(
+                "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP is negative; take less "
+                "friction, or stiffer bodies"
+            )
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
@@ -172,11 +185,8 @@ class BodySystem:
 
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
-        return make_rows(self.meetings, self.pairs, self._held, self.forces.prescribed)
-
-    def _held(self, stopping: UnitingEquations, resisting: UnitingEquations) -> Bools:
-        """Components free but for those that hold neutral motions ``(n_owned, gdim)`` (collective)."""
-        return self.floating.hold(self.forces.free[: self.config.n_owned], stopping, resisting)
+        hold = partial(self.floating.hold, self.forces.free[: self.config.n_owned])
+        return make_rows(self.meetings, self.pairs, hold, self.forces.prescribed)
 
     def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
@@ -242,6 +252,7 @@ class BodySystem:
                     "Dirichlet condition, give it inertia, or take less load"
                 )
             if not count or self._adrift:
+                self._doubtful = state if self.solver.negative else None
                 self._take(forces)
                 return None
             wrong = self._choose(wrong, foreseen, count)
@@ -254,20 +265,10 @@ class BodySystem:
         return self._state(rows, residual, state.rounding, state.changed, False)
 
     def _sliding(self, F: PETSc.Vec, forces: list[tuple[Array, Array, Array]]) -> Array | None:
-        """How bodies slide without end that friction alone could hold, but does not, ``(n_owned, gdim)``; None if none does (collective).
-
-        Args:
-            F: of the bodies, foreseen.
-            forces: of the contacts, foreseen.
-        """
-        if self.floating.motions is None or not any(pair.rough for pair in self.pairs):
+        """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
+        if self.floating.motions is None or not self.rough:
             return None
-        left = F.array_r.reshape(-1, self.config.gdim).copy()
-        every = left.copy()
-        for pair, (lam, _, force) in zip(self.pairs, forces):
-            state = replace(pair.trial, lam=lam, force=force)
-            left -= self.config.add_at_owners(*pair.coupling.nodal_forces(pair.placement, state))
-        return self.floating.slide(left, every)
+        return self.floating.slide(*unbalanced(self.pairs, F, forces))
 
     def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
         """Which of the wrong contactors are exchanged now (collective)."""
@@ -430,6 +431,11 @@ class BodySystem:
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement."""
         return self.forces.linear
+
+    @property
+    def rough(self) -> bool:
+        """Whether there is friction."""
+        return any(pair.rough for pair in self.pairs)
 
     @property
     def in_contact(self) -> bool:
