@@ -45,6 +45,7 @@ def driven(
     law: Any = linear,
     E: float = 1.0,
     n: Any = (3, 4),
+    comm: MPI.Comm = MPI.COMM_WORLD,
     target: Any = None,
     walls: bool = False,
     how: dict[str, Any] | None = None,
@@ -52,7 +53,7 @@ def driven(
     **scene: Any,
 ) -> Driven:
     """A block on another one that is wider, or on a plane; all of its top is driven. ``walls`` hold it in the second direction."""
-    b = blocks(MPI.COMM_WORLD, cell, *n, overhang=0.5, **scene)
+    b = blocks(comm, cell, *n, overhang=0.5, **scene)
     g = b.gdim
     if target is None:
         target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low

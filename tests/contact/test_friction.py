@@ -5,6 +5,8 @@ The tests to read first are ``test_a_block_slides_at_mu_times_its_load`` and ``t
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from friction_scenes import driven, history, loose
@@ -265,3 +267,45 @@ def test_the_sign_of_the_determinant():
             refused(uem.FrictionError, "more than one answer", system.end_step)
         else:
             system.end_step()
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("rigid", [True, False])
+def test_going_on_from_a_checkpoint(cell, rigid, folder):
+    """Written by one rank in the middle of a slide and read by all, a run goes on as if it had not stopped."""
+    comm, side = MPI.COMM_WORLD, [0.01] if cell == "hexahedron" else []
+    places = [(x, *side, -0.02) for x in (0.0, 0.01, 0.03, 0.08, 0.07, 0.02)]
+    whole = driven(cell, 0.3, rigid=rigid)
+    u = history(whole, *places)
+    if comm.rank == 0:
+        first = driven(cell, 0.3, rigid=rigid, comm=MPI.COMM_SELF)
+        history(first, *places[:3])
+        uem.write_checkpoint(folder / "run", first.problem.state())
+    comm.barrier()
+    second = driven(cell, 0.3, rigid=rigid)
+    uem.read_checkpoint(folder / "run", second.problem.state())
+    v = history(second, *places[3:])
+    assert np.abs(u[3:] - v).max() <= 1e-9 * np.abs(u).max()
+    assert second.states == whole.states and min(np.ptp(whole.states), 1) == 1
+    assert second.contact.dissipation == pytest.approx(whole.contact.dissipation, rel=1e-8)
+    if comm.size == 1:
+        assert whole.problem.u.x.array.tobytes() == second.problem.u.x.array.tobytes()
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_iterative_solvers(cell):
+    """Where contactors slip, GMRES with the multigrid of P'KP takes the place of CG, and finds the same."""
+    g = 2 if cell == "quadrilateral" else 3
+    places = [(x, *[0.0] * (g - 2), -0.02) for x in (0.0, 0.01, 0.08)]
+    direct = driven(cell, 0.3, options={"rtol": 1e-10})
+    multigrid = {"ksp_type": "cg", **uem.multigrid_options("gamg")}
+    other = driven(cell, 0.3, options={"rtol": 1e-10, "petsc_options": multigrid})
+    u, v = history(direct, *places), history(other, *places)
+    assert other.states == direct.states and other.states[0] == 0
+    assert other.problem.system.solver.ksp.getType() == "gmres"
+    assert np.abs(u - v).max() <= 1e-7 * np.abs(u).max()
+
+
+@pytest.mark.parametrize("how, words", [({"how": {"coupling": "mortar"}}, "mortar"), ({"degree": 2}, "degree 2")])
+def test_what_friction_does_not_go_with(how, words):
+    refused(uem.InputError, ["friction", words], lambda: driven("quadrilateral", 0.3, **how))

@@ -163,6 +163,9 @@ class Contact:
         else:
             from uem_dolfinx.contact.friction_pair import FrictionalPair
 
+            if type(coupling) is not NodeToSurface:
+                what = "coupling = 'mortar'" if self.coupling == "mortar" else "a displacement of degree 2"
+                raise InputError(f"contact '{self.name}': friction does not go with {what} yet: take node_to_surface of degree 1")
             self._pair = FrictionalPair(config, nodes, coupling, mu=mu, free=free[nodes], **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair

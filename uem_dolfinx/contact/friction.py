@@ -29,7 +29,7 @@ PRESCRIBED = 1e-6
 SLIP_STIFFNESS = 0.1
 #: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
 #: [heuristic; the force q; -]
-LEAST_TURN = 0.9999
+LEAST_TURN = 0.99
 
 
 @dataclass(frozen=True)
