@@ -116,8 +116,8 @@ def coulomb(pair: FrictionalPair, length: float, force: float) -> None:
     """
     comm, trial, friction = pair.config.comm, pair.trial, pair.trial.friction
     assert friction is not None
-    tau, slip, s = pair.tangential(trial.force), pair.slip, pair.directions
-    bound = pair.mu * trial.nodal
+    tau, slip, s = pair.tangential(friction.tau), pair.slip, pair.directions
+    bound = pair.mu * trial.lam
     rubbing, slipping = pair.rubbing, pair.slipping
     stuck = rubbing & friction.stick
     assert highest(comm, (np.linalg.norm(tau, axis=1) - bound)[~trial.in_corner]) <= force

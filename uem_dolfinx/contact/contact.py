@@ -163,9 +163,10 @@ class Contact:
         else:
             from uem_dolfinx.contact.friction_pair import FrictionalPair
 
-            if type(coupling) is not NodeToSurface:
-                what = "coupling = 'mortar'" if self.coupling == "mortar" else "a displacement of degree 2"
-                raise InputError(f"contact '{self.name}': friction does not go with {what} yet: take node_to_surface of degree 1")
+            if not isinstance(coupling, Bernstein) and type(coupling) is not NodeToSurface:
+                raise InputError(
+                    f"contact '{self.name}': friction does not go with coupling = 'mortar' yet: take node_to_surface"
+                )
             self._pair = FrictionalPair(config, nodes, coupling, mu=mu, free=free[nodes], **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
@@ -256,17 +257,21 @@ class Contact:
     def status(self) -> fem.Function:
         """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective).
 
-        With friction a contactor that a corner of the target holds sticks.
+        With friction a contactor that a corner of the target holds in the plane sticks.
         """
         state = self.pair.trial
-        sticks = np.zeros(len(state.active), bool) if state.friction is None else state.friction.stick | state.in_corner
+        sticks = (
+            np.zeros(len(state.active), bool)
+            if state.friction is None
+            else state.friction.stick | (state.in_corner & (self.config.gdim == 2))
+        )
         return self._field("status", np.where(state.active, np.where(sticks, 1.0, 2.0), 0.0))
 
     @property
     def traction(self) -> fem.Function:
         """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
         pair, areas = self.pair, self.pair.coupling.areas(self.pair.placement, self._areas)[:, None]
-        tau = pair.trial.force - pair.trial.nodal[:, None] * pair.projection.normal
+        tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
         return self._vectors("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0))
 
     @property
@@ -292,7 +297,7 @@ class Contact:
         f, g, pair = self._fields["force"], self.config.gdim, self.pair
         f.x.array[:] = 0.0
         total = compat.petsc_vector(f)
-        nodes, forces = pair.coupling.nodal_forces(pair.placement, pair.trial)
+        nodes, forces = pair.nodal_forces(pair.trial)
         rows = (nodes[:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
         total.setValues(rows, forces.ravel(), addv=PETSc.InsertMode.ADD)
         total.assemble()

@@ -101,6 +101,10 @@ class Coupling(Protocol):
     def with_nodal_gaps(self) -> Coupling:
         """The same contactors and target with nodal gaps, for methods that push nodes."""
 
+    @property
+    def nodal(self) -> bool:
+        """Whether each contactor follows the point of the target below it, rather than in a mean."""
+
     def rub(self, mu: Array) -> None:
         """Take the contactors' coefficients of friction ``(n,)``."""
 
@@ -119,8 +123,11 @@ class Coupling(Protocol):
     def foreseen(self, placement: Placement, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
 
-    def relative(self, placement: Placement, du: Array) -> Array:
-        """How an increment of the owned nodes ``(n_owned, gdim)`` moves contactors relative to the target ``(n, gdim)`` (collective)."""
+    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """By what contactors follow other nodes: places of contactors, global nodes and weights, ``(k,)`` each (collective)."""
+
+    def shares(self, placement: Placement) -> Array:
+        """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)``."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

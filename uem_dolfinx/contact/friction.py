@@ -60,14 +60,14 @@ class FrictionWrong(Wrong):
         return FrictionWrong(first.enter, first.release, self.violation, self.slide, self.hold)
 
 
-def tangents(normal: Array, free: Bools) -> Array:
-    """Orthonormal directions across the normals ``(n, gdim)`` in the components ``free (n, gdim)``; zeros where there are fewer.
+def tangents(normals: Array, free: Bools) -> Array:
+    """Orthonormal directions across all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``; zeros where there are fewer.
 
     Returns:
         ``(n, gdim - 1, gdim)``.
     """
-    fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normal.shape[1])
-    _, size, axes = np.linalg.svd(np.concatenate([normal[:, None], fixed], axis=1))
+    fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normals.shape[2])
+    _, size, axes = np.linalg.svd(np.concatenate([normals, fixed], axis=1))
     # the last axes are those that neither the normal nor a prescribed component has a part in
     return np.where((size[:, 1:] < PRESCRIBED)[:, :, None] & free[:, None], axes[:, 1:], 0.0)
 

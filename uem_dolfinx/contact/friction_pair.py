@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, cast
 
 from mpi4py import MPI
 
 import numpy as np
+import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact import friction
 from uem_dolfinx.contact.active_set import GAP_ROUNDING, Wrong
+from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.state import FrictionState, PairState
@@ -41,10 +44,16 @@ class FrictionalPair(ContactPair):
         self._anchors: Array = np.zeros((n, g))
         #: The last placement that directions along the target were made for, and these ``(n, gdim - 1, gdim)``.
         self._tangents: tuple[Projection | None, Array] = None, np.zeros((n, g - 1, g))
+        #: What contactors follow in a mean kept since the last step: weights, positions of the owned nodes, motion of a rigid target;
+        #: None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
+        self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None] | None = None
+        self._moved: Array = np.zeros((n, g))
         #: Forces q and stiffnesses c that the directions of slip come from ``(n, gdim)``, ``(n,)``, and the forces tau ``(n, gdim)``.
         #: Contactors that have been let go of in the present linearised problem ``(n,)``, and what it foretells: forces and slips.
         self._released: Bools = np.zeros(n, dtype=bool)
         self._foreseen = np.zeros((n, g)), np.zeros((n, g))
+        #: Friction that belongs to the forces last read or foreseen ``(n, gdim)``.
+        self._told: Array = np.zeros((n, g))
         self._q, self._c, self._tau = np.zeros((n, g)), np.zeros(n), np.zeros((n, g))
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
@@ -53,10 +62,37 @@ class FrictionalPair(ContactPair):
         """Project the contactors and find their anchors where both are now (collective); see ``ContactPair``."""
         super().project()
         f, target = self._rub(), self.target
+        if not self.coupling.nodal:
+            if self._kept is None:
+                self._kept = self.coupling.weights(self.placement), self.config.x[: self.config.n_owned].copy(), target.motion
+            self._moved = self._move_since(*self._kept)
+            return
         if target.n_nodes:
             self._anchors = cast("MeshTarget", target).places(f.facet, f.xi) + f.anchor
         else:
             self._anchors = f.anchor if target.motion is None else target.motion.carry(f.anchor)
+
+    def _move_since(self, weights: tuple[Ints, Ints, Array], before: Array, motion: Motion | None) -> Array:
+        """Motion of the contactors relative to the target since the nodes were at ``before (n_owned, gdim)``, with weights of then."""
+        way = self.config.x[: self.config.n_owned] - before
+        now = self.target.motion
+        if now is not motion:
+            still = Motion.none(self.config.gdim)
+            start = before[self.nodes]
+            way[self.nodes] -= (now or still).carry((motion or still).back(start)) - start
+        return self._relative(way, weights)
+
+    def _relative(self, du: Array, weights: tuple[Ints, Ints, Array]) -> Array:
+        """How an increment ``(n_owned, gdim)`` moves contactors relative to what they follow ``(n, gdim)`` (collective)."""
+        row, followed, weight = weights
+        move = du[self.nodes]
+        np.subtract.at(move, row, weight[:, None] * self.config.ask_owners(followed, du))
+        return move
+
+    @property
+    def _off_anchor(self) -> Array:
+        """How far contactors are from their anchors, or have moved since the last step ``(n, gdim)``."""
+        return self.points - self._anchors if self.coupling.nodal else self._moved
 
     def _rub(self) -> FrictionState:
         assert self.trial.friction is not None
@@ -64,8 +100,21 @@ class FrictionalPair(ContactPair):
 
     @property
     def rubbing(self) -> Bools:
-        """Active contactors that friction acts on; a corner's facets hold a contactor without ``(n,)``."""
-        return self.trial.active & ~self.trial.in_corner & (self.mu > 0)
+        """Active contactors that friction acts on ``(n,)``."""
+        return self.trial.active & (self.mu > 0)
+
+    @property
+    def _corners(self) -> Corners | None:
+        """Corners that hold contactors, along whose edges alone they rub; None if no rank has any."""
+        return getattr(self.placement.details, "corners", None)
+
+    @property
+    def _cornered(self) -> Bools:
+        """Contactors that a corner holds ``(n,)``."""
+        held = np.zeros(len(self.nodes), dtype=bool)
+        if self._corners is not None:
+            held[self._corners.which] = True
+        return held
 
     @property
     def slipping(self) -> Bools:
@@ -77,13 +126,18 @@ class FrictionalPair(ContactPair):
         """Directions along the target in free components ``(n, gdim - 1, gdim)``."""
         p = self.projection
         if self._tangents[0] is not p:
-            self._tangents = p, friction.tangents(p.normal, self.free)
+            normals, c = p.normal[:, None], self._corners
+            if c is not None:
+                more = np.zeros((len(self.nodes), *c.axes.shape[1:]))
+                more[c.which] = np.where((np.arange(c.axes.shape[1]) < c.count[:, None])[:, :, None], c.axes, 0.0)
+                normals = np.concatenate([normals, more], axis=1)
+            self._tangents = p, friction.tangents(normals, self.free)
         return self._tangents[1]
 
     @property
     def slip(self) -> Array:
         """Motion along the target since the last step; of a contactor that sticks, how far it is off its anchor ``(n, gdim)``."""
-        return friction.along(self.tangents, self.points - self._anchors)
+        return friction.along(self.tangents, self._off_anchor)
 
     @property
     def directions(self) -> Array:
@@ -102,7 +156,7 @@ class FrictionalPair(ContactPair):
         return max(super().largest_gap(), float(self.config.comm.allreduce(float(off), op=MPI.MAX)))
 
     def _return_vectors(self) -> Array:
-        stuck = self.rubbing & self._rub().stick
+        stuck = self.rubbing & self._rub().stick & self.coupling.nodal
         return super()._return_vectors() - np.where(stuck[:, None], self.slip, 0.0)
 
     # -- activation and release ------------------------------------------------------------------------------------------
@@ -133,17 +187,18 @@ class FrictionalPair(ContactPair):
     ) -> Wrong:
         """Contactors that break the conditions of contact or friction; see ``ContactPair`` (collective)."""
         found = super().wrong(gap, lam, force, stiffness, force_rounding, gap_rounding, swept)
-        slip = self.slip
+        slip, tau = self.slip, self._rub().tau
         if du is not None:
-            slip = slip + friction.along(self.tangents, self.coupling.relative(self.placement, du))
-            self._foreseen = self.tangential(force), slip
+            slip = slip + friction.along(self.tangents, self._relative(du, self.coupling.weights(self.placement)))
+            tau = self._told
+            self._foreseen = tau, slip
         return friction.find_wrong(
             found,
             replace(self._rub(), direction=self.directions),
             self.rubbing,
             self.mu,
             lam,
-            self.tangential(force),
+            self.tangential(tau),
             slip,
             stiffness,
             force_rounding=force_rounding,
@@ -161,6 +216,7 @@ class FrictionalPair(ContactPair):
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), back, slip))
         self._released = self._released | wrong.release
         # where they begin to slip the linearised problem has taken the forces to
+        tau = tau / self.coupling.shares(self.placement)[:, None]
         self._q[wrong.slide], self._tau[wrong.slide] = -tau[wrong.slide], tau[wrong.slide]
         self._q[back], self._tau[back] = slip[back] * self._c[back, None], 0.0
 
@@ -170,7 +226,7 @@ class FrictionalPair(ContactPair):
         if self.config.gdim == 2:
             return
         self._c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
-        self._tau = self.tangential(self.trial.force)
+        self._tau = self.tangential(self._rub().tau) / self.coupling.shares(self.placement)[:, None]
         self._q = self._c[:, None] * self.slip - self._tau
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), self.slipping, self._q))
 
@@ -181,33 +237,36 @@ class FrictionalPair(ContactPair):
         own, g, f = super().equations(), self.config.gdim, self._rub()
         normal = np.flatnonzero(own.kind == NORMAL)
         who, test = own.contactor[normal], own.test
-        place = np.full(len(own), -1, dtype=np.int64)
-        place[normal] = np.arange(len(normal))
-        # the weights with which a contactor's row follows the target are those of its rows along the target
-        terms = np.flatnonzero(place[test.row] >= 0)
-        row = place[test.row[terms]]
-        weights = np.einsum("kg,kg->k", test.coefficients[terms], test.direction[test.row[terms]])[:, None]
-        T, rubbing = self.tangents[who], self.rubbing[who]
-        off = np.einsum("nrg,ng->nr", T, (self.points - self._anchors)[who])
-        parts, resisted = [], []
-        for r in range(g - 1):
-            t, there = T[:, r], rubbing & T[:, r].any(axis=1)
-            resisted.append(there)
-            held = there & f.stick[who]
-            parts.append(UnitingEquations(test.node[normal], t, off[:, r], held, row, test.followed[terms], weights * t[row]))
+        place = np.full(len(self.nodes), -1, dtype=np.int64)
+        place[who] = np.arange(len(who))
+        row, followed, weight = self.coupling.weights(self.placement)
+        there = place[row] >= 0
+        row, followed, weight = place[row[there]], followed[there], weight[there, None]
+
+        def along(t: Array, gap: Array, active: Bools) -> UnitingEquations:
+            return UnitingEquations(test.node[normal], t, gap, active, row, followed, weight * t[row])
+
+        T, rubbing, slipping = self.tangents[who], self.rubbing[who], self.slipping[who]
+        off = np.einsum("nrg,ng->nr", T, self._off_anchor[who])
+        resisted = [rubbing & T[:, r].any(axis=1) for r in range(g - 1)]
+        parts = [along(T[:, r], off[:, r], resisted[r] & f.stick[who]) for r in range(g - 1)]
         untilted = tilted = UnitingEquations.join([test, *parts], g)
         trial = untilted if own.trial is test else UnitingEquations.join([own.trial, *parts], g)
-        if self.config.comm.allreduce(int(self.slipping.any())):
-            tilt = np.where(self.slipping[who, None], -self.mu[who, None] * self.directions[who], 0.0)
-            direction, coefficients = untilted.direction.copy(), untilted.coefficients.copy()
+        if self.config.comm.allreduce(int(slipping.any())):
+            tilt = np.where(slipping[:, None], -self.mu[who, None] * self.directions[who], 0.0)
+            direction = untilted.direction.copy()
             direction[normal] += tilt
-            coefficients[terms] += weights * tilt[row]
-            tilted = replace(untilted, direction=direction, coefficients=coefficients)
+            tilted = replace(
+                untilted,
+                direction=direction,
+                row=np.concatenate([untilted.row, normal[row]]),
+                followed=np.concatenate([untilted.followed, followed]),
+                coefficients=np.concatenate([untilted.coefficients, weight * tilt[row]]),
+            )
         turning = trial
         if g == 3:
             across = np.cross(self.projection.normal[who], self.directions[who])
-            more = (np.zeros(len(who)), self.slipping[who], row, test.followed[terms], weights * across[row])
-            turning = UnitingEquations.join([trial, UnitingEquations(test.node[normal], across, *more)], g)
+            turning = UnitingEquations.join([trial, along(across, np.zeros(len(who)), slipping)], g)
         return LabelledEquations(
             trial,
             tilted,
@@ -224,17 +283,40 @@ class FrictionalPair(ContactPair):
         rows = equations.upright.select(plain)
         own = LabelledEquations(rows, rows, equations.contactor[plain], equations.kind[plain])
         lam, nodal, force = super().forces(own, multipliers[plain])
-        slipping = self.slipping[:, None]
-        force = force - np.where(slipping, (self.mu * nodal)[:, None] * self.directions, 0.0)
+        share = self.coupling.shares(self.placement)
+        tau = np.where(self.slipping[:, None], -(self.mu * lam / share)[:, None] * self.directions, 0.0)
         held = np.flatnonzero(~plain)
-        np.add.at(force, equations.contactor[held], multipliers[held, None] * equations.test.direction[held])
+        np.add.at(tau, equations.contactor[held], multipliers[held, None] * equations.test.direction[held])
         if du is not None and self.config.gdim == 3:
             across, stiffness, part = self._turning()
             i = np.flatnonzero(self.slipping)
-            move = self.coupling.relative(self.placement, du)[i]
+            move = self._relative(du, self.coupling.weights(self.placement))[i]
             taken = stiffness[:, None] * move + part[:, None] * self._tau[i]
-            force[i] -= np.einsum("kgh,kh->kg", across, taken)
-        return lam, nodal, force
+            tau[i] -= np.einsum("kgh,kh->kg", across, taken)
+        self._told = tau * share[:, None]
+        return lam, nodal, force + self._at_contactors(tau)
+
+    def _at_contactors(self, tau: Array) -> Array:
+        """Forces at contactors of multipliers ``tau (n, gdim)`` along the target ``(n, gdim)`` (collective)."""
+        if self.coupling.nodal:
+            return tau
+        return np.asarray(self.config.add_at_owners(*self._handed_on(tau))[self.nodes])
+
+    def _handed_on(self, tau: Array) -> tuple[Ints, Array]:
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``tau (n, gdim)`` along the target, on both bodies."""
+        row, followed, weight = self.coupling.weights(self.placement)
+        nodes = np.concatenate([self.config.to_global(self.nodes), followed])
+        return nodes, np.concatenate([tau, -weight[:, None] * tau[row]])
+
+    def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
+        """Give the trial state contact forces, with the friction that was read or foreseen with them; see ``ContactPair``."""
+        super().set_forces(lam, nodal, force, active)
+        self.trial = replace(self.trial, friction=replace(self._rub(), tau=self._told))
+
+    @property
+    def _multipliers(self) -> Array:
+        """Multipliers along the normals ``(n,)``."""
+        return np.asarray(self.trial.lam / self.coupling.shares(self.placement))
 
     def _turning(self) -> tuple[Array, Array, Array]:
         """Of contactors that slip: projectors across their directions ``(k, g, g)``, and what ``turn_stiffness`` returns."""
@@ -242,34 +324,48 @@ class FrictionalPair(ContactPair):
         T, s = self.tangents[i], self.directions[i]
         across = np.einsum("krg,krh->kgh", T, T) - s[:, :, None] * s[:, None, :]
         size = np.linalg.norm(self._q[i], axis=1)
-        return across, *friction.turn_stiffness(size, self.mu[i] * np.maximum(self.trial.nodal[i], 0.0), self._c[i])
+        return across, *friction.turn_stiffness(size, self.mu[i] * np.maximum(self._multipliers[i], 0.0), self._c[i])
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """What holds the directions of slip back in space; see ``ContactPair``."""
         if self.config.gdim == 2:
             return None
-        i, p = np.flatnonzero(self.slipping), self.projection
+        i = np.flatnonzero(self.slipping)
         across, stiffness, part = self._turning()
-        share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
+        nodes, share = self._table(i)
         k, m, g = *share.shape, self.config.gdim
         blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, share, across).reshape(k, m * g, m * g)
         forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self._tau[i]).reshape(k, m * g)
-        return np.column_stack([self.config.to_global(self.nodes[i]), p.nodes[i]]), blocks, forces
+        return nodes, blocks, forces
+
+    def _table(self, which: Ints) -> tuple[Ints, Array]:
+        """Of contactors ``which (k,)``: global nodes that move them relative to the target, -1 for none, and by how much ``(k, m)``."""
+        row, followed, weight = self.coupling.weights(self.placement)
+        order = np.argsort(row, kind="stable")
+        first = np.searchsorted(row[order], np.arange(len(self.nodes)))
+        column = np.arange(len(row)) - first[row[order]]
+        nodes = np.full((len(self.nodes), int(column.max(initial=-1)) + 2), -1, dtype=np.int64)
+        share = np.zeros(nodes.shape)
+        nodes[:, 0], share[:, 0] = self.config.to_global(self.nodes), 1.0
+        nodes[row[order], column + 1], share[row[order], column + 1] = followed[order], -weight[order]
+        return nodes[which], share[which]
 
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda d(row)/du``, the rows of contactors that slip tilted; see ``ContactPair``."""
         nodes, blocks = super().curvature()
-        i, p = np.flatnonzero(self.slipping & (self.trial.nodal > 0)), self.projection
-        tilt = (self.mu * self.trial.nodal)[i, None, None] * p.turnings(i, self.directions[i])
+        i, p = np.flatnonzero(self.slipping & (self.trial.lam > 0) & ~self._cornered), self.projection
+        tau = self.tangential(self.trial.force)[i]
         own = np.column_stack([self.config.to_global(self.nodes[i]), p.nodes[i]])
-        return np.concatenate([nodes, own]), np.concatenate([blocks, tilt])
+        return np.concatenate([nodes, own]), np.concatenate([blocks, -p.turnings(i, tau)])
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 
     def _anchored(self) -> FrictionState:
         """The state in which contactors that do not stick are anchored where they are."""
         f, p, x = self._rub(), self.projection, self.points
-        loose = ~f.stick | ~self.rubbing
+        if not self.coupling.nodal:
+            return f
+        loose = ~f.stick | ~self.rubbing | self._cornered
         below = x - p.gap[:, None] * p.normal
         if not self.target.n_nodes:
             motion: Motion | None = self.target.motion
@@ -288,9 +384,16 @@ class FrictionalPair(ContactPair):
     def commit(self) -> None:
         """Make the trial state the committed one, with new anchors for those that do not stick; see ``ContactPair``."""
         slip = np.where((self.trial.active | self.committed.active)[:, None], self.slip, 0.0)
-        mean = 0.5 * (self.tangential(self.committed.force) + self.tangential(self.trial.force))
+        assert self.committed.friction is not None
+        share = self.coupling.shares(self.placement)[:, None]
         f = self._anchored()
-        slipped = f.slipped + np.where(self.slipping[:, None], slip, 0.0)
+        mean = 0.5 * self.tangential(self.committed.friction.tau + f.tau) / share
+        slipped = f.slipped + np.where(self.slipping[:, None], slip / share, 0.0)
         f = replace(f, direction=self.directions, slipped=slipped, work=f.work - np.einsum("ng,ng->n", mean, slip))
-        self.trial = replace(self.trial, friction=f)
+        self.trial, self._kept = replace(self.trial, friction=f), None
         super().commit()
+
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what ``to_checkpoint`` returned; see ``ContactPair`` (collective)."""
+        super().from_checkpoint(kept)
+        self._kept = None

@@ -63,6 +63,7 @@ class NodeToSurface:
     """
 
     chained, two_pass = False, True
+    nodal = True
 
     def __init__(
         self,
@@ -167,7 +168,7 @@ class NodeToSurface:
         f = state.friction
         if f is None or not self.target.n_nodes:
             return nearest
-        i = np.flatnonzero(f.stick & state.active & ~state.in_corner)
+        i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
         own: Any = cast("MeshTarget", self.target).at(points[i], f.facet[i], f.xi[i])
         held: Any = nearest
         return held.with_rows(i, {x.name: getattr(own, x.name) for x in fields(own)} | {"beyond": 0.0})
@@ -186,16 +187,21 @@ class NodeToSurface:
     def foreseen(self, placement: Placement, du: Array) -> Array:
         """Nodal gaps after an increment (collective)."""
         p = placement.projection
-        return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, self.relative(placement, du)))
-
-    def relative(self, placement: Placement, du: Array) -> Array:
-        """How an increment moves the contactors away from their feet (collective)."""
-        p = placement.projection
         move = du[self.nodes]
         if p.nodes.shape[1]:
             followed = self.config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, self.config.gdim)
             move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
-        return move
+        return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
+
+    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """The shape functions at the feet; see ``Coupling``."""
+        p = placement.projection
+        row, a = np.nonzero(p.nodes >= 0)
+        return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
+
+    def shares(self, placement: Placement) -> Array:
+        """The whole multiplier."""
+        return np.ones(len(self.nodes))
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an open end of the target in a direction in which they can move.

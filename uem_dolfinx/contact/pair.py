@@ -297,6 +297,10 @@ class ContactPair:
         """
         return self.coupling.forces(self.placement, self.trial, equations, multipliers)
 
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """The contact forces of a state at nodes of both bodies; see ``Coupling.nodal_forces``."""
+        return self.coupling.nodal_forces(self.placement, state)
+
     def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
         """Give the trial state contact forces, and an active set if another method than elimination decides on it.
 

@@ -29,6 +29,7 @@ class FrictionState:
     Attributes:
         stick: held at the anchor ``(n,)``.
         direction: in which a contactor slips over the target, of length one; zero for all others ``(n, gdim)``.
+        tau: force of friction that belongs to ``lam`` ``(n, gdim)``.
         facet: facet that the anchor is on ``(n,)``; -1 on a rigid target.
         xi: the anchor's reference coordinates on it ``(n, gdim - 1)``.
         anchor: what is to be added to that place; on a rigid target the anchor where the target was drawn ``(n, gdim)``.
@@ -38,6 +39,7 @@ class FrictionState:
 
     stick: Bools
     direction: Array
+    tau: Array
     facet: Ints
     xi: Array
     anchor: Array
@@ -50,6 +52,7 @@ class FrictionState:
         return cls(
             stick=np.zeros(n, bool),
             direction=np.zeros((n, gdim)),
+            tau=np.zeros((n, gdim)),
             facet=np.full(n, -1, np.int64),
             xi=np.zeros((n, gdim - 1)),
             anchor=np.zeros((n, gdim)),

@@ -144,5 +144,5 @@ def unbalanced(pairs: Sequence[ContactPair], F: PETSc.Vec, forces: Sequence[tupl
     left = every.copy()
     for pair, (lam, nodal, force) in zip(pairs, forces):
         state = replace(pair.trial, lam=lam, nodal=nodal, force=force)
-        left -= pair.config.add_at_owners(*pair.coupling.nodal_forces(pair.placement, state))
+        left -= pair.config.add_at_owners(*pair.nodal_forces(state))
     return left, every
