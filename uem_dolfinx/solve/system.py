@@ -73,8 +73,8 @@ class BodySystem:
         self._factored: object = None
         self._curvature: PETSc.Mat | None = None
         self._pivoting = Pivoting()
-        #: Whether P differs from Q, and whether it may not, for the rest of an iteration.
-        self._apart = self._plain = False
+        #: Whether P differs from Q.
+        self._apart = False
         #: The state that was settled last, if its united matrix has a negative determinant.
         self._doubtful: BodyState | None = None
         #: Whether the last exchange has let go of a body that loads drive.
@@ -237,7 +237,7 @@ class BodySystem:
             forces = self._read_forces(rows, rows.test.pass_on(F), increment)
             left = accuracy if self.solver.iterative else 0.0
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            foreseen = [pair.foreseen(increment, self._plain) for pair in self.pairs]
+            foreseen = [pair.foreseen(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
             wrong = []
