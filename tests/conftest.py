@@ -28,10 +28,11 @@ pytest.register_assert_rewrite(
     "helpers", "bar_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes", "resting_scenes",
     "results_scenes",
 )  # fmt: skip
-from helpers import complementary, highest
+from helpers import complementary, coulomb, highest
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.contact.friction_pair import FrictionalPair
 from uem_dolfinx.solve.system import BodySystem
 
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -110,6 +111,8 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         # a small-sliding contact has been projected anew since
         if contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
+        if isinstance(contact.pair, FrictionalPair):
+            coulomb(contact.pair, 1e-12 * config.size, 1e-7 * scale + rounding)
         balance = contact.balance()
         # where the foot stays behind, the forces of a pair lie on two lines
         assert balance is None or (balance.force < 1e-11 and (balance.moment < 1e-11 or contact.sliding != "finite"))

@@ -41,6 +41,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.contact.friction_pair import FrictionalPair
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 #: Oedometric modulus over Young's modulus.
@@ -103,6 +104,30 @@ def complementary(contact: uem.Contact, length: float, force: float) -> None:
     assert lowest(comm, gap[~pair.off]) >= -length
     assert highest(comm, np.abs(lam[~active])) <= 0.0
     assert highest(comm, np.abs(gap[active])) <= length
+
+
+def coulomb(pair: FrictionalPair, length: float, force: float) -> None:
+    """Assert Coulomb's law: friction in its cone, no motion where contactors stick, friction against it where they slip (collective).
+
+    Args:
+        pair: after a converged step that is not yet committed.
+        length: relative motions below it are rounding.
+        force: nodal forces below it are rounding.
+    """
+    comm, trial, friction = pair.config.comm, pair.trial, pair.trial.friction
+    assert friction is not None
+    tau, slip, s = pair.tangential(friction.tau), pair.slip, pair.directions
+    bound = pair.mu * trial.lam
+    rubbing, slipping = pair.rubbing, pair.slipping
+    stuck = rubbing & friction.stick
+    assert highest(comm, (np.linalg.norm(tau, axis=1) - bound)[~trial.in_corner]) <= force
+    assert highest(comm, np.linalg.norm(slip[stuck], axis=1)) <= length
+    assert highest(comm, np.linalg.norm(tau + bound[:, None] * s, axis=1)[slipping]) <= force
+    forward = np.einsum("ng,ng->n", slip, s)
+    assert lowest(comm, forward[slipping]) >= -length
+    sideways = np.linalg.norm(slip - forward[:, None] * s, axis=1)
+    # a direction that comes from forces is as good as they are
+    assert highest(comm, sideways[slipping]) <= 1e-6 * highest(comm, np.abs(forward[slipping])) + 1e3 * length
 
 
 def lawful(contact: uem.Contact, size: float = 1.0, force: float = 1.0) -> None:

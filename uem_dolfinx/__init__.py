@@ -19,7 +19,7 @@ from __future__ import annotations
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Energies",
-    "EnergyBook", "EnergyGivenError", "FloatingBodyError", "HistoryWriter", "InputError", "InputTypeError",
+    "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
     "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
     "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
@@ -45,6 +45,7 @@ from uem_dolfinx.errors import (
     ConvergenceError,
     EnergyGivenError,
     FloatingBodyError,
+    FrictionError,
     InputError,
     InputTypeError,
     InvertedElementError,

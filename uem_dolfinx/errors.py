@@ -118,3 +118,7 @@ class ConvergenceError(UEMError, RuntimeError):
     def __init__(self, message: str, history: Sequence[object] = ()):
         super().__init__(message)
         self.history = list(history)
+
+
+class FrictionError(ConvergenceError):
+    """Friction leaves no answer, or more than one: stick and slip do not settle, or a slip runs against its own direction."""

@@ -314,6 +314,23 @@ class UnitedSolver:
                 vectors.append(q)
         return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
 
+    @property
+    def _tells_sign(self) -> bool:
+        """Whether the solver tells the sign of the determinant of an unsymmetric matrix."""
+        return not self._symmetric and self.ksp.getPC().getFactorSolverType() == "mumps"
+
+    @property
+    def negative(self) -> bool:
+        """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
+        return self._tells_sign and bool(self.ksp.getPC().getFactorMatrix().getMumpsRinfog(12) < 0.0)
+
+    def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
+        """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
+        self.set_operator(restriction, K, curvature)
+        with self._in_database(mat_mumps_icntl_33=1):
+            self.ksp.setUp()
+        return bool(self.ksp.getPC().getFactorMatrix().getMumpsRinfog(12) < 0.0)
+
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and the number of linear iterations (collective).
 
@@ -325,7 +342,7 @@ class UnitedSolver:
         dq = rhs.duplicate()
         if self.iterative and not self._fixed_accuracy:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
-        with self._in_database():
+        with self._in_database(**({"mat_mumps_icntl_33": 1} if self._tells_sign else {})):
             try:
                 if self._new:
                     with timed("factorisation or preconditioner set-up"):

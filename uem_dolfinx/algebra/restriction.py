@@ -40,12 +40,21 @@ class Restriction:
         free: components without Dirichlet condition, of the owned nodes ``(n_owned, gdim)``.
         prescribed: increments that the Dirichlet conditions ask for ``(n_owned, gdim)``, zero where free.
         stacked: whether a node that is followed may itself be eliminated.
+        like: restriction of the same equations in other directions, whose components are eliminated and whose unknowns kept.
 
     Raises:
         ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle.
     """
 
-    def __init__(self, config: Configuration, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool = True):
+    def __init__(
+        self,
+        config: Configuration,
+        equations: UnitingEquations,
+        free: Bools,
+        prescribed: Array,
+        stacked: bool = True,
+        like: Restriction | None = None,
+    ):
         self.config, self.equations, self.free, self.stacked = config, equations, free, stacked
         self.comm = config.comm
         g, n = config.gdim, config.n_owned
@@ -55,7 +64,7 @@ class Restriction:
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
-        self.frames, self.lift = self._eliminate()
+        self.frames, self.lift = self._eliminate() if like is None else self._eliminate_like(like)
         #: Columns of P that are in use ``(n_owned, gdim)``.
         self.used: Bools = free.copy()
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
@@ -91,6 +100,22 @@ class Restriction:
             lift[rows] = pinv.transpose(0, 2, 1)
             frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
         agree(self.comm, error)
+        return frames, lift
+
+    def _eliminate_like(self, like: Restriction) -> tuple[Array, Array]:
+        """What ``_eliminate`` returns, from the frames and the lift of other equations ``like``.
+
+        With ``A`` the directions here, and ``T`` and ``L`` the frame and the lift there, these are ``L (A L)^-1`` and
+        ``(1 - L (A L)^-1 A) T``: a frame, no longer orthonormal, with the same unknowns.
+        """
+        eq, frames, lift = self.equations, like.frames.copy(), np.zeros_like(like.lift)
+        for at, rows in eq.by_node():
+            A = eq.direction[rows] * self.free[at, None, :]
+            L = like.lift[rows].transpose(0, 2, 1)
+            own = L @ np.linalg.inv(A @ L)
+            lift[rows] = own.transpose(0, 2, 1)
+            place = np.searchsorted(self.nodes, at)
+            frames[place] -= own @ (A @ frames[place])
         return frames, lift
 
     def _conflict(self, node: int, n_equations: int) -> ConflictError:

@@ -132,10 +132,10 @@ class ControlGaps:
         control = control + active * self._handed_on(control, dropped & of_facet)
         control = control + active * self._handed_on(control, dropped & ~of_facet)
         nodal = control - self._handed_on(control, self.shared)
-        return self._scale * control, nodal
+        return self.scale * control, nodal
 
     @property
-    def _scale(self) -> Array:
+    def scale(self) -> Array:
         """Bernstein's basis functions over those that belong to the scaled gaps ``(n,)``."""
         f = self.family
         scale = np.ones(len(f.nodes))
@@ -168,7 +168,7 @@ class ControlGaps:
     def areas(self, areas: Array) -> Array:
         """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
         areas = areas + self._handed_on(areas, self.shared & self.family.of_facet)
-        return self._scale * (areas + self._handed_on(areas, self.shared & ~self.family.of_facet))
+        return self.scale * (areas + self._handed_on(areas, self.shared & ~self.family.of_facet))
 
     def _handed_on(self, values: Array, terms: Bools) -> Array:
         """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
@@ -187,15 +187,42 @@ class ControlFeet(Feet):
 class Bernstein(NodeToSurface):
     """Implements ``Coupling`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
 
+    nodal = False
+    #: Whether there is friction, so that the gap of a parent matters whether it has closed or not.
+    _rubs = False
+
     def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.family = Family(config, nodes, *_family(config, nodes))
         # one in the middle of a facet follows those in the middles of edges
         self.chained = bool(config.comm.allreduce(int(self.family.of_facet.sum())))
 
+    def rub(self, mu: Array) -> None:
+        """Keep all terms; see ``Coupling``."""
+        super().rub(mu)
+        self._rubs = self.chained = True
+
+    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """Those of the feet, and what leads from the control gaps to the nodal ones."""
+        row, followed, weight = super().weights(placement)
+        control: ControlGaps = placement.details.control
+        f, k = self.family, np.flatnonzero(control.shared)
+        t, a = np.nonzero(control.targets[k] >= 0)
+        return (
+            np.concatenate([row, f.child[k], f.child[k][t]]),
+            np.concatenate([followed, self.config.to_global(f.parent[k]), control.targets[k][t, a]]),
+            np.concatenate([weight, f.weight[k], -f.weight[k][t] * control.weights[k][t, a]]),
+        )
+
+    def shares(self, placement: Placement) -> Array:
+        """Bernstein's basis functions over those that belong to the scaled gaps."""
+        control: ControlGaps = placement.details.control
+        return control.scale
+
     def _measured(self, projection: Projection, moves: Bools | None, feet: Feet, state: PairState) -> Placement:
         plain = Placement(projection, projection.gap, moves, feet)
-        control = self.family.control_gaps(projection, ~self.off(plain, state) & ~state.in_corner, state.active)
+        active = state.active & (not self._rubs)
+        control = self.family.control_gaps(projection, ~self.off(plain, state) & ~state.in_corner, active)
         details = ControlFeet(feet.nearest, feet.corners, feet.left, control)
         return replace(plain, gap=control.of(projection.gap), details=details)
 
@@ -208,7 +235,7 @@ class Bernstein(NodeToSurface):
 
     def with_active(self, placement: Placement, state: PairState) -> Placement:
         """The gap of a parent that has closed no longer counts (collective)."""
-        control = placement.details.control.with_active(state.active)
+        control = placement.details.control.with_active(state.active & (not self._rubs))
         details = replace(placement.details, control=control)
         return replace(placement, gap=control.of(placement.projection.gap), details=details)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.coupling import Coupling
@@ -29,7 +30,7 @@ from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, ask_together
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
@@ -52,6 +53,8 @@ class Contact:
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
             than this lies behind the body, not in it. None takes the body to have no back.
+        friction: Coulomb's coefficient, a number, or a function of place that is given points ``(3, n)`` of the reference
+            configuration and returns ``(n,)``. With 0 the contact is the one without friction.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -72,6 +75,7 @@ class Contact:
         max_penetration: float | None = None,
         thickness: float | None = None,
         chords: bool = False,
+        friction: float | Callable[[Array], npt.ArrayLike] = 0.0,
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
@@ -86,6 +90,8 @@ class Contact:
             if thickness is not None:
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
+            if not callable(friction):
+                friction = given.number("friction", friction, given.NOT_NEGATIVE)
             if coupling == "mortar" and (chords or normals != "facet"):
                 what = "chords = True" if chords else f"normals = '{normals}'"
                 raise InputError(
@@ -95,6 +101,7 @@ class Contact:
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.coupling = coupling
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
+        self.friction = friction
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
@@ -123,6 +130,7 @@ class Contact:
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__, coupling=self.coupling,
+            friction=self.friction,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
@@ -147,17 +155,34 @@ class Contact:
         else:
             kind = Bernstein if config.degree == 2 else NodeToSurface
             coupling = kind(config, nodes, target, chords=self.chords and config.degree == 2, **how)
-        self._pair = ContactPair(
-            config,
-            nodes,
-            coupling,
-            name=self.name,
-            sliding=self.sliding,
-            max_penetration=MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration,
-            thickness=thickness,
-        )
+        bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
+        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
+        mu = self._coefficients(nodes)
+        if mu is None:
+            self._pair = ContactPair(config, nodes, coupling, **of)
+        else:
+            from uem_dolfinx.contact.friction_pair import FrictionalPair
+
+            if not isinstance(coupling, Bernstein) and type(coupling) is not NodeToSurface:
+                raise InputError(
+                    f"contact '{self.name}': friction does not go with coupling = 'mortar' yet: take node_to_surface"
+                )
+            self._pair = FrictionalPair(config, nodes, coupling, mu=mu, free=free[nodes], **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def _coefficients(self, nodes: Indices) -> Array | None:
+        """Coefficients of friction at contactors ``(n,)``; None if there is no friction anywhere (collective)."""
+        if not callable(self.friction):
+            return np.full(len(nodes), self.friction) if self.friction > 0 else None
+        places = np.zeros((3, len(nodes)))
+        places[: self.config.gdim] = self.config.X[nodes].T
+        words = f"contact '{self.name}': friction"
+        mu = np.array(ask_together(self.config.comm, words, self.friction, places), dtype=float)
+        with agreed(self.config.comm):
+            if mu.shape != (len(nodes),) or not given.NOT_NEGATIVE.holds(mu).all():
+                raise InputError(f"{words}(x) has shape {mu.shape}: expected {len(nodes)} numbers, 0 or positive and finite")
+        return mu if self.config.comm.allreduce(int((mu > 0).any())) else None
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
@@ -229,6 +254,42 @@ class Contact:
         return self._field("active", self.pair.trial.active)
 
     @property
+    def status(self) -> fem.Function:
+        """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective).
+
+        With friction a contactor that a corner of the target holds in the plane sticks.
+        """
+        state = self.pair.trial
+        sticks = (
+            np.zeros(len(state.active), bool)
+            if state.friction is None
+            else state.friction.stick | (state.in_corner & (self.config.gdim == 2))
+        )
+        return self._field("status", np.where(state.active, np.where(sticks, 1.0, 2.0), 0.0))
+
+    @property
+    def traction(self) -> fem.Function:
+        """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
+        pair, areas = self.pair, self.pair.coupling.areas(self.pair.placement, self._areas)[:, None]
+        tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
+        return self._vectors("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0))
+
+    @property
+    def slip(self) -> fem.Function:
+        """How far contactors have slipped over the target, summed over all committed steps, as a vector field on the contactor.
+
+        It is zero without friction (collective).
+        """
+        state = self.pair.trial
+        return self._vectors("slip", 0.0 if state.friction is None else state.friction.slipped)
+
+    @property
+    def dissipation(self) -> float:
+        """Energy that friction has taken from the bodies in all committed steps; of forces in the mean of a step (collective)."""
+        friction = self.pair.committed.friction
+        return float(self.config.comm.allreduce(0.0 if friction is None else float(friction.work.sum())))
+
+    @property
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
         if "force" not in self._fields:
@@ -236,7 +297,7 @@ class Contact:
         f, g, pair = self._fields["force"], self.config.gdim, self.pair
         f.x.array[:] = 0.0
         total = compat.petsc_vector(f)
-        nodes, forces = pair.coupling.nodal_forces(pair.placement, pair.trial)
+        nodes, forces = pair.nodal_forces(pair.trial)
         rows = (nodes[:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
         total.setValues(rows, forces.ravel(), addv=PETSc.InsertMode.ADD)
         total.assemble()
@@ -284,6 +345,15 @@ class Contact:
         f = self._fields[what]
         f.x.array[:] = 0.0
         f.x.array[self.pair.nodes] = values
+        f.x.scatter_forward()
+        return f
+
+    def _vectors(self, what: str, values: npt.ArrayLike) -> fem.Function:
+        if what not in self._fields:
+            self._fields[what] = fem.Function(self.config.V, name=_identifier(f"contact_{what}_{self.name}"))
+        f = self._fields[what]
+        f.x.array[:] = 0.0
+        f.x.array.reshape(-1, self.config.gdim)[self.pair.nodes] = values
         f.x.scatter_forward()
         return f
 

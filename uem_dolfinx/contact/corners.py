@@ -36,6 +36,7 @@ class Corners:
         loose: whether that is a vertex of two facets in space, whose planes meet in a line through it ``(k,)``.
         rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
         normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
+        away: unit directions along the facets away from the shared place, zero beyond ``count`` ``(k, gdim, gdim)``.
         axes: orthonormal; the first ``count`` span the normals, the very first is their mean ``(k, gdim, gdim)``.
         nodes: global nodes of the first facet ``(k, nn)``.
         weights: shape functions at the closest point of the shared place ``(k, nn)``.
@@ -51,6 +52,7 @@ class Corners:
     loose: Bools
     rising: Array
     normals: Array
+    away: Array
     axes: Array
     nodes: Ints
     weights: Array
@@ -73,18 +75,22 @@ class Corners:
         """Distances of ``points (k, gdim)`` from the shared place along the axes ``(k, gdim)``."""
         return np.einsum("krg,kg->kr", self.axes, points - self.foot)
 
-    def pulls(self, force: Array) -> Array:
+    def pulls(self, force: Array, mu: Array | float = 0.0) -> Array:
         """What each facet contributes to the contact forces, along its own outward normal.
+
+        With friction it is along the force on one that leaves the corner over this facet: tilted against that way.
 
         Args:
             force: on the contactors ``(k, gdim)``.
+            mu: coefficients of friction, of all or of each ``(k,)``.
 
         Returns:
             Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or, where they span less than the
             space, to the part of it in their span; of those possible the least in norm. A facet whose coefficient is negative pulls.
             They are infinite beyond ``count``, where there is no facet.
         """
-        shares = np.einsum("kgr,kg->kr", np.linalg.pinv(self.normals.transpose(0, 2, 1)).transpose(0, 2, 1), force)
+        along = self.normals - np.reshape(mu, (-1, 1, 1)) * self.away
+        shares = np.einsum("kgr,kg->kr", np.linalg.pinv(along.transpose(0, 2, 1)).transpose(0, 2, 1), force)
         shares[np.arange(shares.shape[1])[None, :] >= self.count[:, None]] = np.inf
         return shares
 
@@ -120,22 +126,24 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
     normals = np.zeros((k, gdim, gdim))
     normals[:, 0] = target.outward(first)
     common = np.ones(first.nodes.shape, dtype=bool)
-    middle = first.x.mean(axis=1)
+    middles = np.zeros((k, gdim, gdim))
+    middles[:, 0] = first.x.mean(axis=1)
     for j in range(1, gdim):
         i = np.flatnonzero(facets[:, j] >= 0)
         other = target.project_on(points[i], facets[i, j])
         normals[i, j] = target.outward(other)
         common[i] &= (first.nodes[i][:, :, None] == other.nodes[:, None, :]).any(axis=2)
-        middle[i] = other.x.mean(axis=1)
+        middles[i, j] = other.x.mean(axis=1)
     count = (facets >= 0).sum(axis=1)
     place = _shared_place(target, first.x, points, common, count, normals)
-    arm = middle - place.foot
+    arms = middles - place.foot[:, None]
+    arm = arms[np.arange(k), count - 1]
     arm /= np.linalg.norm(arm, axis=1, keepdims=True)
     earlier = np.arange(gdim)[None, :] < count[:, None] - 1
     rising = np.where(earlier, np.einsum("kg,kjg->kj", arm, normals), np.inf).min(axis=1)
     return Corners(
-        which, count, place.found, place.loose, rising, normals, _axes(normals, count), first.nodes, place.weights, place.foot, first.x,
-        place.dN, place.ddN,
+        which, count, place.found, place.loose, rising, normals, _away(arms, normals, count), _axes(normals, count), first.nodes,
+        place.weights, place.foot, first.x, place.dN, place.ddN,
     )  # fmt: skip
 
 
@@ -199,6 +207,23 @@ def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Ar
     m = np.einsum("kfg,keg->kfe", t, t)
     rate = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, along)[..., None])[..., 0]
     return tab.N, np.einsum("kaf,kf->ka", tab.dN, rate)
+
+
+def _away(arms: Array, normals: Array, count: Ints) -> Array:
+    """Unit directions along facets with these normals away from the place they share, across an edge ``(k, gdim, gdim)``.
+
+    ``arms (k, gdim, gdim)`` lead from that place to the facets' middles.
+    """
+    gdim = arms.shape[2]
+    along = arms - np.einsum("krg,krg->kr", arms, normals)[:, :, None] * normals
+    if gdim == 3:
+        edge = np.cross(normals[:, 0], normals[:, 1])
+        size = np.linalg.norm(edge, axis=1, keepdims=True)
+        edge = np.where((count == 2)[:, None], edge / np.where(size > 0, size, 1.0), 0.0)
+        along -= np.einsum("krg,kg->kr", along, edge)[:, :, None] * edge[:, None]
+    size = np.linalg.norm(along, axis=2, keepdims=True)
+    here = np.arange(gdim)[None, :, None] < count[:, None, None]
+    return np.where(here, along / np.where(size > 0, size, 1.0), 0.0)
 
 
 def _axes(normals: Array, count: Ints) -> Array:

@@ -29,16 +29,37 @@ class LabelledEquations:
         test: rows of Q: how contact forces are handed on, ``Q'r = 0``; the same object unless the two differ. Equations of both are
             in the same order and eliminate the same nodes.
         contactor: place of each equation's contactor among the pair's ``(m,)``.
-        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
+        kind: ``NORMAL``, the number of a corner's further axis, or minus the number of a tangent along which friction holds ``(m,)``.
+        untilted: test rows as they are without the friction of contactors that slip; None where ``test`` is not tilted.
+        holding: trial rows, of which those that friction resists are active as well; None where there is no friction.
+        turning: trial rows, and those across the directions of slip, in which friction resists as well; None where there is no friction.
     """
 
     trial: UnitingEquations
     test: UnitingEquations
     contactor: Ints
     kind: Ints
+    untilted: UnitingEquations | None = None
+    holding: UnitingEquations | None = None
+    turning: UnitingEquations | None = None
 
     def __len__(self) -> int:
         return len(self.contactor)
+
+    @property
+    def upright(self) -> UnitingEquations:
+        """Test rows without the friction of contactors that slip."""
+        return self.test if self.untilted is None else self.untilted
+
+    @property
+    def resisting(self) -> UnitingEquations:
+        """Rows of all relative motions that the contact resists."""
+        return self.trial if self.holding is None else self.holding
+
+    @property
+    def stopping(self) -> UnitingEquations:
+        """Rows of the relative motions that the contact does not let go on without end."""
+        return self.trial if self.turning is None else self.turning
 
 
 @dataclass(frozen=True)
@@ -80,6 +101,13 @@ class Coupling(Protocol):
     def with_nodal_gaps(self) -> Coupling:
         """The same contactors and target with nodal gaps, for methods that push nodes."""
 
+    @property
+    def nodal(self) -> bool:
+        """Whether each contactor follows the point of the target below it, rather than in a mean."""
+
+    def rub(self, mu: Array) -> None:
+        """Take the contactors' coefficients of friction ``(n,)``."""
+
     def place(self, points: Array, state: PairState) -> Placement:
         """Project contactors at ``points (n, gdim)`` (collective)."""
 
@@ -94,6 +122,12 @@ class Coupling(Protocol):
 
     def foreseen(self, placement: Placement, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+
+    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """By what contactors follow other nodes: places of contactors, global nodes and weights, ``(k,)`` each (collective)."""
+
+    def shares(self, placement: Placement) -> Array:
+        """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)``."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

@@ -6,7 +6,8 @@ contactor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
 
 from mpi4py import MPI
 
@@ -20,6 +21,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.valleys import create_valleys
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
 
 #: A contactor past an open end by more than this part of its facet has slid off.
 #: [heuristic; length of the facet; -]
@@ -61,6 +63,7 @@ class NodeToSurface:
     """
 
     chained, two_pass = False, True
+    nodal = True
 
     def __init__(
         self,
@@ -95,6 +98,11 @@ class NodeToSurface:
             chords=self.chords,
         )
 
+    def rub(self, mu: Array) -> None:
+        """Take the contactors' coefficients of friction ``(n,)``, with which they leave corners."""
+        if self._valleys is not None:
+            self._valleys.mu = mu
+
     @property
     def followed(self) -> Indices:
         """Local nodes of the target."""
@@ -106,7 +114,7 @@ class NodeToSurface:
         """Project contactors (collective); see ``Coupling``."""
         corners = None
         if self.sliding == "finite":
-            nearest = projection = self._continued_at_end(self._nearest(points), state)
+            nearest = projection = self._stuck(self._continued_at_end(self._nearest(points), state), points, state)
             if self._valleys is not None:
                 projection, corners = self._valleys.place(nearest, points, state)
         else:
@@ -155,6 +163,16 @@ class NodeToSurface:
         i = np.flatnonzero(state.active & _held_at_end(state) & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i) if len(i) else nearest
 
+    def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
+        """Put the feet of contactors that friction holds where they stick, so that no bend leads them astray (collective)."""
+        f = state.friction
+        if f is None or not self.target.n_nodes:
+            return nearest
+        i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
+        own: Any = cast("MeshTarget", self.target).at(points[i], f.facet[i], f.xi[i])
+        held: Any = nearest
+        return held.with_rows(i, {x.name: getattr(own, x.name) for x in fields(own)} | {"beyond": 0.0})
+
     def _target_moves(self, p: Projection) -> Bools | None:
         """Which targets can move along the normal (collective)."""
         if not p.nodes.shape[1]:
@@ -174,6 +192,16 @@ class NodeToSurface:
             followed = self.config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, self.config.gdim)
             move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
         return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
+
+    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """The shape functions at the feet; see ``Coupling``."""
+        p = placement.projection
+        row, a = np.nonzero(p.nodes >= 0)
+        return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
+
+    def shares(self, placement: Placement) -> Array:
+        """The whole multiplier."""
+        return np.ones(len(self.nodes))
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an open end of the target in a direction in which they can move.

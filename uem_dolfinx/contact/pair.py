@@ -55,6 +55,8 @@ class ContactPair:
     """
 
     placement: Placement
+    #: Whether there is friction.
+    rough = False
 
     def __init__(
         self,
@@ -133,13 +135,17 @@ class ContactPair:
         Args:
             stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
         """
-        correction = self.coupling.return_vectors(self.placement, self.points, self.trial)
+        correction = self._return_vectors()
         disturbance = np.abs(stiffness[self.nodes] * correction).max(axis=1)
         largest = self.config.comm.allreduce(float(self.trial.lam.max(initial=0.0)), op=MPI.MAX)
         correction[disturbance > GENTLE * largest] = 0.0
         self.config.displacement[self.nodes] += correction
         gap = self.projection.gap + np.einsum("ng,ng->n", correction, self.projection.normal)
         self.placement = self.coupling.returned(self.placement, self.points, self.trial, gap)
+
+    def _return_vectors(self) -> Array:
+        """Displacements that put the active contactors back onto the target ``(n, gdim)`` (collective)."""
+        return self.coupling.return_vectors(self.placement, self.points, self.trial)
 
     @property
     def n_active(self) -> int:
@@ -197,17 +203,27 @@ class ContactPair:
         return self.coupling.foreseen(self.placement, du)
 
     def wrong(
-        self, gap: Array, lam: Array, stiffness: Array, force_rounding: Array, gap_rounding: float, swept: bool
+        self,
+        gap: Array,
+        lam: Array,
+        force: Array,
+        stiffness: Array,
+        force_rounding: Array,
+        gap_rounding: float,
+        swept: bool,
+        du: Array | None = None,
     ) -> active_set.Wrong:
-        """Contactors that break the conditions of contact with such gaps and forces.
+        """Contactors that break the conditions of contact with such gaps and forces (collective).
 
         Args:
             gap: that decides on contact ``(n,)``.
             lam: force along the normal that decides on contact ``(n,)``.
+            force: on the contactors ``(n, gdim)``.
             stiffness: of the contactors along the normal ``(n,)``.
             force_rounding: forces below it are zero ``(n,)``.
             gap_rounding: gaps below it are zero, and below rounding of positions.
             swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
+            du: increment of the owned nodes with which they are foreseen ``(n_owned, gdim)``; None where the bodies are now.
         """
         off = self.off
         if swept and self.thickness < np.inf:
@@ -274,9 +290,16 @@ class ContactPair:
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
         self.redundant[equations.contactor[normal]] = redundant[normal]
 
-    def forces(self, equations: LabelledEquations, multipliers: Array) -> tuple[Array, Array, Array]:
-        """Contact forces from the multipliers of the pair's equations ``(m,)``; see ``Coupling.forces`` (collective)."""
+    def forces(self, equations: LabelledEquations, multipliers: Array, du: Array | None = None) -> tuple[Array, Array, Array]:
+        """Contact forces from the multipliers of the pair's equations ``(m,)``; see ``Coupling.forces`` (collective).
+
+        ``du (n_owned, gdim)`` is the increment that they are foreseen with; None where the bodies are now.
+        """
         return self.coupling.forces(self.placement, self.trial, equations, multipliers)
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """The contact forces of a state at nodes of both bodies; see ``Coupling.nodal_forces``."""
+        return self.coupling.nodal_forces(self.placement, state)
 
     def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
         """Give the trial state contact forces, and an active set if another method than elimination decides on it.
@@ -294,6 +317,13 @@ class ContactPair:
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
         return self.coupling.curvature(self.placement, self.trial)
+
+    def turn(self, stiffness: Array) -> None:
+        """Take the directions of friction from where the contactors are; ``stiffness (n, gdim)`` is the diagonal of K at them."""
+
+    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+        """What sliding friction adds to tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
+        return None
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 

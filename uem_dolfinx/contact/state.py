@@ -14,7 +14,51 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 Renumber = Callable[[Ints], Ints]
 
 #: Attributes that number facets.
-FACETS = ("facet", "held")
+FACETS = ("facet", "held", "friction_facet")
+#: Before the names of what friction remembers, in checkpoints.
+RUBBING = "friction_"
+
+
+@dataclass(frozen=True)
+class FrictionState:
+    """What friction remembers of ``n`` contactors; those that are active and do not stick slip.
+
+    The anchor is the point of the target that a contactor sticks to. It is where a contactor that is open or slips stood at the end of
+    the last step, and stays where it is as long as the contactor sticks.
+
+    Attributes:
+        stick: held at the anchor ``(n,)``.
+        direction: in which a contactor slips over the target, of length one; zero for all others ``(n, gdim)``.
+        tau: force of friction that belongs to ``lam`` ``(n, gdim)``.
+        facet: facet that the anchor is on ``(n,)``; -1 on a rigid target.
+        xi: the anchor's reference coordinates on it ``(n, gdim - 1)``.
+        anchor: what is to be added to that place; on a rigid target the anchor where the target was drawn ``(n, gdim)``.
+        slipped: relative motion along the target while slipping, summed over all steps ``(n, gdim)``.
+        work: that friction has taken from the bodies ``(n,)``.
+    """
+
+    stick: Bools
+    direction: Array
+    tau: Array
+    facet: Ints
+    xi: Array
+    anchor: Array
+    slipped: Array
+    work: Array
+
+    @classmethod
+    def initial(cls, n: int, gdim: int) -> FrictionState:
+        """The state of ``n`` contactors that nothing is known about."""
+        return cls(
+            stick=np.zeros(n, bool),
+            direction=np.zeros((n, gdim)),
+            tau=np.zeros((n, gdim)),
+            facet=np.full(n, -1, np.int64),
+            xi=np.zeros((n, gdim - 1)),
+            anchor=np.zeros((n, gdim)),
+            slipped=np.zeros((n, gdim)),
+            work=np.zeros(n),
+        )
 
 
 @dataclass(frozen=True)
@@ -32,6 +76,7 @@ class PairState:
         slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
         passed: has been past the target's end since it was last in front of it ``(n,)``.
         at_end: came to the target, or was drawn, at its end, which has held it since ``(n,)``.
+        friction: what friction remembers; None without friction.
     """
 
     active: Bools
@@ -44,6 +89,7 @@ class PairState:
     slips: Ints
     passed: Bools
     at_end: Bools
+    friction: FrictionState | None = None
 
     @property
     def in_corner(self) -> Bools:
@@ -72,7 +118,10 @@ class PairState:
         Args:
             keys_of: what tells facets in any partition, from their present numbers ``(k,)``.
         """
-        return {f.name: _renumbered(f.name, getattr(self, f.name), keys_of) for f in fields(self)}
+        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
+        if self.friction is not None:
+            kept |= {RUBBING + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
+        return {name: _renumbered(name, array, keys_of) for name, array in kept.items()}
 
     @classmethod
     def from_checkpoint(cls, kept: Mapping[str, npt.NDArray[Any]], facets_of: Renumber) -> PairState:
@@ -82,7 +131,11 @@ class PairState:
             kept: by name.
             facets_of: present numbers of facets, from what tells them in any partition ``(k,)``.
         """
-        return cls(**{f.name: _renumbered(f.name, np.array(kept[f.name]), facets_of) for f in fields(cls)})
+        arrays = {name: _renumbered(name, np.array(array), facets_of) for name, array in kept.items()}
+        rubbing = {name: array for name, array in arrays.items() if name.startswith(RUBBING)}
+        friction = FrictionState(**{name.removeprefix(RUBBING): array for name, array in rubbing.items()}) if rubbing else None
+        own = [f.name for f in fields(cls) if f.name != "friction"]
+        return cls(**{name: arrays[name] for name in own}, friction=friction)
 
 
 def _renumbered(name: str, array: npt.NDArray[Any], renumber: Renumber) -> npt.NDArray[Any]:

@@ -44,6 +44,8 @@ class Valleys:
 
     def __init__(self, config: Configuration, target: MeshTarget, free: Bools):
         self.config, self.target, self.free = config, target, free
+        #: Coefficients of friction of the contactors ``(n,)``.
+        self.mu: Array = np.zeros(len(free))
 
     def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
         """Put contactors that a corner holds into it, and give those that change facets too often averaged normals (collective).
@@ -105,7 +107,7 @@ class Valleys:
         if corners is None or not len(corners.which):
             return state, left
         i = corners.which
-        pulls = corners.pulls(state.force[i])
+        pulls = corners.pulls(state.force[i], self.mu[i])
         leaving = (pulls < 0).any(axis=1) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)

@@ -53,6 +53,9 @@ class Projection(Protocol):
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
 
+    def turnings(self, which: Ints, s: Array) -> Array:
+        """Derivative of the rows along tangents ``s (k, gdim)``, which turn with the normal ``(k, (1 + nn) g, (1 + nn) g)``."""
+
     def with_gap(self, gap: Array) -> Projection:
         """The same projection of points that have moved along the normal."""
 
@@ -158,8 +161,23 @@ class FacetProjection:
         slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
         on a straight 2D facet this is the formula of the method's description.
         """
-        fields = (getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "bend"))
-        return gap_hessians(*fields)
+        return gap_hessians(*self._at(which))
+
+    def turnings(self, which: Ints, s: Array) -> Array:
+        """Derivative of the rows ``(s, -N_a s)`` along tangents ``s (k, gdim)``, which turn with the normal as the foot moves.
+
+        The normal changes by ``- t^a (N_a + b D)``, the tangent by as much along the normal, and the shape functions with ``D_a``.
+        """
+        n, _, w, dN, _, _, _ = self._at(which)
+        t, m, _, _, D, L = _foot_derivatives(*self._at(which))
+        along = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, s)[..., None])[..., 0]
+        ds = np.einsum("kg,kf,kfi->kgi", n, along, L)
+        on_target = np.einsum("ka,kgi->kagi", w, ds) + np.einsum("kaf,kg,kfi->kagi", dN, s, D)
+        k, size = len(n), ds.shape[2]
+        return np.concatenate([ds[:, None], -on_target], axis=1).reshape(k, size, size)
+
+    def _at(self, which: Ints) -> list[Array]:
+        return [getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "bend")]
 
 
 def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array) -> Array:
@@ -167,6 +185,16 @@ def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, 
 
     A side of a facet is served too: ``dN`` then has one column, and ``n`` is any direction across the side.
     """
+    _, m, b, N, D, L = _foot_derivatives(n, g, w, dN, ddN, x, bend)
+    H = -np.einsum("kfi,kfj->kij", D, N)
+    H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
+    return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+
+
+def _foot_derivatives(
+    n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Tangents, their products m, bend b, and the rows N, D and ``N + b D``, each ``(k, fdim, ...)``; see ``hessians``."""
     k, nn, fdim = dN.shape
     gdim = n.shape[1]
     size = (1 + nn) * gdim
@@ -182,7 +210,4 @@ def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, 
     T[:, :, 1:] -= np.einsum("ka,kfg->kfag", w, t)
     N, T = N.reshape(k, fdim, size), T.reshape(k, fdim, size)
     D = np.linalg.solve(m - g[:, None, None] * b, T)
-    H = -np.einsum("kfi,kfj->kij", D, N)
-    H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
-    L = N + np.einsum("kfe,kei->kfi", b, D)
-    return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+    return t, m, b, N, D, N + np.einsum("kfe,kei->kfi", b, D)

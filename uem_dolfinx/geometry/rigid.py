@@ -93,6 +93,10 @@ class RigidProjection:
         """Second derivative of the gap ``(k, gdim, gdim)``."""
         return self.bend[which]
 
+    def turnings(self, which: Ints, s: Array) -> Array:
+        """Derivative of tangents ``s (k, gdim)``, which turn with the normal ``(k, gdim, gdim)``."""
+        return -np.einsum("kg,kh,khi->kgi", self.normal[which], s, self.bend[which])
+
 
 class RigidSurface:
     """Rigid target of any shape, still or moved as a rigid body.

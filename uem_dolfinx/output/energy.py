@@ -30,7 +30,8 @@ class Energies:
         dissipated: by plastic flow.
         damped: by the damping form.
         external: work of the external forces, of gravity and of what drives the Dirichlet conditions.
-        contact: work of the contact forces; zero but for rounding, moving rigid targets and the step in which bodies meet.
+        contact: work of the contact forces; zero but for friction, rounding, moving rigid targets and the step in which bodies meet.
+        friction: what friction has taken of that work, so that with still targets it and ``contact`` add up to zero but for rounding.
         defect: what the sum of energies has gained beyond the work of the external and contact forces.
     """
 
@@ -41,6 +42,7 @@ class Energies:
     damped: float
     external: float
     contact: float
+    friction: float
     defect: float
 
 
@@ -95,6 +97,8 @@ class EnergyBook(Closing):
         self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at)
         begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
+        # contacts that were read from a checkpoint know what friction had taken before
+        self._before = begin.get("friction", 0.0) - sum(c.dissipation for c in problem.contacts)
         impulse = [begin.get(f"impulse_{a}{s}", 0.0) for s in suffixes for a in axes]
         self._impulse = np.reshape(impulse, (len(suffixes), len(axes)))
         if begin and begin["time"] != self.dynamics.time:
@@ -154,7 +158,8 @@ class EnergyBook(Closing):
     def _append(self, energies: tuple[float, float, float]) -> Energies:
         damped, external, contact = (float(w) for w in self._works)
         defect = sum(energies) + damped - external - contact - self._first
-        row = Energies(self._time, *energies, damped, external, contact, defect)
+        friction = self._before + sum(c.dissipation for c in self.problem.contacts)
+        row = Energies(self._time, *energies, damped, external, contact, friction, defect)
         self.rows.append(row)
         self.momenta.append(self.dynamics.momentum())
         self.impulses.append(self._impulse.copy())
@@ -169,11 +174,11 @@ class EnergyBook(Closing):
         t = [row.time for row in self.rows]
         kept = ("kinetic", "stored", "dissipated", "damped")
         total = [sum(getattr(row, name) for name in kept) - row.external for row in self.rows]
-        for name in (*kept, "external", "contact"):
+        for name in (*kept, "external", "contact", "friction"):
             values = [getattr(row, name) for row in self.rows]
             # what is never worth a line stays out
             if max(map(abs, values)) > 1e-6 * max(map(abs, total)):
-                panel.plot(t, values, label=name, ls="--" if name in ("external", "contact") else "-")
+                panel.plot(t, values, label=name, ls="--" if name in ("external", "contact", "friction") else "-")
         panel.plot(t, total, "k", lw=1.2, label="sum less external work")
         panel.set_xlabel("time")
         panel.set_ylabel("energy")

@@ -31,6 +31,9 @@ BARELY_LOADED = 1e-3
 #: See ``BARELY_LOADED``.
 #: [heuristic; the model's size; -]
 SHORT_WAY = 0.01
+#: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
+#: [convention; the model's size; test_friction.py::test_what_slides_away]
+FAR = 1e3
 #: A body that falls touches ground after so many stations at most.
 #: [bound; stations; -]
 MOST_STATIONS = 200
@@ -59,6 +62,8 @@ class FloatingBodies:
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
+        #: Likewise with those that friction alone resists, where all contactors slip.
+        self._sliding: Array = np.zeros((0, 0))
         #: Whether contact has yet to develop in this step.
         self._developing = False
 
@@ -87,12 +92,33 @@ class FloatingBodies:
                 "not tell its place", self.motions.share,
             )  # fmt: skip
 
-    def hold(self, free: Bools, equations: UnitingEquations) -> Bools:
-        """Free components ``(n_owned, gdim)`` without those that hold neutral motions (collective)."""
+    def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
+        """Free components ``(n_owned, gdim)`` without those that hold neutral motions (collective).
+
+        Args:
+            free: components without Dirichlet condition ``(n_owned, gdim)``.
+            equations: rows of the relative motions that contacts do not let go on without end.
+            resisting: rows of all relative motions that contacts resist, the same object without friction.
+        """
         if self.motions is None:
             return free
-        self._open = self.motions.open_motions(equations, HARDLY_HELD if self._developing else OPEN)
-        return free & ~self.motions.supports(self._open, equations)
+        resistance = HARDLY_HELD if self._developing else OPEN
+        self._open = self._sliding = self.motions.open_motions(resisting, resistance)
+        if resisting is not equations:
+            self._sliding = self.motions.open_motions(equations, resistance)
+        return free & ~self.motions.supports(self._sliding, equations)
+
+    def slide(self, driving: Array, forces: Array) -> Array | None:
+        """Increment, far beyond all others, of bodies that slide under what the supports carry; None if none does (collective).
+
+        Args:
+            driving: forces that are not in equilibrium, at the owned nodes ``(n_owned, gdim)``.
+            forces: all forces of the bodies, beside which they may be rounding ``(n_owned, gdim)``.
+        """
+        if self.motions is None or self._sliding.shape[1] == self._open.shape[1]:
+            return None
+        motion = self.motions.load(self._sliding, driving, forces)
+        return FAR * self._forces.config.size * self.motions.field(motion / size) if (size := np.linalg.norm(motion)) else None
 
     @property
     def adrift(self) -> bool:
@@ -130,11 +156,11 @@ class FloatingBodies:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
         if self.motions is None:
             return du
-        return du - self.motions.part(self._open, du.reshape(-1, self._forces.config.gdim)).ravel()
+        return du - self.motions.part(self._sliding, du.reshape(-1, self._forces.config.gdim)).ravel()
 
     def _equations(self) -> UnitingEquations:
         """Uniting equations of all pairs, the derivatives of their gaps."""
-        return UnitingEquations.join([pair.equations().trial for pair in self._pairs], self._forces.config.gdim)
+        return UnitingEquations.join([pair.equations().resisting for pair in self._pairs], self._forces.config.gdim)
 
     def _fall(self, place: Callable[[], None], freely: bool, small_loads: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).

@@ -12,7 +12,7 @@ from typing import Protocol
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
+from uem_dolfinx.errors import ConvergenceError, FrictionError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 
 #: A residual that keeps this part of its norm twice has met its rounding.
@@ -243,7 +243,8 @@ def solve_united(
         history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
         _report(history, verbose)
         if step.du is None:
-            raise ConvergenceError(
+            error = FrictionError if getattr(system, "rough", False) else ConvergenceError
+            raise error(
                 f"the active set does not settle in {MOST_EXCHANGES} exchanges: take smaller load steps, or a target of finer facets",
                 history,
             )

@@ -115,23 +115,32 @@ class RigidMotions:
         values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
         return vectors[:, values < resistance**2]
 
-    def load(self, motions: Array, residual: Array) -> Array:
+    def load(self, motions: Array, residual: Array, among: Array | None = None) -> Array:
         """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
 
         Args:
             motions: ``(n_motions, k)``.
             residual: ``F`` at the owned nodes ``(n_owned, gdim)``.
+            among: forces beside which they count ``(n_owned, gdim)``; None takes the residual itself.
         """
         own = self._body[: self.config.n_owned]
         work = -np.einsum("nmg,ng->nm", self._modes(self._places, own), residual)
         force = np.zeros((self.count, self.n_modes))
         np.add.at(force, own, work)
-        total, scale = (sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual).sum()))))
+        total, scale = (
+            sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual if among is None else among).sum())))
+        )
         along = motions.T @ total
         self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
         force = motions @ np.where(np.abs(along) > LOADED * scale, along, 0.0)
         # bodies that are held stay where they are, to the last bit
         return np.where(np.abs(force) > OPEN**2 * np.abs(force).max(initial=0.0), force, 0.0)
+
+    def field(self, motion: Array) -> Array:
+        """The velocities of the owned nodes in a motion ``(n_owned, gdim)``."""
+        own = self._body[: self.config.n_owned]
+        parts = motion.reshape(self.count, self.n_modes)
+        return np.asarray(np.einsum("nmg,nm->ng", self._modes(self._places, own), parts[own]))
 
     def part(self, motions: Array, du: Array) -> Array:
         """What an increment ``(n_owned, gdim)`` holds of some motions ``(n_motions, k)``, of the same shape (collective).

@@ -8,6 +8,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from mpi4py import MPI
 
@@ -15,22 +16,19 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.dependent import IndependentEquations
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
-from uem_dolfinx.contact.coupling import LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
-from uem_dolfinx.errors import ConflictError
-from uem_dolfinx.geometry.surfaces import followed_nodes
+from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
-from uem_dolfinx.solve.tangent import contact_curvature
+from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
+from uem_dolfinx.solve.tangent import contact_curvature, slip_terms, together
 
 #: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_foretells]
@@ -41,27 +39,12 @@ CLOSED = 1e-13
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Uniting equations of all pairs in one state, and what was made of them.
-
-    Attributes:
-        equations: of every pair.
-        trial: all that P is made of; None where Q is made of the same.
-        independent: how those that got in each other's way were resolved; None if none could.
-        test: Q.
-    """
-
-    equations: list[LabelledEquations]
-    trial: UnitingEquations | None
-    independent: IndependentEquations | None
-    test: Restriction
-
-
-@dataclass(frozen=True)
 class BodyState(IterationState):
-    """``IterationState`` with the rows that it was made of."""
+    """``IterationState`` with the rows that it was made of, and what the direction of slip adds to tangent and residual."""
 
-    rows: _Rows
+    rows: Rows
+    added: PETSc.Mat | None
+    held: PETSc.Vec | None
 
 
 class BodySystem:
@@ -92,42 +75,19 @@ class BodySystem:
         self._pivoting = Pivoting()
         #: Whether P differs from Q.
         self._apart = False
+        #: The state that was settled last, if its united matrix has a negative determinant.
+        self._doubtful: BodyState | None = None
         #: Whether the last exchange has let go of a body that loads drive.
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
         self._swept = False
-        self._find_meetings()
+        #: How equations of several contacts can meet.
+        self.meetings = Meetings(self.config, self.pairs)
         self.floating = FloatingBodies(forces, self.pairs)
         self.place(returning=False)
         for pair in self.pairs:
             check_initial(pair)
             pair.activate_touching()
-
-    def _find_meetings(self) -> None:
-        """Find out how equations of several contacts can meet (collective)."""
-        config, pairs = self.config, self.pairs
-        follows = [followed_nodes(config, pair.coupling.followed) for pair in pairs]
-        meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
-        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
-        shared = len(np.unique(contactors)) < len(contactors)
-        found = np.append(meets.ravel(), shared)
-        self.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
-        meets = found[:-1].reshape(meets.shape)
-        #: Whether a node is a contactor of several pairs.
-        self.shared = bool(found[-1])
-        #: Pairs whose surfaces are contactor and target of each other (two-pass).
-        self.mutual: Bools = (meets & meets.T).any(axis=1)
-        for pair, mutual in zip(pairs, self.mutual):
-            pair.mutual = bool(mutual)
-            if mutual and not pair.coupling.two_pass:
-                raise ConflictError(
-                    f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
-                    "one of the two contacts, or give both coupling='node_to_surface'"
-                )
-        #: Whether a node that is followed may itself be eliminated.
-        self.stacked = bool(meets.any()) or any(pair.coupling.chained for pair in pairs)
-        #: Whether equations can get in each other's way.
-        self.contestable = self.shared or bool(self.mutual.any()) or any(pair.coupling.prescribed for pair in pairs)
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -143,26 +103,37 @@ class BodySystem:
             if not returning or stiffness is None:
                 return
             for k, pair in enumerate(self.pairs):
-                if self.shared and k > 0:
+                if self.meetings.shared and k > 0:
                     # what another pair has returned is returned
                     pair.project()
                 # surfaces that follow each other would both make up for the same gap
-                if not self.mutual[k]:
+                if not self.meetings.mutual[k]:
                     pair.return_to_target(stiffness)
-            if self.shared:
+            if self.meetings.shared:
                 for pair in self.pairs:
                     pair.project()
             self.forces.u.x.scatter_forward()
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch."""
+        self._doubtful = None
         self.floating.begin_step(lambda: self.place(returning=False))
 
     def end_step(self) -> None:
-        """Refuse an equilibrium that contacts and conditions do not agree about (collective)."""
+        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
         self.floating.end_step()
+        if (state := self._doubtful) is None:
+            return
+        # between this equilibrium and that without friction the united matrix was singular
+        self._factored = None
+        added = together(self._curvature, state.added)
+        if not self.solver.negative_without(state.rows.upright, self.forces.tangent.K, added):
+            raise FrictionError(
+                "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP is negative; take less "
+                "friction, or stiffer bodies"
+            )
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
@@ -183,6 +154,7 @@ class BodySystem:
         if forces.stiffness is None and pairs:
             # what tells tension from rounding
             forces.update_tangent()
+        self._turn()
         F, rounding = forces.residual, self.rounding()
         with timed("uniting equations"):
             rows = self._rows()
@@ -198,7 +170,10 @@ class BodySystem:
                     pair.place_again()
             here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
             wrong = self._count(
-                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), least, 0.0, self._swept) for pair, least in here]
+                [
+                    pair.wrong(pair.gap, pair.trial.lam, pair.trial.force, self._along(pair), least, 0.0, self._swept)
+                    for pair, least in here
+                ]
             )
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
@@ -208,26 +183,23 @@ class BodySystem:
                 residual = rows.test.transpose(forces.residual)
         return self._state(rows, residual, rounding, moved or fallen, at_rest and wrong == 0)
 
-    def _rows(self) -> _Rows:
+    def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
-        equations = [pair.equations() for pair in self.pairs]
-        test = trial = UnitingEquations.join([e.test for e in equations], self.config.gdim)
-        if any(e.trial is not e.test for e in equations):
-            trial = UnitingEquations.join([e.trial for e in equations], self.config.gdim)
-        # the derivatives of the gaps tell which motions of a body nothing holds
-        free = self.floating.hold(self.forces.free[: self.config.n_owned], trial)
-        Q, independent = self._restrict(equations, test, free)
-        return _Rows(equations, None if trial is test else trial, independent, Q)
+        hold = partial(self.floating.hold, self.forces.free[: self.config.n_owned])
+        return make_rows(self.meetings, self.pairs, hold, self.forces.prescribed)
 
-    def _state(self, rows: _Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
+    def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
         # where equations get in each other's way, those of P might eliminate other components than those of Q
-        contested = self.shared or (rows.independent is not None and rows.independent.found)
+        contested = self.meetings.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
-        self._apart = apart is not None
+        self._apart = apart is not None or rows.test is not rows.upright
+        added, held = slip_terms(self.pairs, self.forces.vector())
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=rows.test if apart is None else self._restrict(rows.equations, apart, rows.test.free)[0],
+            trial=rows.upright
+            if apart is None
+            else self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)[0],
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -240,6 +212,8 @@ class BodySystem:
             right=right,
             closed=gap <= CLOSED * self.config.size and self.forces.dirichlet_met(),
             rows=rows,
+            added=added,
+            held=held,
         )
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
@@ -253,21 +227,32 @@ class BodySystem:
         config, rows = self.config, state.rows
         with timed("uniting equations"):
             F = self.forces.tangent.K * du
-            if self._curvature is not None:
-                F.axpy(1.0, self._curvature * du)
+            for more in (self._curvature, state.added):
+                if more is not None:
+                    F.axpy(1.0, more * du)
             F.axpy(1.0, self.forces.residual)
-            forces = self._read_forces(rows, rows.test.pass_on(F))
+            if state.held is not None:
+                F.axpy(1.0, state.held)
             increment = du.array_r.reshape(-1, config.gdim)
+            forces = self._read_forces(rows, rows.test.pass_on(F), increment)
             left = accuracy if self.solver.iterative else 0.0
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
             foreseen = [pair.foreseen(increment) for pair in self.pairs]
+            sliding = self._sliding(F, forces)
+            moved = increment if sliding is None else increment + sliding
             wrong = []
-            for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
+            for pair, gap, (lam, _, force) in zip(self.pairs, foreseen, forces):
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept))
+                wrong.append(pair.wrong(gap, lam, force, along, least, near, self._swept, moved))
             count = self._count(wrong)
+            if not count and sliding is not None:
+                raise FrictionError(
+                    "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
+                    "Dirichlet condition, give it inertia, or take less load"
+                )
             if not count or self._adrift:
+                self._doubtful = state if self.solver.negative else None
                 self._take(forces)
                 return None
             wrong = self._choose(wrong, foreseen, count)
@@ -278,6 +263,12 @@ class BodySystem:
             self._adrift = self.floating.adrift
             residual = rows.test.transpose(self.forces.residual)
         return self._state(rows, residual, state.rounding, state.changed, False)
+
+    def _sliding(self, F: PETSc.Vec, forces: list[tuple[Array, Array, Array]]) -> Array | None:
+        """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
+        if self.floating.motions is None or not self.rough:
+            return None
+        return self.floating.slide(*unbalanced(self.pairs, F, forces))
 
     def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
         """Which of the wrong contactors are exchanged now (collective)."""
@@ -304,23 +295,17 @@ class BodySystem:
         assert self.forces.stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
 
+    def _turn(self) -> None:
+        """Take the directions of friction from where the contactors are."""
+        for pair in self.pairs:
+            assert self.forces.stiffness is not None
+            pair.turn(self.forces.stiffness[pair.nodes])
+
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
         return self._rows().test
 
-    def _restrict(
-        self, labelled: list[LabelledEquations], equations: UnitingEquations, free: Bools
-    ) -> tuple[Restriction, IndependentEquations | None]:
-        """P or Q of equations, with components ``free (n_owned, gdim)``, and how those in each other's way were resolved (collective)."""
-        independent = None
-        if self.contestable:
-            mutual = np.repeat(self.mutual, [len(own) for own in labelled])
-            independent = IndependentEquations(self.config, equations, free, mutual)
-            equations = independent.equations
-        stacked = self.stacked or (independent is not None and independent.found)
-        return Restriction(self.config, equations, free, self.forces.prescribed, stacked), independent
-
-    def _read_forces(self, rows: _Rows, y: PETSc.Vec) -> list[tuple[Array, Array, Array]]:
+    def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[tuple[Array, Array, Array]]:
         """Contact forces of every pair, as ``Coupling.forces`` returns them, from forces that were passed on (collective)."""
         lam = rows.test.multipliers(y)
         redundant = np.zeros(len(lam), dtype=bool)
@@ -331,7 +316,7 @@ class BodySystem:
         for pair, own in zip(self.pairs, rows.equations):
             part = slice(start, start + len(own))
             pair.set_redundant(own, redundant[part])
-            found.append(pair.forces(own, lam[part]))
+            found.append(pair.forces(own, lam[part], du))
             start += len(own)
         return found
 
@@ -352,9 +337,10 @@ class BodySystem:
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` at the present displacement, with the active set of ``state``.
 
-        Q belongs to the present normals: the old Q would take the turned contact forces for a residual.
+        Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
         """
         self.place(returning=False)
+        self._turn()
         return self.restriction().transpose(self.forces.residual)
 
     def accelerate(self) -> None:
@@ -379,7 +365,9 @@ class BodySystem:
 
     def linearise(self, state: IterationState) -> PETSc.Vec:
         """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)`` (collective)."""
-        K, P, Q, curvature = self.forces.tangent.K, state.trial, state.test, self._curvature
+        assert isinstance(state, BodyState)
+        K, P, Q = self.forces.tangent.K, state.trial, state.test
+        curvature = together(self._curvature, state.added)
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
         active = zlib.crc32(P.equations.active.tobytes())
@@ -393,6 +381,8 @@ class BodySystem:
         if curvature is not None:
             load.axpy(1.0, curvature * c)
         load.axpy(1.0, self.forces.residual)
+        if state.held is not None:
+            load.axpy(1.0, state.held)
         rhs = Q.transpose(load)
         rhs.scale(-1.0)
         return rhs
@@ -441,6 +431,11 @@ class BodySystem:
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement."""
         return self.forces.linear
+
+    @property
+    def rough(self) -> bool:
+        """Whether there is friction."""
+        return any(pair.rough for pair in self.pairs)
 
     @property
     def in_contact(self) -> bool:

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -103,6 +104,36 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
             G.setValuesBlockedRCV(which, which, blocks, addv=PETSc.InsertMode.ADD)
     G.assemble()
     return G
+
+
+def slip_terms(pairs: Sequence[ContactPair], du: PETSc.Vec) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
+    """What the directions of slip add to the tangent and to the residual; None without friction in space (collective).
+
+    Args:
+        pairs: of all contacts.
+        du: a vector with the displacement's layout.
+    """
+    g = du.getBlockSize()
+    parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
+    if not du.comm.tompi4py().allreduce(sum(len(nodes) for nodes, _, _ in parts)) if parts else True:
+        return None, None
+    held = du.duplicate()
+    held.set(0.0)
+    for nodes, _, forces in parts:
+        there = nodes >= 0
+        index = (nodes[there][:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        held.setValues(index, forces.reshape(*nodes.shape, g)[there].ravel(), addv=PETSc.InsertMode.ADD)
+    held.assemble()
+    return contact_curvature([(nodes, blocks) for nodes, blocks, _ in parts], du), held
+
+
+def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:
+    """The sum of two matrices, either of which may be None."""
+    if A is None or B is None:
+        return B if A is None else A
+    both = A.copy()
+    both.axpy(1.0, B, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    return both
 
 
 class Inversions:

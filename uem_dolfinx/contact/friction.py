@@ -1,0 +1,162 @@
+"""Coulomb friction by elimination: who sticks, who slips and where to. Pure functions of arrays, without mesh and without communication.
+
+A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
+the direction s moves as without friction, and hands on a force along ``n - mu s``: its test row is tilted,
+
+    trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
+
+so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In space the direction follows the motion: with
+the tangential force tau and the slip w since the last step, ``q = c w - tau`` has the direction ``s = q / |q|`` wherever
+``tau = -mu lambda s`` and w is along s, whatever the stiffness c is (semismooth Newton: Alart and Curnier, 1991,
+doi:10.1016/0045-7825(91)90022-X; Hüeber, Stadler and Wohlmuth, 2008, doi:10.1137/060671061).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.active_set import TIED, Wrong
+from uem_dolfinx.contact.state import FrictionState
+
+#: A tangential direction of which prescribed components leave less than this part is prescribed.
+#: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
+PRESCRIBED = 1e-6
+#: The stiffness c of a contactor that slips in space, as part of the diagonal of K: from 0.5 on the direction of slip does not settle.
+#: [heuristic; the diagonal of K; -]
+SLIP_STIFFNESS = 0.1
+#: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
+#: [heuristic; the force q; -]
+LEAST_TURN = 0.99
+
+
+@dataclass(frozen=True)
+class FrictionWrong(Wrong):
+    """Contactors that break the conditions of contact or of friction, each ``(n,)``.
+
+    Attributes:
+        slide: those that stick with more force than the cone holds.
+        hold: those whose slip turns against its direction.
+    """
+
+    slide: Bools
+    hold: Bools
+
+    @property
+    def count(self) -> int:
+        """Number of wrong contactors."""
+        return super().count + int(self.slide.sum() + self.hold.sum())
+
+    def among_the_worst(self, worst: float) -> FrictionWrong:
+        """Those alone whose violation equals the ``worst`` of all."""
+        kept = self.violation >= (1.0 - TIED) * worst
+        return FrictionWrong(self.enter & kept, self.release & kept, self.violation, self.slide & kept, self.hold & kept)
+
+    def on_first_touch(self, gap: Array, deepest: float) -> FrictionWrong:
+        """As that of ``Wrong``; friction changes with what is there."""
+        first = super().on_first_touch(gap, deepest)
+        return FrictionWrong(first.enter, first.release, self.violation, self.slide, self.hold)
+
+
+def tangents(normals: Array, free: Bools) -> Array:
+    """Orthonormal directions across all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``; zeros where there are fewer.
+
+    Returns:
+        ``(n, gdim - 1, gdim)``.
+    """
+    fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normals.shape[2])
+    _, size, axes = np.linalg.svd(np.concatenate([normals, fixed], axis=1))
+    # the last axes are those that neither the normal nor a prescribed component has a part in
+    return np.where((size[:, 1:] < PRESCRIBED)[:, :, None] & free[:, None], axes[:, 1:], 0.0)
+
+
+def along(directions: Array, vectors: Array) -> Array:
+    """Parts of ``vectors (n, gdim)`` in the span of orthonormal ``directions (n, k, gdim)``: ``(n, gdim)``."""
+    return np.asarray(np.einsum("nrg,nr->ng", directions, np.einsum("nrg,ng->nr", directions, vectors)))
+
+
+def find_wrong(
+    wrong: Wrong,
+    state: FrictionState,
+    rubbing: Bools,
+    mu: Array,
+    lam: Array,
+    tau: Array,
+    slip: Array,
+    stiffness: Array,
+    *,
+    force_rounding: Array | float,
+    gap_rounding: float,
+) -> FrictionWrong:
+    """Add the contactors that break the conditions of friction to those that break the conditions of contact.
+
+    Args:
+        wrong: contactors that break the conditions of contact.
+        state: of the contactors.
+        rubbing: those that friction acts on ``(n,)``.
+        mu: coefficients of friction ``(n,)``.
+        lam: contact force along the normal, here or foreseen ``(n,)``.
+        tau: contact force along the target ``(n, gdim)``.
+        slip: relative motion along the target since the last step ``(n, gdim)``.
+        stiffness: of the contactors, a force per length ``(n,)``.
+        force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
+        gap_rounding: lengths below it are zero.
+    """
+    staying = rubbing & ~wrong.release
+    excess = np.linalg.norm(tau, axis=1) - mu * np.maximum(lam, 0.0)
+    slide = staying & state.stick & (excess > force_rounding)
+    forward = np.einsum("ng,ng->n", slip, state.direction)
+    hold = staying & ~state.stick & (forward < -gap_rounding)
+    violation = np.where(slide, excess, np.where(hold, -forward * stiffness, wrong.violation))
+    return FrictionWrong(wrong.enter, wrong.release, violation, slide, hold)
+
+
+def exchange(state: FrictionState, wrong: FrictionWrong, tau: Array) -> FrictionState:
+    """The state in which contactors that break the conditions of friction have changed between stick and slip.
+
+    Args:
+        state: of the contactors.
+        wrong: those to change.
+        tau: contact force along the target ``(n, gdim)``; it points against the slip of those that begin to.
+    """
+    size = np.linalg.norm(tau, axis=1, keepdims=True)
+    direction = np.where(wrong.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
+    direction[wrong.hold] = 0.0
+    return replace(state, stick=(state.stick | wrong.hold) & ~wrong.slide, direction=direction)
+
+
+def come_and_go(state: FrictionState, before: Bools, now: Bools, rough: Bools) -> FrictionState:
+    """The state in another active set: who comes sticks, who goes forgets.
+
+    Args:
+        state: of the contactors.
+        before: active so far ``(n,)``.
+        now: active from now on ``(n,)``.
+        rough: contactors with friction ``(n,)``.
+    """
+    stick = (state.stick & now) | (now & ~before & rough)
+    return replace(state, stick=stick, direction=np.where((now & ~stick)[:, None], state.direction, 0.0))
+
+
+def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
+    """The state in which contactors ``which (n,)`` slip along ``q (n, gdim)``."""
+    size = np.linalg.norm(q, axis=1)
+    i = which & (size > 0)
+    direction = np.where(i[:, None], q / np.where(i, size, 1.0)[:, None], state.direction)
+    return replace(state, direction=direction, stick=state.stick & ~i)
+
+
+def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
+    """What holds the direction of slip back: a stiffness across it, and the part of the force across it that is taken away ``(k,)``.
+
+    With ``a = mu lambda / |q|`` these are ``c a / (1 - a)`` and ``a / (1 - a)``.
+
+    Args:
+        size: ``|q|`` ``(k,)``.
+        bound: ``mu lambda`` ``(k,)``.
+        c: stiffness c ``(k,)``.
+    """
+    a = np.clip(bound / np.where(size > 0, size, np.inf), 0.0, LEAST_TURN)
+    return c * a / (1.0 - a), a / (1.0 - a)

@@ -1,0 +1,148 @@
+"""Uniting equations of all pairs brought together: how they can meet, Q, and how those in each other's way are resolved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.dependent import IndependentEquations
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.coupling import LabelledEquations
+from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.errors import ConflictError, FrictionError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import followed_nodes
+
+
+class Meetings:
+    """How equations of several contacts can meet (collective).
+
+    Args:
+        config: configuration of the displacement.
+        pairs: of all contacts; they are told whether their surfaces are contactor and target of each other.
+
+    Attributes:
+        shared: whether a node is a contactor of several pairs.
+        mutual: pairs whose surfaces are contactor and target of each other (two-pass) ``(n_pairs,)``.
+        stacked: whether a node that is followed may itself be eliminated.
+        contestable: whether equations can get in each other's way.
+    """
+
+    def __init__(self, config: Configuration, pairs: Sequence[ContactPair]):
+        self._config = config
+        follows = [followed_nodes(config, pair.coupling.followed) for pair in pairs]
+        meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
+        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
+        shared = len(np.unique(contactors)) < len(contactors)
+        found = np.append(meets.ravel(), shared)
+        config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
+        meets = found[:-1].reshape(meets.shape)
+        self.shared = bool(found[-1])
+        self.mutual: Bools = (meets & meets.T).any(axis=1)
+        for pair, mutual in zip(pairs, self.mutual):
+            pair.mutual = bool(mutual)
+            if mutual and not pair.coupling.two_pass:
+                raise ConflictError(
+                    f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
+                    "one of the two contacts, or give both coupling='node_to_surface'"
+                )
+        self.stacked = bool(meets.any()) or any(pair.coupling.chained for pair in pairs)
+        self.contestable = self.shared or bool(self.mutual.any()) or any(pair.coupling.prescribed for pair in pairs)
+
+    def restrict(
+        self, labelled: list[LabelledEquations], equations: UnitingEquations, free: Bools, prescribed: Array
+    ) -> tuple[Restriction, IndependentEquations | None]:
+        """P or Q of equations, and how those in each other's way were resolved (collective).
+
+        Args:
+            labelled: equations of every pair, in the order of those to be joined.
+            equations: of all pairs together.
+            free: components that are not held ``(n_owned, gdim)``.
+            prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
+        """
+        independent = None
+        if self.contestable:
+            mutual = np.repeat(self.mutual, [len(own) for own in labelled])
+            independent = IndependentEquations(self._config, equations, free, mutual)
+            equations = independent.equations
+        stacked = self.stacked or (independent is not None and independent.found)
+        return Restriction(self._config, equations, free, prescribed, stacked), independent
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Uniting equations of all pairs in one state, and what was made of them.
+
+    Attributes:
+        equations: of every pair.
+        trial: all that P is made of; None where it is ``upright``.
+        independent: how those that got in each other's way were resolved; None if none could.
+        test: Q.
+        upright: Q as it is without the friction of contactors that slip, which closes the gaps as well.
+    """
+
+    equations: list[LabelledEquations]
+    trial: UnitingEquations | None
+    independent: IndependentEquations | None
+    test: Restriction
+    upright: Restriction
+
+
+def make_rows(
+    meetings: Meetings,
+    pairs: Sequence[ContactPair],
+    hold: Callable[[UnitingEquations, UnitingEquations], Bools],
+    prescribed: Array,
+) -> Rows:
+    """Equations of all pairs in their present states, and Q (collective).
+
+    Args:
+        meetings: of the pairs.
+        pairs: of all contacts.
+        hold: free components ``(n_owned, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
+        prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
+
+    Raises:
+        FrictionError: if contactors slip where equations get in each other's way.
+    """
+    equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
+    upright = trial = UnitingEquations.join([e.upright for e in equations], g)
+    if any(e.trial is not e.upright for e in equations):
+        trial = UnitingEquations.join([e.trial for e in equations], g)
+    resisting = stopping = trial
+    if any(e.holding is not None for e in equations):
+        resisting = UnitingEquations.join([e.resisting for e in equations], g)
+        stopping = UnitingEquations.join([e.stopping for e in equations], g)
+    # the derivatives of the gaps tell which motions of a body nothing holds
+    free = hold(stopping, resisting)
+    Q, independent = meetings.restrict(equations, upright, free, prescribed)
+    tilted = Q
+    if any(e.test is not e.upright for e in equations):
+        if independent is not None and independent.found:
+            raise FrictionError(
+                "contactors slip where uniting equations get in each other's way: keep contacts with friction from sharing "
+                "contactors and from being contactor and target of each other, and their contactors from prescribed normals"
+            )
+        test = UnitingEquations.join([e.test for e in equations], g)
+        tilted = Restriction(Q.config, test, free, prescribed, Q.stacked, like=Q)
+    return Rows(equations, None if trial is upright else trial, independent, tilted, Q)
+
+
+def unbalanced(pairs: Sequence[ContactPair], F: PETSc.Vec, forces: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
+    """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
+
+    ``forces`` are those of every pair, as ``Coupling.forces`` returns them.
+    """
+    every = F.array_r.reshape(-1, F.getBlockSize()).copy()
+    left = every.copy()
+    for pair, (lam, nodal, force) in zip(pairs, forces):
+        state = replace(pair.trial, lam=lam, nodal=nodal, force=force)
+        left -= pair.config.add_at_owners(*pair.nodal_forces(state))
+    return left, every
