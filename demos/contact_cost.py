@@ -23,7 +23,7 @@ from dolfinx import fem
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, dofs=100_000, degree=1)
+args = common.arguments(__doc__, dofs=100_000, degree=1, coupling=("node_to_surface", "mortar"))
 CONTACT = ("search and projection", "uniting equations", "contact curvature", "united matrix P'KP")
 OTHERS = ("assemble residual", "assemble tangent", "linear solve")
 #: What has a timer of its own and counts towards another stage here.
@@ -69,7 +69,7 @@ def share(dim: int) -> dict[str, object]:
     bcs += [
         uem.dirichlet(u.function_space, tags[name], dim - 1, value) for name, value in (("block_bottom", 0.0), (names[2], push))
     ]
-    contact = uem.Contact(contactor=tags[names[1]], target=tags["block_top"])
+    contact = uem.Contact(contactor=tags[names[1]], target=tags["block_top"], coupling=args.coupling)
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="share_")
     before = {stage: clock(stage) for stage in CONTACT + OTHERS}
     start = time.perf_counter()
@@ -99,7 +99,7 @@ def cg_iterations(dim: int, amg: str, fused: bool) -> tuple[int, int]:
     V = u.function_space
     bcs = [uem.dirichlet(V, tags[name], i) for name in ("bottom", "top") for i in range(dim - 1)]
     bcs += [uem.dirichlet(V, tags["bottom"], dim - 1), uem.dirichlet(V, tags["top"], dim - 1, -0.01)]
-    contacts = [] if fused else [uem.Contact(contactor=tags["upper_bottom"], target=tags["lower_top"])]
+    contacts = [] if fused else [uem.Contact(contactor=tags["upper_bottom"], target=tags["lower_top"], coupling=args.coupling)]
     problem = uem.UnitedProblem(
         F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=common.cg(amg, 1e-8), rtol=1e-6
     )
