@@ -115,10 +115,15 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
             coulomb(contact.pair, 1e-12 * config.size, 1e-7 * scale + rounding)
         balance = contact.balance()
         # where the foot stays behind, the forces of a pair lie on two lines
-        assert balance is None or (balance.force < 1e-11 and (balance.moment < 1e-11 or contact.sliding != "finite"))
+        assert balance is None or (balance.force < 1e-11 and (balance.moment < lever(contact) or contact.sliding != "finite"))
         forces.axpy(1.0, compat.petsc_vector(contact.force))
     left = (F - forces).array_r.reshape(-1, config.gdim) * forces_of_bodies.free[: config.n_owned]
     assert highest(config.comm, np.abs(left)) <= 1e-5 * scale + rounding
+
+
+def lever(contact: uem.Contact) -> float:
+    """Bound on the moment that a contact leaves behind: friction of mortar acts where gaps vanish in the mean, not everywhere."""
+    return 1e-7 if isinstance(contact.pair, FrictionalPair) and not contact.pair.coupling.at_feet else 1e-11
 
 
 @pytest.fixture

@@ -10,9 +10,11 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
-from evidence.scenes import Array, Blocks, at, blocks, clamp, linear, modulus
+from evidence.scenes import Array, Blocks, Body, at, blocks, box, clamp, linear, modulus
+from evidence.scenes import scene as create_scene
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 
 
 @dataclass
@@ -83,12 +85,20 @@ class Loose:
         return self.problem.solve()
 
 
-def loose(cell: str = "quadrilateral", mu: Any = 0.3, *, rigid: bool = False, E: float = 50.0, **options: Any) -> Loose:
+def loose(
+    cell: str = "quadrilateral",
+    mu: Any = 0.3,
+    *,
+    rigid: bool = False,
+    E: float = 50.0,
+    coupling: str = "node_to_surface",
+    **options: Any,
+) -> Loose:
     """A block of unit volume on another one, or on a plane, that nothing but contact holds."""
     b = blocks(MPI.COMM_WORLD, cell, 3, 4, overhang=0.5)
     g = b.gdim
     target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
-    contact = uem.Contact(b.high, target, friction=mu)
+    contact = uem.Contact(b.high, target, friction=mu, coupling=coupling)
     force = fem.Constant(b.scene.mesh, np.zeros(g))
     F = linear(b.u, E) - modulus(b.scene, 0.0, 1.0) * ufl.inner(force, ufl.TestFunction(b.V)) * ufl.dx
     problem = uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[contact], **options)
@@ -98,3 +108,41 @@ def loose(cell: str = "quadrilateral", mu: Any = 0.3, *, rigid: bool = False, E:
 def history(scene: Driven, *places: tuple[float, ...]) -> Array:
     """Displacements after each place that the top is driven to, ``(n_places, n_nodes, gdim)`` in the drawing's order (collective)."""
     return np.array([(scene.to(*place), scene.blocks.scene.gather(scene.problem.u))[1] for place in places])
+
+
+#: Radius of the cylinder's surface, and how far the bodies reach.
+RADIUS, REACH = 8.0, 3.0
+
+
+@dataclass
+class Cylinder(Driven):
+    """Two bodies with a mesh that is the finer the nearer to the middle of their contact."""
+
+    n: int
+
+    def facet(self, x: float) -> float:
+        """Length of the facets at a distance from the middle."""
+        return 2 * np.sqrt(REACH * max(x, REACH / self.n**2)) / self.n
+
+
+def cylinder(mu: float, *, n: int, degree: int = 1, coupling: str = "node_to_surface") -> Cylinder:
+    """A body with a round lower surface on a flat one, of the same material; its top is driven."""
+
+    def graded(body: Body) -> Body:
+        return body.mapped(lambda x: REACH * np.sign(x) * x**2)
+
+    def pose(x: Array) -> Array:
+        y, high = x.copy(), np.arange(len(x)) >= len(lower.x)
+        y[high, 1] += y[high, 0] ** 2 / (2 * RADIUS) * (1 - y[high, 1] / REACH)
+        return y
+
+    lower, upper = (graded(box("quadrilateral", [-1.0, y], [1.0, y + 1.0], [2 * n, n])) for y in (-1.0, 0.0))
+    s = create_scene(MPI.COMM_WORLD, "quadrilateral", [lower, upper], pose=pose)
+    V = compat.function_space(s.mesh, degree, (2,))
+    bottom, low = s.tag("bottom", 0, at(1, -REACH)), s.tag("low", 0, at(1, 0.0))
+    high, top = s.tag("high", 1, at(1, 0.0)), s.tag("top", 1, at(1, REACH))
+    u, driver = fem.Function(V), fem.Function(V)
+    contact = uem.Contact(high, low, friction=mu, coupling=coupling)
+    bcs = [*clamp(V, bottom), fem.dirichletbc(driver, fem.locate_dofs_topological(V, 1, top.entities))]
+    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact])
+    return Cylinder(Blocks(s, V, u, bottom, low, high, top, len(upper.x)), problem, contact, driver, n)

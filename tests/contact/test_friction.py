@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from friction_scenes import driven, history, loose
-from helpers import CELLS, factors, gathered_matrix, highest, refused, rotation, st_venant
+from friction_scenes import RADIUS, cylinder, driven, history, loose
+from helpers import CELLS, NU, factors, gathered_matrix, highest, lowest, refused, rotation, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -19,10 +19,12 @@ from uem_dolfinx import compat
 @pytest.mark.parametrize("mu", [0.1, 0.3, 0.9])
 @pytest.mark.parametrize("rigid", [True, False])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_a_block_slides_at_mu_times_its_load(mu, rigid, degree):
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_a_block_slides_at_mu_times_its_load(mu, rigid, degree, coupling):
     """Driven far enough the whole surface slips, and the force along the base is mu times the force on it."""
     n = (3, 4) if degree == 1 else (2, 2)
-    scene = driven("quadrilateral", mu, rigid=rigid, degree=degree, n=n, how={"sliding": "finite" if rigid else "fixed"})
+    how = {"sliding": "finite" if rigid else "fixed", "coupling": coupling}
+    scene = driven("quadrilateral", mu, rigid=rigid, degree=degree, n=n, how=how)
     assert scene.to(0.0, -0.01)
     assert scene.states[0] > 0
     for x in np.linspace(0.0, 0.1 if mu > 0.5 else 0.06, 7)[1:]:
@@ -38,9 +40,10 @@ def test_a_block_slides_at_mu_times_its_load(mu, rigid, degree):
 
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.parametrize("rigid", [True, False])
-def test_friction_holds_a_block(cell, rigid):
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_friction_holds_a_block(cell, rigid, coupling):
     """Pushed with less than mu times its weight, it stays: weight, push and friction balance. It is pushed back as well."""
-    scene = loose(cell, 0.3, rigid=rigid, rtol=1e-12)
+    scene = loose(cell, 0.3, rigid=rigid, coupling=coupling, rtol=1e-12)
     g = scene.problem.config.gdim
     for push in (0.0, 0.15, 0.27, -0.2):
         load = np.zeros(g)
@@ -49,7 +52,7 @@ def test_friction_holds_a_block(cell, rigid):
         assert np.abs(scene.contact.resultant().force + load).max() <= 1e-12
         if not rigid:
             balance = scene.contact.balance()
-            assert balance.force <= 1e-12 and balance.moment <= 1e-11
+            assert balance.force <= 1e-12 and balance.moment <= (1e-11 if coupling == "node_to_surface" else 1e-7)
 
 
 def test_no_friction_is_the_contact_without():
@@ -308,6 +311,26 @@ def test_iterative_solvers(cell):
     assert np.abs(u - v).max() <= 1e-7 * np.abs(u).max()
 
 
-@pytest.mark.parametrize("how, words", [({"how": {"coupling": "mortar"}}, "mortar")])
-def test_what_friction_does_not_go_with(how, words):
-    refused(uem.InputError, ["friction", words], lambda: driven("quadrilateral", 0.3, **how))
+def test_what_friction_does_not_go_with():
+    """Mortar between surfaces of degree 2 that slide far: their equations follow each other."""
+    refused(uem.InputError, ["friction", "mortar"], lambda: driven("quadrilateral", 0.3, degree=2, how={"coupling": "mortar"}))
+
+
+@pytest.mark.parametrize("degree, coupling", [(1, "node_to_surface"), (2, "node_to_surface"), (1, "mortar")])
+def test_cattaneo_and_mindlin(degree, coupling):
+    """A cylinder pressed, then driven sideways: the middle sticks over c = a (1 - Q / mu P)^(1/2), with Mindlin's tractions."""
+    mu, press = 0.3, 0.02
+    scene = cylinder(mu, n=24 if degree == 1 else 12, degree=degree, coupling=coupling)
+    for y in (0.5 * press, press):
+        scene.to(0.0, -y)
+    most = 0
+    for x in (0.0025, 0.005, 0.0075):
+        most = max(most, len(scene.to(x, -press)) - 1)
+        pair, f = scene.contact.pair, scene.contact.resultant().force
+        half = 2 * np.sqrt(2 * RADIUS * f[1] * (1 - NU**2) * 2 / np.pi)
+        stick = half * np.sqrt(1 + f[0] / (mu * f[1]))
+        place, facet = np.abs(pair.points[:, 0]), scene.facet
+        sticks = pair.trial.friction.stick & pair.trial.active
+        assert highest(scene.problem.comm, place[sticks]) <= stick + 1.5 * facet(stick)
+        assert lowest(scene.problem.comm, place[pair.slipping]) >= stick - 1.5 * facet(stick)
+    assert most <= 5

@@ -127,13 +127,12 @@ class Restriction:
             "condition there, or make the other surface the contactor"
         )
 
-    def _matrix(self, rows: Ints, columns: Ints, values: Array) -> PETSc.Mat:
-        """Matrix from sorted local rows, global columns and values."""
-        n = self.config.gdim * self.config.n_owned
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(PETSc.IntType)
-        return PETSc.Mat().createAIJ(
-            self._sizes, bsize=self.config.gdim, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm
-        )
+    def _matrix(self, rows: Ints, columns: Ints, values: Array, sizes: Any = None) -> PETSc.Mat:
+        """Matrix from sorted local rows, global columns and values; of the displacement's size unless others are given."""
+        bsize = self.config.gdim if sizes is None else None
+        sizes = sizes or self._sizes
+        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=sizes[0][0]))]).astype(PETSc.IntType)
+        return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
 
     def _coupling_entries(self, which: Bools) -> tuple[Ints, Ints, Array]:
         """Local rows, global columns and values of M for some equations, zeros stored so that no place depends on directions."""
@@ -143,25 +142,27 @@ class Restriction:
         columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
         return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
 
-    @property
-    def _eliminated(self) -> PETSc.Mat:
-        """Projector of a displacement onto what the equations eliminate of it."""
-        g, eq = self.config.gdim, self.equations
-        blocks = self.lift[:, :, None] * eq.direction[:, None, :]
-        rows = np.broadcast_to((eq.node[:, None] * g + np.arange(g))[:, :, None], blocks.shape)
-        columns = self._first + rows.transpose(0, 2, 1)
-        return self._matrix(*_sum_duplicates(rows.ravel().astype(np.int64), columns.ravel().astype(np.int64), blocks.ravel()))
-
     def _longest_chain(self) -> int:
-        """How many equations follow one another from node to node (collective); raises ConflictError if they never end."""
-        path = self.M.matMult(self._eliminated)
+        """How many equations follow one another from node to node (collective); raises ConflictError if they never end.
+
+        An equation follows another if its terms have a part in what the other eliminates of a node; what that leaves free ends a chain.
+        """
+        g, eq, comm = self.config.gdim, self.equations, self.comm
+        m, k = len(eq), np.arange(g)
+        counts = np.array(comm.allgather(m))
+        first, sizes = int(counts[: comm.rank].sum()), (m, int(counts.sum()))
+        terms = np.broadcast_to(eq.row[:, None], eq.coefficients.shape), eq.followed[:, None] * g + k, eq.coefficients
+        own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift
+        C = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in terms)), (sizes, self._sizes[1]))
+        L = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in own)), (self._sizes[0], sizes))
+        path = C.matMult(L)
         indptr, columns, values = path.getValuesCSR()
-        # an equation may follow what is left free of an eliminated node
         path.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
         path.assemble()
-        at = self.vector(np.ones((self.config.n_owned, self.config.gdim)))
+        at = path.createVecRight()
+        at.set(1.0)
         length, left, before = 0, at.sum(), np.inf
-        # components from which a path of so many equations leads; if none of them drops out, it has no end
+        # equations from which a path of so many leads; if none of them drops out, it has no end
         while 0.0 < left < before:
             at, length, before = path * at, length + 1, left
             at.array[:] = at.array_r > 0
@@ -170,10 +171,10 @@ class Restriction:
         error = None
         if len(rows):
             error = ConflictError(
-                f"the contactor at {self.config.describe(int(rows[0]) // self.config.gdim)} follows itself through its targets: "
+                f"the contactor at {self.config.describe(int(eq.node[rows[0]]))} follows itself through its targets: "
                 "two surfaces are contactor and target of each other; drop one of the two contacts"
             )
-        agree(self.comm, error)
+        agree(comm, error)
         return length
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------

@@ -214,7 +214,7 @@ class Bernstein(NodeToSurface):
             np.concatenate([weight, f.weight[k], -f.weight[k][t] * control.weights[k][t, a]]),
         )
 
-    def shares(self, placement: Placement) -> Array:
+    def shares(self, placement: Placement, state: PairState) -> Array:
         """Bernstein's basis functions over those that belong to the scaled gaps."""
         control: ControlGaps = placement.details.control
         return control.scale

@@ -105,6 +105,10 @@ class Coupling(Protocol):
     def nodal(self) -> bool:
         """Whether each contactor follows the point of the target below it, rather than in a mean."""
 
+    @property
+    def at_feet(self) -> bool:
+        """Whether contact forces act at the feet of the projection."""
+
     def rub(self, mu: Array) -> None:
         """Take the contactors' coefficients of friction ``(n,)``."""
 
@@ -126,8 +130,11 @@ class Coupling(Protocol):
     def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
         """By what contactors follow other nodes: places of contactors, global nodes and weights, ``(k,)`` each (collective)."""
 
-    def shares(self, placement: Placement) -> Array:
-        """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)``."""
+    def shares(self, placement: Placement, state: PairState) -> Array:
+        """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)`` (collective)."""
+
+    def normals(self, placement: Placement, state: PairState) -> Array:
+        """Directions of the contactors' equations, across which friction acts ``(n, gdim)`` (collective)."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

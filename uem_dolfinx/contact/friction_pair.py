@@ -19,7 +19,6 @@ from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.state import FrictionState, PairState
-from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
 
@@ -42,8 +41,8 @@ class FrictionalPair(ContactPair):
         self.trial = self.committed = replace(self.trial, friction=FrictionState.initial(n, g))
         #: Where the anchors are ``(n, gdim)``.
         self._anchors: Array = np.zeros((n, g))
-        #: The last placement that directions along the target were made for, and these ``(n, gdim - 1, gdim)``.
-        self._tangents: tuple[Projection | None, Array] = None, np.zeros((n, g - 1, g))
+        #: The last normals that directions along the target were made for, and these ``(n, gdim - 1, gdim)``.
+        self._tangents: tuple[Array | None, Array] = None, np.zeros((n, g - 1, g))
         #: What contactors follow in a mean kept since the last step: weights, positions of the owned nodes, motion of a rigid target;
         #: None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
         self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None] | None = None
@@ -123,16 +122,20 @@ class FrictionalPair(ContactPair):
 
     @property
     def tangents(self) -> Array:
-        """Directions along the target in free components ``(n, gdim - 1, gdim)``."""
-        p = self.projection
-        if self._tangents[0] is not p:
-            normals, c = p.normal[:, None], self._corners
+        """Directions along the target in free components ``(n, gdim - 1, gdim)`` (collective)."""
+        normal = self.coupling.normals(self.placement, self.trial)
+        if self._tangents[0] is not normal:
+            normals, c = normal[:, None], self._corners
             if c is not None:
                 more = np.zeros((len(self.nodes), *c.axes.shape[1:]))
                 more[c.which] = np.where((np.arange(c.axes.shape[1]) < c.count[:, None])[:, :, None], c.axes, 0.0)
                 normals = np.concatenate([normals, more], axis=1)
-            self._tangents = p, friction.tangents(normals, self.free)
+            self._tangents = normal, friction.tangents(normals, self.free)
         return self._tangents[1]
+
+    @property
+    def _shares(self) -> Array:
+        return self.coupling.shares(self.placement, self.trial)
 
     @property
     def slip(self) -> Array:
@@ -216,7 +219,7 @@ class FrictionalPair(ContactPair):
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), back, slip))
         self._released = self._released | wrong.release
         # where they begin to slip the linearised problem has taken the forces to
-        tau = tau / self.coupling.shares(self.placement)[:, None]
+        tau = tau / self._shares[:, None]
         self._q[wrong.slide], self._tau[wrong.slide] = -tau[wrong.slide], tau[wrong.slide]
         self._q[back], self._tau[back] = slip[back] * self._c[back, None], 0.0
 
@@ -226,7 +229,7 @@ class FrictionalPair(ContactPair):
         if self.config.gdim == 2:
             return
         self._c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
-        self._tau = self.tangential(self._rub().tau) / self.coupling.shares(self.placement)[:, None]
+        self._tau = self.tangential(self._rub().tau) / self._shares[:, None]
         self._q = self._c[:, None] * self.slip - self._tau
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), self.slipping, self._q))
 
@@ -265,7 +268,7 @@ class FrictionalPair(ContactPair):
             )
         turning = trial
         if g == 3:
-            across = np.cross(self.projection.normal[who], self.directions[who])
+            across = np.cross(self.coupling.normals(self.placement, self.trial)[who], self.directions[who])
             turning = UnitingEquations.join([trial, along(across, np.zeros(len(who)), slipping)], g)
         return LabelledEquations(
             trial,
@@ -283,7 +286,7 @@ class FrictionalPair(ContactPair):
         rows = equations.upright.select(plain)
         own = LabelledEquations(rows, rows, equations.contactor[plain], equations.kind[plain])
         lam, nodal, force = super().forces(own, multipliers[plain])
-        share = self.coupling.shares(self.placement)
+        share = self._shares
         tau = np.where(self.slipping[:, None], -(self.mu * lam / share)[:, None] * self.directions, 0.0)
         held = np.flatnonzero(~plain)
         np.add.at(tau, equations.contactor[held], multipliers[held, None] * equations.test.direction[held])
@@ -316,7 +319,7 @@ class FrictionalPair(ContactPair):
     @property
     def _multipliers(self) -> Array:
         """Multipliers along the normals ``(n,)``."""
-        return np.asarray(self.trial.lam / self.coupling.shares(self.placement))
+        return np.asarray(self.trial.lam / self._shares)
 
     def _turning(self) -> tuple[Array, Array, Array]:
         """Of contactors that slip: projectors across their directions ``(k, g, g)``, and what ``turn_stiffness`` returns."""
@@ -353,6 +356,8 @@ class FrictionalPair(ContactPair):
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda d(row)/du``, the rows of contactors that slip tilted; see ``ContactPair``."""
         nodes, blocks = super().curvature()
+        if not self.coupling.at_feet:
+            return nodes, blocks
         i, p = np.flatnonzero(self.slipping & (self.trial.lam > 0) & ~self._cornered), self.projection
         tau = self.tangential(self.trial.force)[i]
         own = np.column_stack([self.config.to_global(self.nodes[i]), p.nodes[i]])
@@ -385,7 +390,7 @@ class FrictionalPair(ContactPair):
         """Make the trial state the committed one, with new anchors for those that do not stick; see ``ContactPair``."""
         slip = np.where((self.trial.active | self.committed.active)[:, None], self.slip, 0.0)
         assert self.committed.friction is not None
-        share = self.coupling.shares(self.placement)[:, None]
+        share = self._shares[:, None]
         f = self._anchored()
         mean = 0.5 * self.tangential(self.committed.friction.tau + f.tau) / share
         slipped = f.slipped + np.where(self.slipping[:, None], slip / share, 0.0)

@@ -63,6 +63,9 @@ class Mortar(NodeToSurface):
     """
 
     chained, two_pass = True, False
+    nodal = at_feet = False
+    #: Whether there is friction.
+    _rubs = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -257,7 +260,35 @@ class Mortar(NodeToSurface):
             beside = self._elimination.beside(at, scale, direction)
             equations = with_terms(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
-        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share)
+        weights = None
+        if self._rubs:
+            whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
+            means = [
+                terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
+                terms_of(own[e], at.opposite, (A[e] @ at.covered.N)[..., None]),
+            ]
+            r, t, w = self._elimination.at_owners(means, np.where(is_covered, whole, 1.0))
+            near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
+            weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
+        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share, weights)
+
+    def rub(self, mu: Array) -> None:
+        """Keep the weights that friction needs; see ``Coupling``."""
+        self._rubs = True
+
+    def weights(self, placement: Placement) -> Terms:
+        """Integrals of the dual functions times the shape functions of both sides, over that of the contactor's own."""
+        weights: Terms = placement.details.weights
+        return weights
+
+    def shares(self, placement: Placement, state: PairState) -> Array:
+        """Of the multipliers of equations that are taken apart."""
+        rows: WeightedRows = placement.details
+        return np.asarray(rows.share / self._elimination.apart(rows, state.active)[1])
+
+    def normals(self, placement: Placement, state: PairState) -> Array:
+        """The directions of equations that are taken apart."""
+        return self._elimination.apart(placement.details, state.active)[0].direction
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
@@ -322,7 +353,15 @@ class Mortar(NodeToSurface):
         """What the equations hand on of the state's multipliers."""
         rows: WeightedRows = placement.details
         made, by = self._elimination.apart(rows, state.active)
-        return self._handed_on(made, state.lam / rows.share * by)
+        nodes, forces = self._handed_on(made, state.lam / rows.share * by)
+        if state.friction is None:
+            return nodes, forces
+        tau = state.friction.tau / (rows.share / by)[:, None]
+        row, followed, weight = self.weights(placement)
+        return (
+            np.concatenate([nodes, self.config.to_global(self.nodes), followed]),
+            np.concatenate([forces, tau, -weight[:, None] * tau[row]]),
+        )
 
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """Second derivatives of the weighted gaps."""

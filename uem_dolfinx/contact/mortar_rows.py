@@ -40,6 +40,7 @@ class WeightedRows:
         ratio: part of the contactor's share of its facets that is covered ``(n,)``.
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
+        weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
     """
 
     equations: UnitingEquations
@@ -51,6 +52,7 @@ class WeightedRows:
     ratio: Array
     area: Array
     share: Array
+    weights: Terms | None = None
 
 
 class Elimination:

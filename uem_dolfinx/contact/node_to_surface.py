@@ -63,7 +63,7 @@ class NodeToSurface:
     """
 
     chained, two_pass = False, True
-    nodal = True
+    nodal = at_feet = True
 
     def __init__(
         self,
@@ -199,9 +199,13 @@ class NodeToSurface:
         row, a = np.nonzero(p.nodes >= 0)
         return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
 
-    def shares(self, placement: Placement) -> Array:
+    def shares(self, placement: Placement, state: PairState) -> Array:
         """The whole multiplier."""
         return np.ones(len(self.nodes))
+
+    def normals(self, placement: Placement, state: PairState) -> Array:
+        """The normals at the feet."""
+        return placement.projection.normal
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an open end of the target in a direction in which they can move.
