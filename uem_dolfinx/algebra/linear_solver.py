@@ -15,6 +15,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
+from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
@@ -28,9 +29,6 @@ from uem_dolfinx.parallel import agreed
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
 #: [convention; bodies; test_thresholds_algebra.py::test_few_bodies_have_modes_of_their_own]
 MODES_OF_THEIR_OWN = 4
-#: A mode of which less than this part is new adds nothing to the near-null space.
-#: [convention; part of its norm; test_thresholds_algebra.py::test_modes_that_are_nearly_alike]
-INDEPENDENT = 1e-6
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
 #: [convention; ratio of norms; test_thresholds_algebra.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
@@ -43,6 +41,8 @@ KEPT_SLOWER = 2.0
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 #: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+#: Types of PC that cannot see contactors much stiffer than their targets.
+MULTIGRID = ("hypre", "gamg", "ml")
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)
 #: Options that misspelt ones are likely to mean.
@@ -76,7 +76,10 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     """
     amg = amg or ("hypre" if has_hypre() else "gamg")
     if amg == "gamg":
-        return {"pc_type": "gamg", "mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
+        # the smoother's bounds from CG, which finds the few large eigenvalues that stiff contactors make
+        gamg = {"esteig_ksp_type": "cg", "esteig_ksp_max_it": 20, "threshold": 0.02}
+        smoother = {"mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
+        return {"pc_type": "gamg"} | smoother | {f"pc_gamg_{k}": v for k, v in gamg.items()}
     boomeramg = {
         "strong_threshold": 0.15, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4, "relax_type_all": "Chebyshev",
     }  # fmt: skip
@@ -164,10 +167,12 @@ class UnitedSolver:
         self._first_pace = self._pace = 0.0
         #: Whether the KSP is for symmetric matrices, and the types of KSP and PC that the options ask for.
         self._symmetric = True
-        self._types = self.ksp.getType(), self.ksp.getPC().getType()
+        self._types = self.ksp.getType(), self.pc.getType()
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.config.comm)
+        #: The preconditioner that the options ask for, which the KSP may have inside another one.
+        self.pc = ksp.getPC()
         ksp.setOptionsPrefix(self._prefix)
         ksp.setErrorIfNotConverged(False)
         with self._in_database():
@@ -208,7 +213,7 @@ class UnitedSolver:
     @property
     def needs_near_null_space(self) -> bool:
         """Whether the preconditioner can use the rigid-body modes."""
-        return self.ksp.getPC().getType() in ("gamg", "ml", "bddc")
+        return self.pc.getType() in ("gamg", "ml", "bddc")
 
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, test: Restriction | None = None
@@ -243,14 +248,30 @@ class UnitedSolver:
         if self._new and self.needs_near_null_space:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
+        self.pc.setOperators(self.A)
+        self._deflate(restriction, K)
         self.ksp.setOperators(self.A)
+
+    def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
+        """Put multigrid into a deflation where contactors are much stiffer than what they press on (collective)."""
+        if self.pc.getType() not in MULTIGRID:
+            return
+        with timed("deflation"):
+            pressed = pressed_hard(self.config, self.A, K, restriction)
+            if not self.config.comm.allreduce(int(pressed.any())):
+                self.ksp.setPC(self.pc)
+                return
+            deflation = Deflation(self.pc)
+            deflation.update(self.A, deflated(self.config, self.A, restriction, pressed))
+            self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.config.comm))
 
     def _adapt(self, symmetric: bool) -> None:
         """Take the KSP and PC of the options, or ones for unsymmetric matrices in place of those for symmetric ones."""
         if symmetric == self._symmetric:
             return
         self._symmetric = symmetric
-        pc = self.ksp.getPC()
+        pc = self.pc
+        self.ksp.setPC(pc)
         if symmetric:
             self.ksp.setType(self._types[0])
             pc.setType(self._types[1])
@@ -274,7 +295,7 @@ class UnitedSolver:
             self.ksp.setOperators(A, self.A)
             return
         self._new, self.A = True, A
-        self.ksp.getPC().setReusePreconditioner(False)
+        self.pc.setReusePreconditioner(False)
         self.ksp.setOperators(A)
 
     def _keep_preconditioner(self, equations: UnitingEquations) -> None:
@@ -288,7 +309,7 @@ class UnitedSolver:
         if not keep:
             self._made_with, self._first_pace = equations, 0.0
         self._new = not keep
-        self.ksp.getPC().setReusePreconditioner(bool(keep))
+        self.pc.setReusePreconditioner(bool(keep))
 
     def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
         """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
@@ -352,7 +373,7 @@ class UnitedSolver:
                 with timed("linear solve"):
                     self.ksp.solve(rhs, dq)
             except PETSc.Error as error:
-                kinds = f"{self.ksp.getType()} and {self.ksp.getPC().getType()}"
+                kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
                 if error.ierr in NO_SUCH_TYPE:
                     raise InputError(
                         f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {_last_words(error)}; choose others"
@@ -365,7 +386,7 @@ class UnitedSolver:
         reason = self.ksp.getConvergedReason()
         if reason < 0 or not np.isfinite(dq.norm()):
             raise LinearSolveError(
-                f"the united solve with {self.ksp.getType()} and {self.ksp.getPC().getType()} failed with KSP reason {reason} after "
+                f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "
                 f"{self.ksp.getIterationNumber()} iterations: a body may be free to move as a rigid body, the tangent may be "
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
@@ -380,7 +401,7 @@ class UnitedSolver:
             near = difflib.get_close_matches(key, OFTEN_USED, n=1)
             logger.warning(
                 "petsc_options[%r] = %s was not used by PETSc with %s and %s: %s",
-                key, given.shown(self.options[key]), self.ksp.getType(), self.ksp.getPC().getType(),
+                key, given.shown(self.options[key]), self.ksp.getType(), self.pc.getType(),
                 f"did you mean {near[0]!r}?" if near else "check its spelling, or leave it out",
             )  # fmt: skip
         self._unused = None

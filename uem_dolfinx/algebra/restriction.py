@@ -71,13 +71,14 @@ class Restriction:
         closure = np.array(prescribed)
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
-        self.d = self._vector(closure)
+        self.d = self.vector(closure)
         #: Rows of the eliminated nodes, columns of the nodes they follow.
         self.M: Any = self._matrix(*self._coupling_entries(equations.active)) if self._n_rows else None
         #: Number of terms with M in the series of P and c.
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
-    def _vector(self, values: Array) -> PETSc.Vec:
+    def vector(self, values: Array) -> PETSc.Vec:
+        """A vector with these values at the owned components."""
         v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.config.gdim, comm=self.comm)
         v.array[:] = values.ravel()
         return v
@@ -158,7 +159,7 @@ class Restriction:
         # an equation may follow what is left free of an eliminated node
         path.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
         path.assemble()
-        at = self._vector(np.ones((self.config.n_owned, self.config.gdim)))
+        at = self.vector(np.ones((self.config.n_owned, self.config.gdim)))
         length, left, before = 0, at.sum(), np.inf
         # components from which a path of so many equations leads; if none of them drops out, it has no end
         while 0.0 < left < before:
@@ -185,7 +186,7 @@ class Restriction:
         if self.chain == 0 or not self.stacked:
             P = self._rows_of_P(active)
             # a followed component that is prescribed is no unknown
-            P.diagonalScale(None, self._vector(self.used.astype(float)))
+            P.diagonalScale(None, self.vector(self.used.astype(float)))
             return P
         P, power, reach = self._rows_of_P(np.zeros_like(active)), self.M, 1
         # (1 + M)(1 + M^2)(1 + M^4)... T: twice as many equations follow one another with each product
@@ -224,7 +225,7 @@ class Restriction:
 
     def cross_out(self, A: PETSc.Mat) -> None:
         """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""
-        used = self._vector(self.used.astype(float))
+        used = self.vector(self.used.astype(float))
         A.diagonalScale(used, used)
 
     # -- P as a map ----------------------------------------------------------------------------------------------------
@@ -239,7 +240,7 @@ class Restriction:
         q = dq.array_r.reshape(-1, self.config.gdim)
         du = q * self.free
         du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
-        return self._series(self._vector(du))
+        return self._series(self.vector(du))
 
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
         """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F``."""
@@ -256,7 +257,7 @@ class Restriction:
         full = y.array_r.reshape(-1, self.config.gdim)
         q = full * self.free
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
-        return self._vector(q)
+        return self.vector(q)
 
     def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
         """``P'F``."""

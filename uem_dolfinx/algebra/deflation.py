@@ -1,0 +1,134 @@
+"""Multigrid that sees contactors much stiffer than their targets: what it cannot see is solved exactly.
+
+P lands the stiffness of a contactor on the nodes that it follows, as pieces of low rank. Where it outweighs the target's own, what the
+target can still do between them oscillates, and no coarser grid shows it; nor does one show that a stiff body moves as a whole. So both
+are taken out of multigrid's hands: with W, whose columns are the unknowns of these nodes and their neighbours and the rigid motions of
+the stiff bodies, and B a multigrid cycle,
+
+    M^-1 = C + (1 - C A) B (1 - A C),    C = W (W'AW)^-1 W'
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.geometry.configuration import Configuration
+
+#: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
+#: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
+MUCH_STIFFER = 10.0
+#: A mode of which less than this part is new adds nothing to those before it.
+#: [convention; part of its norm; test_thresholds_algebra.py::test_modes_that_are_nearly_alike]
+INDEPENDENT = 1e-6
+
+
+class Deflation:
+    """A preconditioner of PETSc's Python type around another one.
+
+    Args:
+        inner: preconditioner that cannot see stiff contactors.
+    """
+
+    def __init__(self, inner: PETSc.PC):
+        self.inner, self.comm = inner, inner.comm
+        self.W: Any = None
+
+    def update(self, A: PETSc.Mat, W: PETSc.Mat) -> None:
+        """Solve exactly for the columns of W from now on (collective)."""
+        self.W, self.AW = W, A.matMult(W)
+        self._solver = PETSc.KSP().create(self.comm)
+        self._solver.setType("preonly")
+        pc = self._solver.getPC()
+        if PETSc.Sys.hasExternalPackage("mumps"):
+            pc.setType("lu")
+            pc.setFactorSolverType("mumps")
+        else:
+            pc.setType("redundant")
+        self._solver.setOperators(W.transposeMatMult(self.AW))
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802
+        """Set up what PETSc has not (collective)."""
+        self.inner.setUp()
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """``y = M^-1 x`` (collective)."""
+        force, moved, rest = self.W.createVecRight(), self.W.createVecRight(), x.duplicate()
+        self.W.multTranspose(x, force)
+        self._solver.solve(force, moved)
+        self.AW.mult(moved, rest)
+        rest.aypx(-1.0, x)
+        self.inner.apply(rest, y)
+        self.AW.multTranspose(y, force)
+        back = moved.duplicate()
+        self._solver.solve(force, back)
+        moved.axpy(-1.0, back)
+        self.W.multAdd(moved, y, y)
+
+
+def pressed_hard(config: Configuration, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
+    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)``."""
+    stiffness, own = (np.array(M.getDiagonal().array_r).reshape(-1, config.gdim) for M in (A, K))
+    pressed = P.used & (stiffness > MUCH_STIFFER * own)
+    pressed[P.nodes] = False
+    return np.asarray(pressed.any(axis=1))
+
+
+def deflated(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
+    """W for nodes ``pressed (n_owned,)`` by much stiffer contactors; the last rank has the columns of the modes (collective)."""
+    g, n, comm = config.gdim, config.n_owned, config.comm
+    first = g * int(config.index_map.local_range[0])
+    touched = PETSc.IS().createGeneral(np.flatnonzero(np.repeat(pressed, g)).astype(PETSc.IntType) + first, comm=PETSc.COMM_SELF)
+    A.increaseOverlap(touched, 1)
+    near = np.zeros((n, 1), dtype=bool)
+    near[config.gather_owned(np.unique(touched.getIndices() // g).astype(np.int64))] = True
+    alone = np.flatnonzero(P.used & near)
+    counts = np.cumsum([0, *comm.allgather(len(alone))])
+    mode, row, value = _rigid_modes(config, P, pressed, ~near & P.used)
+    n_modes = comm.allreduce(int(mode.max(initial=-1)) + 1, op=MPI.MAX)
+    rows, values = np.append(alone, row), np.append(np.ones(len(alone)), value)
+    columns = np.append(counts[comm.rank] + np.arange(len(alone)), counts[-1] + mode)
+    order = np.lexsort((columns, rows))
+    indptr = np.append(0, np.cumsum(np.bincount(rows, minlength=g * n))).astype(PETSc.IntType)
+    here = len(alone) + (n_modes if comm.rank == comm.size - 1 else 0)
+    return PETSc.Mat().createAIJ(
+        (A.getSizes()[0], (here, counts[-1] + n_modes)),
+        csr=(indptr, columns[order].astype(PETSc.IntType), values[order]),
+        comm=A.comm,
+    )
+
+
+def _rigid_modes(config: Configuration, P: Restriction, pressed: Bools, where: Bools) -> tuple[Ints, Ints, Array]:
+    """Number, local component and value of the entries of the stiff bodies' rigid motions at components ``where (n_owned, gdim)``."""
+    body, n_bodies = find_bodies(config)
+    n, eq, comm = config.n_owned, P.equations, config.comm
+    hard = (config.ask_owners(eq.followed, pressed[:, None].astype(float))[:, 0] > 0) & eq.active[eq.row]
+    stiff = np.zeros(n_bodies, dtype=bool)
+    stiff[body[eq.node[eq.row[hard]]]] = True
+    comm.Allreduce(MPI.IN_PLACE, stiff, op=MPI.LOR)
+    if not stiff.any():
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    mine = np.flatnonzero(stiff[body[:n]])
+    number = (np.cumsum(stiff) - 1)[body[mine]]
+    # lengths of the model's size make turns as large as shifts
+    velocities = rigid_velocities(
+        (config.x[:n] - comm.allreduce(config.x[:n].sum(axis=0)) / config.index_map.size_global) / config.size
+    )
+    modes = np.stack([P.reduce(P.vector(v)).array_r.reshape(n, -1) for v in velocities.transpose(1, 0, 2)], axis=2)
+    modes = (modes * where[:, :, None])[mine]
+    gram = np.zeros((stiff.sum(), modes.shape[2], modes.shape[2]))
+    np.add.at(gram, number, np.einsum("ngk,ngl->nkl", modes, modes))
+    comm.Allreduce(MPI.IN_PLACE, gram)
+    size, mixed = np.linalg.eigh(gram)
+    independent = size > INDEPENDENT**2 * size[:, -1:]
+    column = (np.cumsum(independent) - 1).reshape(independent.shape)
+    modes = np.einsum("ngk,nkl->ngl", modes, mixed / np.sqrt(np.where(independent, size, 1.0))[:, None, :])
+    i, c, k = np.nonzero((modes != 0) & independent[number][:, None, :])
+    return column[number[i], k], mine[i] * config.gdim + c, modes[i, c, k]
