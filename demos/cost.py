@@ -39,7 +39,10 @@ args = common.arguments(
     runs=1,
 )
 #: Timers of what contact adds, and of what there is without it; some hold others.
-CONTACT = ("search and projection", "uniting equations", "contact curvature", "restriction matrix P", "united matrix P'KP")
+CONTACT = (
+    "search and projection", "uniting equations", "contact curvature", "restriction matrix P", "united matrix P'KP",
+    "united matrix Q'KP", "deflation",
+)  # fmt: skip
 BODIES = ("assemble residual", "assemble tangent", "factorisation or preconditioner set-up", "linear solve")
 STAGES = (*CONTACT, "cross out prescribed components", *BODIES)
 TOLERANCE = 1e-8
