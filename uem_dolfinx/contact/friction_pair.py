@@ -19,8 +19,14 @@ from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.state import FrictionState, PairState
+from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import agree
+
+#: A contactor is driven over the target if its prescribed components move by more than this part of the model's size in a step.
+#: [convention; the model's size; test_friction.py::test_contactors_that_are_driven]
+DRIVEN = 1e-9
 
 
 class FrictionalPair(ContactPair):
@@ -232,6 +238,25 @@ class FrictionalPair(ContactPair):
         self._tau = self.tangential(self._rub().tau) / self._shares[:, None]
         self._q = self._c[:, None] * self.slip - self._tau
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), self.slipping, self._q))
+
+    def check(self) -> None:
+        """Refuse contactors that are driven over the target by Dirichlet conditions, which friction cannot act on (collective).
+
+        Raises:
+            FrictionError: naming the first such contactor of the first rank that has one.
+        """
+        normal, off = self.coupling.normals(self.placement, self.trial), self._off_anchor
+        whole = friction.along(friction.tangents(normal[:, None], np.ones_like(self.free)), off)
+        driven = np.linalg.norm(whole - self.slip, axis=1) > DRIVEN * self.config.size
+        i = np.flatnonzero(driven & self.rubbing & (self.trial.lam > 0) & ~self._cornered & ~self.free.all(axis=1))
+        error = None
+        if len(i):
+            error = FrictionError(
+                f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i[0]]))} is driven over the target by a Dirichlet "
+                "condition, and friction cannot act on a prescribed component: drive other nodes of the body, or make the other surface "
+                "the contactor"
+            )
+        agree(self.config.comm, error)
 
     # -- what the united system gets -------------------------------------------------------------------------------------
 

@@ -318,6 +318,9 @@ class ContactPair:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
         return self.coupling.curvature(self.placement, self.trial)
 
+    def check(self) -> None:
+        """Refuse an equilibrium that the pair cannot stand for (collective)."""
+
     def turn(self, stiffness: Array) -> None:
         """Take the directions of friction from where the contactors are; ``stiffness (n, gdim)`` is the diagonal of K at them."""
 

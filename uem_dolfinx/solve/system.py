@@ -123,6 +123,7 @@ class BodySystem:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
+            pair.check()
         self.floating.end_step()
         if (state := self._doubtful) is None:
             return
