@@ -108,7 +108,7 @@ def find_wrong(
     excess = np.linalg.norm(tau, axis=1) - mu * np.maximum(lam, 0.0)
     slide = staying & state.stick & (excess > force_rounding)
     forward = np.einsum("ng,ng->n", slip, state.direction)
-    hold = staying & ~state.stick & (forward < -gap_rounding)
+    hold = staying & ~state.stick & ((forward < -gap_rounding) | ~state.direction.any(axis=1))
     violation = np.where(slide, excess, np.where(hold, -forward * stiffness, wrong.violation))
     return FrictionWrong(wrong.enter, wrong.release, violation, slide, hold)
 
