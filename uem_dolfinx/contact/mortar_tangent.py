@@ -358,4 +358,4 @@ class SegmentPoints:
 
 def _products(left: Array, right: Array) -> Array:
     """Products of all columns of ``left (q, a)`` with all of ``right (q, b)``: ``(q, a b)``."""
-    return (left[:, :, None] * right[:, None, :]).reshape(len(left), -1)
+    return (left[:, :, None] * right[:, None, :]).reshape(len(left), left.shape[1] * right.shape[1])
