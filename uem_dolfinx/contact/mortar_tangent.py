@@ -116,11 +116,11 @@ class SegmentPoints:
             tilt = np.zeros((k, g))
             tilt[s.pair] = self.tilt
             own, gap = np.split(
-                add_up(s.pair, _products(weighted, np.column_stack([self.phi, s.gap])), k).reshape(k, nc, -1), [nc], axis=2
+                add_up(s.pair, _products(weighted, np.column_stack([self.phi, s.gap])), k).reshape(k, nc, nc + 1), [nc], axis=2
             )
-            on_facet = add_up(e, (own[..., None] * tilt[:, None, None]).reshape(k, -1), m).reshape(m, nc, nc * g)
+            on_facet = add_up(e, (own[..., None] * tilt[:, None, None]).reshape(k, nc * nc * g), m).reshape(m, nc, nc * g)
             on_target = (self.covered.N[..., None] * tilt[:, None, None]).reshape(k, nc, nt * g)
-            vector = vector + add_up(e, (gap * tilt[:, None]).reshape(k, -1), m).reshape(m, nc, g)
+            vector = vector + add_up(e, (gap * tilt[:, None]).reshape(k, nc * g), m).reshape(m, nc, g)
         else:
             lean = _products(weighted, self.tilt)
             on_facet = add_up(e[s.pair], _products(lean, self.phi), m).reshape(m, nc, g, nc).swapaxes(2, 3).reshape(m, nc, nc * g)
