@@ -29,7 +29,7 @@ from dolfinx import fem
 import uem_dolfinx as uem
 
 args = common.arguments(__doc__, h=1 / 50, mu=0.3, part=0.88, steps=4)
-E, nu, R, depth, mu, reach = 1.0, 0.3, 1.0, 0.004, args.mu, 0.06
+E, nu, R, depth, mu, reach = 1.0, 0.3, 1.0, 0.0012, args.mu, 0.03
 
 # %% [markdown]
 # ## The scene
