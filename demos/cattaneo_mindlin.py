@@ -28,8 +28,8 @@ from dolfinx import fem
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, h=1 / 50, mu=0.3, part=0.88, steps=4)
-E, nu, R, depth, mu, reach = 1.0, 0.3, 1.0, 0.004, args.mu, 0.06
+args = common.arguments(__doc__, h=1 / 60, mu=0.3, part=0.88, steps=4)
+E, nu, R, depth, mu, reach = 1.0, 0.3, 1.0, 0.0012, args.mu, 0.03
 
 # %% [markdown]
 # ## The scene
@@ -153,5 +153,6 @@ if args.plot:
 
 # %%
 assert results["stick_edge_error"] <= 1 and results["loop_error"] < 1e-8 and results["iterations"] <= 5, results
-if args.h <= 1 / 50:
-    assert results["traction_error"] < 0.025, results
+# of first order: friction has a vertical tangent where stick ends
+if args.h <= 1 / 30:
+    assert results["traction_error"] < 1.5 * args.h, results

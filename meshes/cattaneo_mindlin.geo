@@ -3,7 +3,7 @@ DefineConstant[
   h = 1/40,      // size in the contact zone, as part of its reach
   R = 1,         // radius of the disc
   W = 1,         // half the width, and height, of the block
-  zone = 0.06,   // the contact zone reaches this far to either side
+  zone = 0.03,   // the contact zone reaches this far to either side
   growth = 0.25  // cells at distance r are growth * r larger
 ];
 size = h * zone;
