@@ -85,6 +85,15 @@ def _mean_places(contact: uem.Contact) -> list[Place]:
     return [Place(float(gap), np.zeros((0, contact.config.gdim)), bool(np.isfinite(gap))) for gap in gaps]
 
 
+def _mean_normals(contact: uem.Contact) -> dict[int, Array]:
+    """Mean normals of the contactor's facets around each of this rank's contactors (collective)."""
+    pair, surface = contact.pair, contact.pair.coupling.surface
+    known = COMM.allgather((surface.nodes.ravel(), surface.normals().reshape(-1, contact.config.gdim)))
+    nodes, normals = (np.concatenate(part) for part in zip(*known))
+    sums = (normals[nodes == node].sum(axis=0) for node in contact.config.to_global(pair.nodes))
+    return {int(i): n / np.linalg.norm(n) for i, n in zip(pair.nodes, sums)}
+
+
 def _target_normals(contact: uem.Contact) -> dict[int, Array]:
     """Inward normals of the target's facets around each of this rank's nodes, what mortar's forces lie along (collective)."""
     facets = contact.pair.target.facets
@@ -147,11 +156,15 @@ def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALAN
     inner = np.where(free & ~touching[:, None], r, 0.0)
     trial.check("equilibrium", COMM.allreduce(float(np.linalg.norm(inner, axis=1).sum())) / scale, supported)
     trial.check("overlap", overlap(scene, h), OVERLAP)
+    leans = {
+        i: n for contact in scene.contacts if isinstance(contact.pair.coupling, Mortar) for i, n in _mean_normals(contact).items()
+    }
     astray = work = lost = 0.0
     for node in np.flatnonzero(contactor & ~target & free.all(axis=1)):
         if len(cone := np.concatenate(normals[node])):
             astray += _off_cone(cone, r[node])
-        force = float(np.linalg.norm(r[node]))
+        # with mortar, neighbours that press pull an open contactor to and fro along the facets
+        force = float(np.linalg.norm(r[node]) if node not in leans else abs(r[node] @ leans[node]))
         if np.isfinite(gaps[node]):
             work += force * gaps[node]
         else:

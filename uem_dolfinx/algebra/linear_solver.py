@@ -191,6 +191,11 @@ class UnitedSolver:
         self.ksp.destroy()
         self.ksp = self._create_ksp()
 
+    def begin_step(self) -> None:
+        """Let what the united matrix has room for depend on this step alone."""
+        self._united.begin_step()
+        self._unsymmetric.begin_step()
+
     @contextmanager
     def _in_database(self, **instead: Any) -> Iterator[None]:
         """Show PETSc the options, some with another value; levels of a multigrid read theirs only when they are set up."""

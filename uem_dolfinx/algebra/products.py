@@ -45,6 +45,13 @@ class UnitedMatrix:
         self._filled: Ints = np.zeros(0, np.int64)
         #: Keys of the last product's entries, and of those of H.
         self._last: tuple[Ints, Ints] | None = None
+        #: Whether a step begins, and the keys that the matrix was made for when the last one did; None if it has grown since.
+        self._begins = False
+        self._made_from: Ints | None = None
+
+    def begin_step(self) -> None:
+        """Let no place depend on the steps before this one: a run that goes on from a checkpoint takes the same."""
+        self._begins = True
 
     def update(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> PETSc.Mat:
         """Give the matrix its values for this P and Q, with the diagonal of K in idle columns (collective)."""
@@ -52,19 +59,26 @@ class UnitedMatrix:
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
         csr = indptr, columns, values = K.getValuesCSR()
         if comm.allreduce(int(same)) < comm.size:
-            self._made_for, self.A, self._filled = (K, P.free), None, np.zeros(0, np.int64)
+            self._made_for, self.A, self._made_from = (K, P.free), None, None
             self._look(P.free, indptr, columns)
         taken, H = self._near(csr, P.united, K, curvature)
         product = _product(H, P.P, Q.P)
         *pattern, changes = product.getValuesCSR()
         keys = self._keys(*pattern), taken
-        if self.A is None or not self._fit(keys):
+        if self.A is None or self._begins or not self._fit(keys):
             wanted = np.union1d(*keys)
             if self.reserving:
                 more = _product(self._near(csr, P.nodes, K, curvature)[1], P.reserved, Q.reserved)
                 wanted = np.union1d(wanted, self._keys(*more.getValuesCSR()[:2]))
-            self._create(wanted, K, indptr, columns)
-            self._last = None
+            begins = self.A is None or self._begins
+            same = begins and self._made_from is not None and np.array_equal(self._made_from, wanted)
+            if comm.allreduce(int(same)) < comm.size:
+                if begins:
+                    self._filled = np.zeros(0, np.int64)
+                self._create(wanted, K, indptr, columns)
+                self._made_from = wanted if begins else None
+                self._last = None
+            self._begins = False
         if self._last is None or not all(map(np.array_equal, keys, self._last)):
             self._last = keys
             self._places, self._taken = (self._key_places[np.searchsorted(self._sorted, k)] for k in keys)

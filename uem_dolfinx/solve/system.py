@@ -358,6 +358,8 @@ class BodySystem:
     def differentiate(self, first: bool) -> None:
         """Tangent of the bodies and curvature of the contact at the present displacement (collective)."""
         forms.free_petsc_garbage(self.comm)
+        if first:
+            self.solver.begin_step()
         if first or self.newton == "full":
             self.forces.update_tangent()
         with timed("contact curvature"):
