@@ -38,7 +38,7 @@ def test_a_block_slides_at_mu_times_its_load(mu, rigid, degree, coupling):
         assert scene.contact.balance().force <= 1e-12
 
 
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("cell", [*CELLS[:-1], pytest.param("hexahedron", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rigid", [True, False])
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_friction_holds_a_block(cell, rigid, coupling):
@@ -57,14 +57,15 @@ def test_friction_holds_a_block(cell, rigid, coupling):
 
 def test_no_friction_is_the_contact_without():
     """A coefficient of zero, or one that is zero everywhere, leaves every bit as it is without friction."""
-    found = []
-    for how in ({}, {"friction": 0.0}, {"friction": lambda x: 0.0 * x[0]}):
-        scene = driven("quadrilateral", 0.0, how={})
-        scene = driven("quadrilateral", how.get("friction", 0.0))
-        scene.to(0.01, -0.02)
-        found.append(scene.problem.u.x.array.tobytes())
+    found, bits = [], set()
+    for mu in (None, 0.0, lambda x: 0.0 * x[0]):
+        scene = driven("quadrilateral", mu)
+        found.append(history(scene, (0.01, -0.02)))
+        bits.add(scene.problem.u.x.array.tobytes())
         assert type(scene.contact.pair) is uem.contact.pair.ContactPair
-    assert len(set(found)) == 1
+    assert all(np.abs(u - found[0]).max() <= 1e-12 * np.abs(found[0]).max() for u in found)
+    # ranks share out each mesh in its own way
+    assert scene.contact.config.comm.size > 1 or len(bits) == 1
 
 
 def test_what_sticks_does_not_move():
@@ -197,7 +198,7 @@ def test_space_is_the_plane_pulled_out():
     assert np.abs(space[:, high][:, :, [0, 2]] - plane[:, place[of]][:, high]).max() <= 1e-9
 
 
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("cell", ["triangle", pytest.param("hexahedron", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("angle, scale", [(0.7, 1.0), (0.0, 1e3), (2.5, 1e-3)])
 def test_pose_and_units(cell, angle, scale):
     """Turned, and drawn in other units, it is the same."""
@@ -274,7 +275,7 @@ def test_the_sign_of_the_determinant():
             system.end_step()
 
 
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize("cell", ["triangle", pytest.param("hexahedron", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rigid", [True, False])
 def test_going_on_from_a_checkpoint(cell, rigid, folder):
     """Written by one rank in the middle of a slide and read by all, a run goes on as if it had not stopped."""
