@@ -123,6 +123,8 @@ def coulomb(pair: FrictionalPair, length: float, force: float) -> None:
     assert highest(comm, (np.linalg.norm(tau, axis=1) - bound)[~trial.in_corner]) <= force
     assert highest(comm, np.linalg.norm(slip[stuck], axis=1)) <= length
     assert highest(comm, np.linalg.norm(tau + bound[:, None] * s, axis=1)[slipping]) <= force
+    # one without a direction would slip without friction
+    assert highest(comm, (bound - np.linalg.norm(tau, axis=1))[slipping & ~trial.in_corner]) <= force
     forward = np.einsum("ng,ng->n", slip, s)
     assert lowest(comm, forward[slipping]) >= -length
     sideways = np.linalg.norm(slip - forward[:, None] * s, axis=1)
