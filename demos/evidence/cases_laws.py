@@ -18,6 +18,7 @@ import uem_dolfinx as uem
 from evidence.cases import BALANCE, COMM, OVERLAP, BoxScene, Trial
 from evidence.scenes import Array
 from uem_dolfinx.contact.mortar import Mortar
+from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
@@ -85,22 +86,19 @@ def _mean_places(contact: uem.Contact) -> list[Place]:
     return [Place(float(gap), np.zeros((0, contact.config.gdim)), bool(np.isfinite(gap))) for gap in gaps]
 
 
-def _mean_normals(contact: uem.Contact) -> dict[int, Array]:
-    """Mean normals of the contactor's facets around each of this rank's contactors (collective)."""
-    pair, surface = contact.pair, contact.pair.coupling.surface
-    known = COMM.allgather((surface.nodes.ravel(), surface.normals().reshape(-1, contact.config.gdim)))
+def _normals_around(surface: TargetFacets) -> dict[int, Array]:
+    """Outward normals of a surface's facets around each of this rank's nodes ``(k, gdim)`` (collective)."""
+    config = surface.config
+    known = COMM.allgather((surface.nodes.ravel(), surface.normals().reshape(-1, config.gdim)))
     nodes, normals = (np.concatenate(part) for part in zip(*known))
-    sums = (normals[nodes == node].sum(axis=0) for node in contact.config.to_global(pair.nodes))
-    return {int(i): n / np.linalg.norm(n) for i, n in zip(pair.nodes, sums)}
-
-
-def _target_normals(contact: uem.Contact) -> dict[int, Array]:
-    """Inward normals of the target's facets around each of this rank's nodes, what mortar's forces lie along (collective)."""
-    facets = contact.pair.target.facets
-    known = COMM.allgather((facets.nodes.ravel(), -facets.normals().reshape(-1, contact.config.gdim)))
-    nodes, normals = (np.concatenate(part) for part in zip(*known))
-    own = contact.config.to_global(np.arange(contact.config.n_owned))
+    own = config.to_global(np.arange(config.n_owned))
     return {i: normals[nodes == node] for i, node in enumerate(own) if (nodes == node).any()}
+
+
+def _mean(normals: Array) -> Array:
+    """Unit vector along the mean of some normals ``(k, gdim)``."""
+    total = normals.sum(axis=0)
+    return np.asarray(total / np.linalg.norm(total))
 
 
 def _off_cone(normals: Array, force: Array) -> float:
@@ -113,7 +111,7 @@ def _off_line(normals: Array, force: Array) -> float:
 
     Pressures between the nodes of mortar may be negative, so that forces between facets that lean need not lie in their cone.
     """
-    mean = normals.sum(axis=0) / np.linalg.norm(normals.sum(axis=0))
+    mean = _mean(normals)
     spread = np.linalg.norm(normals - np.outer(normals @ mean, mean), axis=1).max()
     return max(0.0, float(np.linalg.norm(force - (force @ mean) * mean) - 2 * spread * np.linalg.norm(force)))
 
@@ -156,9 +154,8 @@ def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALAN
     inner = np.where(free & ~touching[:, None], r, 0.0)
     trial.check("equilibrium", COMM.allreduce(float(np.linalg.norm(inner, axis=1).sum())) / scale, supported)
     trial.check("overlap", overlap(scene, h), OVERLAP)
-    leans = {
-        i: n for contact in scene.contacts if isinstance(contact.pair.coupling, Mortar) for i, n in _mean_normals(contact).items()
-    }
+    averaged = [contact.pair for contact in scene.contacts if isinstance(contact.pair.coupling, Mortar)]
+    leans = {i: _mean(n) for pair in averaged for i, n in _normals_around(pair.coupling.surface).items()}
     astray = work = lost = 0.0
     for node in np.flatnonzero(contactor & ~target & free.all(axis=1)):
         if len(cone := np.concatenate(normals[node])):
@@ -169,12 +166,13 @@ def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALAN
             work += force * gaps[node]
         else:
             lost += force
-    for contact in scene.contacts:
-        if isinstance(contact.pair.coupling, Mortar) and contact.pair.target.n_nodes:
-            cones = _target_normals(contact)
-            astray += sum(_off_line(cones[i], r[i]) for i in cones if free[i].all() and not contactor[i])
-    mortar = any(isinstance(contact.pair.coupling, Mortar) for contact in scene.contacts)
-    trial.check("force off the normals", COMM.allreduce(astray) / scale, LEAN_AT_ENDS if mortar else BALANCE)
+    for pair in averaged:
+        if pair.target.n_nodes:
+            around = _normals_around(pair.target.facets)
+            astray += sum(_off_line(around[i], r[i]) for i in around if free[i].all() and not contactor[i])
+    ratios = [pair.placement.details.ratio for pair in averaged]
+    ends = COMM.allreduce(any(((ratio > 0) & (ratio < 1 - OVERLAP)).any() for ratio in ratios), op=MPI.LOR)
+    trial.check("force off the normals", COMM.allreduce(astray) / scale, LEAN_AT_ENDS if ends else BALANCE)
     trial.check("force times gap", COMM.allreduce(work) / (scale * h), OVERLAP)
     trial.check("force off the target", COMM.allreduce(lost) / scale, BALANCE)
     if meshed:

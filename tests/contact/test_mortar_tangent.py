@@ -78,9 +78,8 @@ def leaning(b, cell):
         disturbed(b, 2, 0.01)
 
 
-@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
-def test_rows_are_derivatives_of_the_gaps(cell, target):
-    """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
+def weighted_gap(cell, target):
+    """Of blocks that lean, above a mesh, above one that ends over a facet, or above a rigid ball."""
     b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
         "lower" if target == "end" else "upper"
     ))  # fmt: skip
@@ -88,7 +87,13 @@ def test_rows_are_derivatives_of_the_gaps(cell, target):
         b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
     problem = b.pressed()
     leaning(b, cell)
-    phi = WeightedGap(b, problem.system)
+    return WeightedGap(b, problem.system)
+
+
+@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+def test_rows_are_derivatives_of_the_gaps(cell, target):
+    """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
+    phi = weighted_gap(cell, target)
     phi.leave_out_ends()
     first = phi.forces(phi.start)
     for way, (ahead, behind), h in phi.ways(cell):
@@ -99,18 +104,11 @@ def test_rows_are_derivatives_of_the_gaps(cell, target):
 @pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
 def test_curvature_against_differences(cell, target):
     """Blocks of the curvature against central differences of what the rows hand on at constant multipliers."""
-    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
-        "lower" if target == "end" else "upper"
-    ))  # fmt: skip
-    if target == "ball":
-        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
-    problem = b.pressed()
-    leaning(b, cell)
-    phi = WeightedGap(b, problem.system)
+    phi = weighted_gap(cell, target)
     rows = phi.leave_out_ends()
     nodes, blocks = rows.points.curvature(phi.pressure)
     assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
-    index = (nodes[:, :, None] * b.g + np.arange(b.g)).reshape(len(nodes), -1)
+    index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
     for way, (ahead, behind), h in phi.ways(cell):
         measured = -(phi.forces(ahead) - phi.forces(behind)) / h
         told = np.zeros(len(phi.start))

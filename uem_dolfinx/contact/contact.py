@@ -274,7 +274,7 @@ class Contact:
         """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
         pair, areas = self.pair, self.pair.coupling.areas(self.pair.placement, self._areas)[:, None]
         tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
-        return self._vectors("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0))
+        return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
     @property
     def slip(self) -> fem.Function:
@@ -283,7 +283,7 @@ class Contact:
         It is zero without friction (collective).
         """
         state = self.pair.trial
-        return self._vectors("slip", 0.0 if state.friction is None else state.friction.slipped)
+        return self._field("slip", 0.0 if state.friction is None else state.friction.slipped, vector=True)
 
     @property
     def dissipation(self) -> float:
@@ -340,22 +340,15 @@ class Contact:
         n, g = self.config.n_owned, self.config.gdim
         return imbalance(self.config.comm, self.config.x[:n], self.force.x.array.reshape(-1, g)[:n])
 
-    def _field(self, what: str, values: npt.ArrayLike) -> fem.Function:
+    def _field(self, what: str, values: npt.ArrayLike, vector: bool = False) -> fem.Function:
+        config = self.config
         if what not in self._fields:
-            S = compat.function_space(self.config.mesh, self.config.degree)
-            self._fields[what] = fem.Function(S, name=_identifier(f"contact_{what}_{self.name}"))
+            space = config.V if vector else compat.function_space(config.mesh, config.degree)
+            self._fields[what] = fem.Function(space, name=_identifier(f"contact_{what}_{self.name}"))
         f = self._fields[what]
         f.x.array[:] = 0.0
-        f.x.array[self.pair.nodes] = values
-        f.x.scatter_forward()
-        return f
-
-    def _vectors(self, what: str, values: npt.ArrayLike) -> fem.Function:
-        if what not in self._fields:
-            self._fields[what] = fem.Function(self.config.V, name=_identifier(f"contact_{what}_{self.name}"))
-        f = self._fields[what]
-        f.x.array[:] = 0.0
-        f.x.array.reshape(-1, self.config.gdim)[self.pair.nodes] = values
+        table = f.x.array.reshape(-1, config.gdim) if vector else f.x.array
+        table[self.pair.nodes] = values
         f.x.scatter_forward()
         return f
 

@@ -78,6 +78,7 @@ class Covered:
         M: of their products ``(m, nn, nn)``.
         G: of their products with the gap ``(m, nn)``.
         N: of their products with the target's shape functions, pair by pair ``(k, nn, nt)``.
+        own: of their products with each other and with the gap, pair by pair ``(k, nn, nn + 1)``.
         full: of the functions over the whole facets ``(m, nn)``.
     """
 
@@ -86,6 +87,7 @@ class Covered:
     M: Array
     G: Array
     N: Array
+    own: Array
     full: Array
 
     @classmethod
@@ -102,10 +104,11 @@ class Covered:
         """
         s, m, k, nn = segments, len(size), len(facet), len(mean)
         weighted = s.weight[:, None] * b
-        parts = [weighted, (weighted[:, :, None] * b[:, None, :]).reshape(-1, nn * nn), weighted * s.gap[:, None]]
-        D, M, G = (add_up(facet[s.pair], part, m) for part in parts)
-        pairs = add_up(s.pair, (weighted[:, :, None] * N[:, None, :]).reshape(len(b), nn * N.shape[1]), k)
-        return cls(facet, D, M.reshape(m, nn, nn), G, pairs.reshape(k, nn, N.shape[1]), size[:, None] * mean)
+        own = add_up(s.pair, products(weighted, np.column_stack([b, s.gap])), k)
+        M, G = np.split(add_up(facet, own, m).reshape(m, nn, nn + 1), [nn], axis=2)
+        D = add_up(facet[s.pair], weighted, m)
+        pairs = add_up(s.pair, products(weighted, N), k).reshape(k, nn, N.shape[1])
+        return cls(facet, D, M, G[:, :, 0], pairs, own.reshape(k, nn, nn + 1), size[:, None] * mean)
 
 
 def add_up(place: Ints, values: Array, n: int) -> Array:
@@ -117,6 +120,11 @@ def add_up(place: Ints, values: Array, n: int) -> Array:
     return out
 
 
+def products(left: Array, right: Array) -> Array:
+    """Products of all columns of ``left (q, a)`` with all of ``right (q, b)``: ``(q, a b)``."""
+    return (left[:, :, None] * right[:, None, :]).reshape(len(left), left.shape[1] * right.shape[1])
+
+
 @dataclass(frozen=True)
 class Duals:
     """Dual functions of ``m`` facets.
@@ -126,6 +134,7 @@ class Duals:
         C: their integrals with the functions b ``(m, nn, nn)``.
         own: nodes with a dual function of their own, the foremost not among them ``(m, nn)``.
         foremost: node whose dual function makes their sum one ``(m,)``.
+        inverse: of the integrals of the functions' products; zero where no node has a function of its own ``(m, nn, nn)``.
         gap: coefficients of the gap's projection onto the functions b ``(m, nn)``.
     """
 
@@ -133,6 +142,7 @@ class Duals:
     C: Array
     own: Bools
     foremost: Ints
+    inverse: Array
     gap: Array
 
     def at_end(self, facet: Ints, b: Array, gap: Array) -> Array:
@@ -168,17 +178,16 @@ def dual_functions(covered: Covered, precedence: Array) -> Duals:
     row, foremost = np.arange(m), np.argmax(precedence, axis=1)
     # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
     own = kept & (np.arange(nn) != foremost[:, None])
-    A, mean = np.zeros((m, nn, nn)), np.zeros((m, nn))
+    A, inverse = np.zeros((2, m, nn, nn))
     some = np.flatnonzero(own.any(axis=1))
     if len(some):
         size = covered.D[some].sum(axis=1)
         # functions that are not kept take no part in the inverse but through their sum
-        inverse = np.linalg.pinv(covered.M[some] / size[:, None, None], hermitian=True)
-        A[some] = (covered.D[some] / size[:, None])[:, :, None] * inverse * own[some][:, :, None]
-        mean[some] = np.einsum("mij,mj->mi", inverse, covered.G[some] / size[:, None])
+        inverse[some] = np.linalg.pinv(covered.M[some] / size[:, None, None], hermitian=True) / size[:, None, None]
+        A[some] = covered.D[some][:, :, None] * inverse[some] * own[some][:, :, None]
     A[row, foremost] = 1.0 - A.sum(axis=1)
     C, j = np.zeros((m, nn, nn)), np.arange(nn)
     C[:, j, j] = np.where(own, covered.D, 0.0)
     C[row, foremost] = np.where(own, 0.0, covered.D)
     A[covered.D.sum(axis=1) <= 0.0] = 0.0
-    return Duals(A, C, own, foremost, mean)
+    return Duals(A, C, own, foremost, inverse, np.einsum("mij,mj->mi", inverse, covered.G))

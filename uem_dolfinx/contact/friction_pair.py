@@ -14,7 +14,7 @@ import numpy.typing as npt
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact import friction
-from uem_dolfinx.contact.active_set import GAP_ROUNDING, Wrong
+from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
@@ -53,12 +53,12 @@ class FrictionalPair(ContactPair):
         #: None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
         self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None] | None = None
         self._moved: Array = np.zeros((n, g))
-        #: Forces q and stiffnesses c that the directions of slip come from ``(n, gdim)``, ``(n,)``, and the forces tau ``(n, gdim)``.
         #: Contactors that have been let go of in the present linearised problem ``(n,)``, and what it foretells: forces and slips.
         self._released: Bools = np.zeros(n, dtype=bool)
         self._foreseen = np.zeros((n, g)), np.zeros((n, g))
         #: Friction that belongs to the forces last read or foreseen ``(n, gdim)``.
         self._told: Array = np.zeros((n, g))
+        #: Forces q and stiffnesses c that the directions of slip come from ``(n, gdim)``, ``(n,)``, and the forces tau ``(n, gdim)``.
         self._q, self._c, self._tau = np.zeros((n, g)), np.zeros(n), np.zeros((n, g))
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
@@ -183,26 +183,17 @@ class FrictionalPair(ContactPair):
         self.trial = self.committed = replace(self.trial, friction=replace(anchored, stick=stick))
         self.project()
 
-    def wrong(
-        self,
-        gap: Array,
-        lam: Array,
-        force: Array,
-        stiffness: Array,
-        force_rounding: Array,
-        gap_rounding: float,
-        swept: bool,
-        du: Array | None = None,
+    def _with_friction(
+        self, wrong: Wrong, lam: Array, stiffness: Array, force_rounding: Array, gap_rounding: float, du: Array | None
     ) -> Wrong:
         """Contactors that break the conditions of contact or friction; see ``ContactPair`` (collective)."""
-        found = super().wrong(gap, lam, force, stiffness, force_rounding, gap_rounding, swept)
         slip, tau = self.slip, self._rub().tau
         if du is not None:
             slip = slip + friction.along(self.tangents, self._relative(du, self.coupling.weights(self.placement)))
             tau = self._told
             self._foreseen = tau, slip
         return friction.find_wrong(
-            found,
+            wrong,
             replace(self._rub(), direction=self.directions),
             self.rubbing,
             self.mu,
@@ -211,7 +202,7 @@ class FrictionalPair(ContactPair):
             slip,
             stiffness,
             force_rounding=force_rounding,
-            gap_rounding=max(gap_rounding, GAP_ROUNDING * self.config.size),
+            gap_rounding=gap_rounding,
         )
 
     def exchange(self, wrong: Wrong) -> None:

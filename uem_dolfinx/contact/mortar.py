@@ -234,7 +234,8 @@ class Mortar(NodeToSurface):
         own, e, normal, A, C = at.nodes, at.facet, -at.planes.normal, at.duals.A, at.duals.C
         coefficients = C @ self.basis.T
         on_facet = coefficients[:, :, :, None] * normal[:, None, None]
-        on_target = (A[e] @ at.covered.N)[..., None] * normal[e][:, None, None]
+        followed = (A[e] @ at.covered.N)[..., None]
+        on_target = followed * normal[e][:, None, None]
         area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", A, at.covered.G)
         f, i = np.nonzero(area > 0)
         values = np.column_stack([on_facet[f, i, i], gap[f, i], area[f, i, None] * normal[f]])
@@ -265,7 +266,7 @@ class Mortar(NodeToSurface):
             whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
             means = [
                 terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
-                terms_of(own[e], at.opposite, (A[e] @ at.covered.N)[..., None]),
+                terms_of(own[e], at.opposite, followed),
             ]
             r, t, w = self._elimination.at_owners(means, np.where(is_covered, whole, 1.0))
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
@@ -342,9 +343,8 @@ class Mortar(NodeToSurface):
         force = np.asarray(self.config.add_at_owners(nodes, values)[self.nodes])
         return mu / by * rows.share, np.einsum("ng,ng->n", force, rows.equations.direction), force
 
-    def _handed_on(self, equations: UnitingEquations, mu: Array) -> tuple[Ints, Array]:
+    def _handed_on(self, eq: UnitingEquations, mu: Array) -> tuple[Ints, Array]:
         """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
-        eq = equations
         own, terms = mu != 0, mu[eq.row] != 0
         nodes = np.concatenate([self.config.to_global(self.nodes[own]), eq.followed[terms]])
         return nodes, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])

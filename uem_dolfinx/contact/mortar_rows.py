@@ -17,7 +17,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import Exchange
 
 #: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
-#: little is covered there, far from the target, and the end of what is covers moves faster than the contactor.
+#: little is covered there, far from the target, and the end of what covers it moves faster than the contactor.
 #: [heuristic; part of the component; -]
 MOSTLY_OWN = 0.5
 

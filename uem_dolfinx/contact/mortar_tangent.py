@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.contact.duals import Covered, Duals, add_up, basis_of
+from uem_dolfinx.contact.duals import Covered, Duals, add_up, basis_of, products
 from uem_dolfinx.contact.segment_motions import (
     Motions,
     Sides,
@@ -115,16 +115,14 @@ class SegmentPoints:
             # the same all over a pair
             tilt = np.zeros((k, g))
             tilt[s.pair] = self.tilt
-            own, gap = np.split(
-                add_up(s.pair, _products(weighted, np.column_stack([self.phi, s.gap])), k).reshape(k, nc, nc + 1), [nc], axis=2
-            )
+            own, gap = np.split(self.covered.own, [nc], axis=2)
             on_facet = add_up(e, (own[..., None] * tilt[:, None, None]).reshape(k, nc * nc * g), m).reshape(m, nc, nc * g)
             on_target = (self.covered.N[..., None] * tilt[:, None, None]).reshape(k, nc, nt * g)
             vector = vector + add_up(e, (gap * tilt[:, None]).reshape(k, nc * g), m).reshape(m, nc, g)
         else:
-            lean = _products(weighted, self.tilt)
-            on_facet = add_up(e[s.pair], _products(lean, self.phi), m).reshape(m, nc, g, nc).swapaxes(2, 3).reshape(m, nc, nc * g)
-            on_target = add_up(s.pair, _products(lean, self.N), k).reshape(k, nc, g, nt).swapaxes(2, 3).reshape(k, nc, nt * g)
+            lean = products(weighted, self.tilt)
+            on_facet = add_up(e[s.pair], products(lean, self.phi), m).reshape(m, nc, g, nc).swapaxes(2, 3).reshape(m, nc, nc * g)
+            on_target = add_up(s.pair, products(lean, self.N), k).reshape(k, nc, g, nt).swapaxes(2, 3).reshape(k, nc, nt * g)
             if nt:
                 vector = vector + add_up(e[s.pair], lean * s.gap[:, None], m).reshape(m, nc, g)
         # with the area, and on a mesh with the direction, of what is not closed
@@ -263,7 +261,7 @@ class SegmentPoints:
         fore = pressure[e, self.duals.foremost[e]]
         more = np.where(self.duals.own[e], pressure[e] - fore[:, None], 0.0)
         A, D, size, mean, b = self.duals.A[e], self.covered.D[e], self.planes.size[e], self.duals.gap[e], sides.b
-        inverse = np.linalg.pinv(self.covered.M[e] / size[:, None, None], hermitian=True) / size[:, None, None]
+        inverse = self.duals.inverse[e]
         # quadratic functions' differences are derivatives
         forward = np.sign(np.einsum("qg,qg->q", sides.outward, self.x[e, 1] - self.x[e, 0])) / size
         ahead, behind = (basis_of(self.shape).at(sides.xi + half) for half in (0.5, -0.5))
@@ -276,7 +274,7 @@ class SegmentPoints:
         mean_slope = np.einsum("qb,qb->q", b_s, mean) + bc * left
         h_s = b_s * mean + (b * c + psi_s) * left[:, None] + psi * (sides.slope - mean_slope)[:, None]
         h_s = fore * sides.slope + np.einsum("qj,qj->q", more, h_s)
-        h = fore * sides.gap + np.einsum("qj,qj->q", more, b * mean + psi * left[:, None])
+        h = np.einsum("qj,qj->q", pressure[e], self.duals.at_end(e, b, sides.gap))
         # changes of h with the gap at the end, and with its projection
         with_gap = fore + np.einsum("qj,qj->q", more, psi)
         with_mean = more * b - np.einsum("qj,qj->q", more, psi)[:, None] * b
@@ -354,8 +352,3 @@ class SegmentPoints:
         return Sides(
             pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone
         )
-
-
-def _products(left: Array, right: Array) -> Array:
-    """Products of all columns of ``left (q, a)`` with all of ``right (q, b)``: ``(q, a b)``."""
-    return (left[:, :, None] * right[:, None, :]).reshape(len(left), left.shape[1] * right.shape[1])

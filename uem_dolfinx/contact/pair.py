@@ -206,7 +206,6 @@ class ContactPair:
         self,
         gap: Array,
         lam: Array,
-        force: Array,
         stiffness: Array,
         force_rounding: Array,
         gap_rounding: float,
@@ -218,7 +217,6 @@ class ContactPair:
         Args:
             gap: that decides on contact ``(n,)``.
             lam: force along the normal that decides on contact ``(n,)``.
-            force: on the contactors ``(n, gdim)``.
             stiffness: of the contactors along the normal ``(n,)``.
             force_rounding: forces below it are zero ``(n,)``.
             gap_rounding: gaps below it are zero, and below rounding of positions.
@@ -232,16 +230,17 @@ class ContactPair:
         apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
         # the facets of a corner are let go of one by one, which ``follow`` does
         pulled = np.where(self.trial.in_corner, 0.0, lam)
-        return active_set.find_wrong(
-            self.trial,
-            gap,
-            pulled,
-            off,
-            self.movable & ~apart,
-            stiffness,
-            force_rounding=force_rounding,
-            gap_rounding=max(gap_rounding, active_set.GAP_ROUNDING * self.config.size),
+        rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
+        wrong = active_set.find_wrong(
+            self.trial, gap, pulled, off, self.movable & ~apart, stiffness, force_rounding=force_rounding, gap_rounding=rounding
         )
+        return self._with_friction(wrong, lam, stiffness, force_rounding, rounding, du)
+
+    def _with_friction(
+        self, wrong: active_set.Wrong, lam: Array, stiffness: Array, force_rounding: Array, gap_rounding: float, du: Array | None
+    ) -> active_set.Wrong:
+        """Those that break the conditions of contact and those that break the ones of friction; arguments as of ``wrong`` (collective)."""
+        return wrong
 
     def exchange(self, wrong: active_set.Wrong) -> None:
         """Let wrong contactors change sides (collective)."""

@@ -171,10 +171,7 @@ class BodySystem:
                     pair.place_again()
             here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
             wrong = self._count(
-                [
-                    pair.wrong(pair.gap, pair.trial.lam, pair.trial.force, self._along(pair), least, 0.0, self._swept)
-                    for pair, least in here
-                ]
+                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), least, 0.0, self._swept) for pair, least in here]
             )
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
@@ -242,10 +239,10 @@ class BodySystem:
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
             wrong = []
-            for pair, gap, (lam, _, force) in zip(self.pairs, foreseen, forces):
+            for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, lam, force, along, least, near, self._swept, moved))
+                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept, moved))
             count = self._count(wrong)
             if not count and sliding is not None:
                 raise FrictionError(
