@@ -23,8 +23,9 @@ from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
 AS_NEAR = 1e-3
-#: Where a mesh ends over a facet, mortar's forces lean by the gap there over the size of the facet: they have a potential.
-LEAN_AT_ENDS = 1e-2
+#: Forces of mortar have a potential. Where a mesh ends over a facet they lean by the gap there over the size of the facet, and between
+#: facets that lean they also act on the neighbours of the node that touches, by the gap and the lean over the size.
+LEAN = 1e-2
 #: A contactor that is past the end of the target by less than this part of an element may still bear on the end.
 PAST_END = 0.1
 
@@ -106,14 +107,27 @@ def _off_cone(normals: Array, force: Array) -> float:
     return float(nnls(normals.T, force)[1])
 
 
-def _off_line(normals: Array, force: Array) -> float:
+def _forces_around(surface: TargetFacets, forces: Array) -> dict[int, float]:
+    """The largest of this rank's ``forces (n, gdim)``, and the others', at the nodes of the facets around each (collective)."""
+    config = surface.config
+    own = config.to_global(np.arange(config.n_owned))
+    sizes = np.zeros(config.index_map.size_global)
+    sizes[own] = np.linalg.norm(forces, axis=1)
+    sizes = np.asarray(COMM.allreduce(sizes))
+    facets = np.concatenate(COMM.allgather(surface.nodes))
+    at = [(facets == node).any(axis=1) for node in own]
+    return {i: float(sizes[facets[which]].max()) for i, which in enumerate(at) if which.any()}
+
+
+def _off_line(normals: Array, force: Array, largest: float) -> float:
     """What a force has across the mean of some normals ``(k, gdim)``, but for what these differ by from each other.
 
-    Pressures between the nodes of mortar may be negative, so that forces between facets that lean need not lie in their cone.
+    Pressures between the nodes of mortar may be negative, so that forces between facets that lean need not lie in their cone, and
+    those of two facets may cancel but for their lean: this goes by the ``largest`` force on the facets.
     """
     mean = _mean(normals)
     spread = np.linalg.norm(normals - np.outer(normals @ mean, mean), axis=1).max()
-    return max(0.0, float(np.linalg.norm(force - (force @ mean) * mean) - 2 * spread * np.linalg.norm(force)))
+    return max(0.0, float(np.linalg.norm(force - (force @ mean) * mean) - 2 * spread * largest))
 
 
 def overlap(scene: BoxScene, h: float) -> float:
@@ -168,12 +182,13 @@ def check_laws(trial: Trial, scene: BoxScene, h: float, supported: float = BALAN
             lost += force
     for pair in averaged:
         if pair.target.n_nodes:
-            around = _normals_around(pair.target.facets)
-            astray += sum(_off_line(around[i], r[i]) for i in around if free[i].all() and not contactor[i])
+            facets = pair.target.facets
+            around, largest = _normals_around(facets), _forces_around(facets, r)
+            astray += sum(_off_line(around[i], r[i], largest[i]) for i in around if free[i].all() and not contactor[i])
     ratios = [pair.placement.details.ratio for pair in averaged]
     ends = COMM.allreduce(any(((ratio > 0) & (ratio < 1 - OVERLAP)).any() for ratio in ratios), op=MPI.LOR)
-    trial.check("force off the normals", COMM.allreduce(astray) / scale, LEAN_AT_ENDS if ends else BALANCE)
-    trial.check("force times gap", COMM.allreduce(work) / (scale * h), OVERLAP)
+    trial.check("force off the normals", COMM.allreduce(astray) / scale, LEAN if ends else BALANCE)
+    trial.check("force times gap", COMM.allreduce(work) / (scale * h), LEAN if averaged else OVERLAP)
     trial.check("force off the target", COMM.allreduce(lost) / scale, BALANCE)
     if meshed:
         _action_and_reaction(trial, scene, r, touching, free, scale)

@@ -9,7 +9,7 @@ nearer, and corners whose facets do not face it, have the equation of a node aga
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from mpi4py import MPI
 
@@ -25,11 +25,12 @@ from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.node_to_surface import NEAR, NodeToSurface
 from uem_dolfinx.contact.segment_motions import slopes
 from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.valleys import MOST_CHANGES, with_averaged_normals
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.opposite import FACING, find_opposite
 from uem_dolfinx.geometry.overlaps import Planes, Segments, overlap
-from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
@@ -76,8 +77,9 @@ class Mortar(NodeToSurface):
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
         self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
-        #: The last search that rows were made from, and these; a search finds the same object as long as nothing moves.
-        self._united: tuple[Projection, WeightedRows] | None = None
+        #: The last search that rows were made from, the contactors with averaged normals, and the rows; a search finds the same object
+        #: as long as nothing moves.
+        self._united: tuple[Projection, Bools, WeightedRows] | None = None
         #: Rows that a contact with small or fixed sliding keeps.
         self._kept: WeightedRows | None = None
         #: Motion of a rigid target when they were made.
@@ -88,10 +90,12 @@ class Mortar(NodeToSurface):
     def place(self, points: Array, state: PairState) -> Placement:
         """Project contactors and find the segments of their facets (collective); see ``Coupling``."""
         if self.sliding == "finite":
-            nearest = self._nearest(points)
-            if self._united is None or self._united[0] is not nearest:
-                self._united = nearest, self._unite(nearest, points)
-            rows = self._united[1]
+            nearest, locked = self._nearest(points), state.changes >= MOST_CHANGES
+            same = self._united is not None and self._united[0] is nearest and np.array_equal(self._united[1], locked)
+            if self._united is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+                placed = with_averaged_normals(nearest, locked, points) if self.target.faceted else nearest
+                self._united = nearest, locked, self._unite(placed, points)
+            rows = self._united[2]
         elif self._kept is None:
             nearest = self._anchor = self.target.project(points)
             rows = self._kept = self._unite(nearest, points)
@@ -109,6 +113,14 @@ class Mortar(NodeToSurface):
     def returned(self, placement: Placement, points: Array, state: PairState, gap: Array) -> Placement:
         """Nothing is returned."""
         return placement
+
+    def change_facets(self, placement: Placement, points: Array, state: PairState) -> tuple[Placement, PairState, bool]:
+        """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here."""
+        if not (self.target.faceted and self.sliding == "finite"):
+            return placement, state, False
+        number = cast("FacetProjection", placement.projection).facet
+        moved = state.active & ~placement.details.covered & (state.facet >= 0) & (state.facet != number)
+        return placement, replace(state, facet=number, changes=state.changes + moved), False
 
     def return_vectors(self, placement: Placement, points: Array, state: PairState) -> Array:
         """Weighted gaps are closed by the linear solve."""

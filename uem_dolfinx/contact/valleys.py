@@ -58,11 +58,7 @@ class Valleys:
         Returns:
             The projection, and the corners that hold contactors, None if no rank has any.
         """
-        nearest = cast("FacetProjection", nearest)
-        locked = state.changes >= MOST_CHANGES
-        gap = np.einsum("ng,ng->n", nearest.averaged, points - nearest.foot)
-        normal = np.where(locked[:, None], nearest.averaged, nearest.normal)
-        projection = replace(nearest, normal=normal, gap=np.where(locked, gap, nearest.gap))
+        projection = with_averaged_normals(nearest, state.changes >= MOST_CHANGES, points)
         held = np.flatnonzero(state.in_corner)
         c = self._corners_of(state, points, held, state.held[held])
         if c is None:
@@ -171,6 +167,13 @@ class Valleys:
         asked = np.arange(self.config.gdim) < c.count[:, None]
         A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
         return (np.linalg.svd(A, compute_uv=False) > FREE_ENOUGH).sum(axis=1) == c.count
+
+
+def with_averaged_normals(nearest: Projection, which: Bools, points: Array) -> FacetProjection:
+    """The projection with averaged normals for some contactors ``(n,)`` at ``points (n, gdim)``."""
+    p = cast("FacetProjection", nearest)
+    gap = np.einsum("ng,ng->n", p.averaged, points - p.foot)
+    return replace(p, normal=np.where(which[:, None], p.averaged, p.normal), gap=np.where(which, gap, p.gap))
 
 
 def _moved_up(facets: Ints) -> Ints:

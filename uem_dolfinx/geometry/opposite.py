@@ -17,7 +17,7 @@ from uem_dolfinx.parallel import Exchange
 
 #: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
 #: [convention; cosine; test_overlaps.py::test_facets_that_face_each_other]
-FACING = 0.75
+FACING = 0.6
 
 
 @dataclass(frozen=True)
