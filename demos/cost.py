@@ -36,6 +36,7 @@ args = common.arguments(
     cg="20000,100000,500000,1000000",
     stiffness="1,0.01,0.0001,100,10000",
     amg=("best", "hypre", "gamg"),
+    coupling=("node_to_surface", "mortar"),
     runs=1,
 )
 #: Timers of what contact adds, and of what there is without it; some hold others.
@@ -90,7 +91,8 @@ class Hertz:
         contacts = []
         if contact:
             sliding = "finite" if finite else "small"
-            contacts = [uem.Contact(contactor=self.tags[self.surface], target=self.tags["block_top"], sliding=sliding)]
+            contactor, target = self.tags[self.surface], self.tags["block_top"]
+            contacts = [uem.Contact(contactor=contactor, target=target, sliding=sliding, coupling=args.coupling)]
         else:
             weight = np.array([0.0] * (dim - 1) + [-1e3])
             F = F - ufl.inner(fem.Constant(self.mesh, weight), v) * ufl.dx
@@ -210,7 +212,7 @@ for dim in sorted({r["dim"] for r in rows}):
             for name in ("uncontacted_seconds", "contact_seconds")
         }
         growth.append({"dim": dim} | slopes)
-common.report(args, {"machine": machine(), "sizes": rows, "cg": cg, "growth": growth})
+common.report(args, {"machine": machine(), "coupling": args.coupling, "sizes": rows, "cg": cg, "growth": growth})
 
 # %% [markdown]
 # ## Where the time goes

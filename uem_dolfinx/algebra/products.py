@@ -132,8 +132,13 @@ class UnitedMatrix:
     def _fit(self, keys: tuple[Ints, Ints]) -> bool:
         """Whether there are places for entries of these keys (collective)."""
         same = self._last is not None and all(map(np.array_equal, keys, self._last))
-        fits = same or all(np.isin(k, self._sorted).all() for k in keys)
+        fits = same or all(map(self._known, keys))
         return bool(self.config.comm.allreduce(int(fits)) == self.config.comm.size)
+
+    def _known(self, keys: Ints) -> bool:
+        """Whether all keys are among the sorted ones."""
+        at = np.searchsorted(self._sorted, keys)
+        return bool((at < len(self._sorted)).all()) and np.array_equal(self._sorted[at], keys)
 
     def _create(self, keys: Ints, K: PETSc.Mat, indptr: Ints, columns: Ints) -> None:
         """Make the matrix, with the entries of K and those of ``keys`` (collective)."""

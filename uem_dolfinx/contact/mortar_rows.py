@@ -155,11 +155,12 @@ def terms_of(rows: Ints, followed: Ints, values: Array, which: Bools | bool = Tr
 def add_up_terms(*parts: Terms) -> Terms:
     """Terms of several lists, those of the same row and node added up."""
     row, term, value = (np.concatenate(part) for part in zip(*parts))
-    order = np.lexsort((term, row))
-    row, term, value = row[order], term[order], value[order]
     if not len(row):
         return row, term, value
-    first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(term, prepend=-1) != 0))
+    key = row * (term.max() + 1) + term
+    order = np.argsort(key, kind="stable")
+    row, term, value = row[order], term[order], value[order]
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
     return row[first], term[first], np.add.reduceat(value, first, axis=0)
 
 

@@ -134,12 +134,15 @@ def overlap(planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[F
     """
     (shape, x), (other, y) = contactor, target
     own, its = planes.coordinates(x), planes.coordinates(y)
+    meet = ((own.min(axis=1) < its.max(axis=1)) & (its.min(axis=1) < own.max(axis=1)))[:, :-1].all(axis=1)
+    pair = np.flatnonzero(meet)
+    planes, own, its, sign = planes.take(pair), own[pair], its[pair], sign[pair]
     rule = quadrature(shape, _affine(shape, own[:, :, :-1]) and _affine(other, its[:, :, :-1]))
     place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, (shape, own), (other, its), sign, rule)
     xi, eta = locate(shape, own[place, :, :-1], at), locate(other, its[place, :, :-1], at)
     height = np.einsum("qa,qa->q", other.functions(eta), its[place, :, -1])
     height -= np.einsum("qa,qa->q", shape.functions(xi), own[place, :, -1])
-    return Segments(place, xi, eta, weight, height)
+    return Segments(pair[place], xi, eta, weight, height)
 
 
 def _intervals(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
@@ -200,10 +203,14 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     drop = inside_by - beyond_by
     part = inside_by / np.where(crosses, drop, 1.0)
     met = corners + part[..., None] * (following - corners)
-    every = np.stack([corners, met], axis=2).reshape(m, 2 * k, 2)
-    kept = np.stack([real & inside, crosses], axis=2).reshape(m, 2 * k)
-    order = np.argsort(~kept, axis=1, kind="stable")[:, : k + 1]
-    return np.take_along_axis(every, order[..., None], axis=1), kept.sum(axis=1)
+    kept = np.stack([real & inside, crosses], axis=2)
+    polygon, corner, which = np.nonzero(kept)
+    count = kept.sum(axis=(1, 2))
+    place = np.arange(len(polygon)) - np.repeat(np.cumsum(count) - count, count)
+    # convex polygons get one more at most, those that rounding has bent may get others
+    left = np.zeros((m, max(k + 1, int(count.max(initial=0))), 2))
+    left[polygon, place] = np.where(which[:, None] == 0, corners[polygon, corner], met[polygon, corner])
+    return left, count
 
 
 def _areas(corners: Array, count: Ints) -> Array:

@@ -302,7 +302,7 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
 def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) -> tuple[Ints, Ints]:
     """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facets' middles ``(m, gdim)``, m > 0, that may meet.
 
-    There is a tree for each class of facets of like radius.
+    There is a tree for each class of balls of like radius on either side.
 
     Args:
         points: middles of the first.
@@ -312,12 +312,21 @@ def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) 
     """
     from scipy.spatial import cKDTree
 
-    size_class = np.floor(np.log2(radius / radius.max()))
     rows, facets = [], []
-    for c in np.unique(size_class):
-        members = np.flatnonzero(size_class == c)
-        hits = cKDTree(middle[members]).query_ball_point(points, within + radius[members].max(), return_sorted=False)
-        counts = np.fromiter((len(h) for h in hits), np.int64, len(points))
-        rows.append(np.repeat(np.arange(len(points)), counts))
-        facets.append(members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])])
+    smallest = radius.min()
+    theirs = [(which, cKDTree(middle[which]), radius[which].max()) for which in _like(radius)]
+    for own in _like(np.maximum(within, smallest)):
+        tree, largest = cKDTree(points[own]), within[own].max()
+        for which, other, r in theirs:
+            found = tree.sparse_distance_matrix(other, largest + r, output_type="ndarray")
+            i, f = own[found["i"]], which[found["j"]]
+            near = found["v"] <= within[i] + r
+            rows.append(i[near])
+            facets.append(f[near])
     return np.concatenate(rows), np.concatenate(facets)
+
+
+def _like(sizes: Array) -> list[Ints]:
+    """Indices of positive sizes in classes that differ by less than a factor of two."""
+    size_class = np.floor(np.log2(sizes / sizes.max(initial=0.0)))
+    return [np.flatnonzero(size_class == c) for c in np.unique(size_class)]
