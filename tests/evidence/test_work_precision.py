@@ -161,6 +161,15 @@ def test_table_tells_who_is_first():
     assert broken["smallest error"] == "failed"
 
 
+def test_times_for_the_same_error_are_interpolated():
+    """Times that grow like 1/error^2, and one method's alone that ends at a larger error."""
+    ours = [point("a", "united", 1e-4 / e**2, e) for e in (0.04, 0.02, 0.01)]
+    theirs = [point("a", "penalty", 4e-4 / e**2, e, 10.0) for e in (0.05, 0.015)] + [point("a", "penalty", 9.0, 0.02, 1.0)]
+    (row,) = measure.at_equal_error([*theirs, *ours, point("a", "broken", None, None), point("b", "united", 1.0, 0.1)])
+    assert list(row) == ["scene", "error", "united", "penalty"] and row["error"] == 0.015
+    assert row["united"] == pytest.approx(1e-4 / 0.015**2) and row["penalty"] == pytest.approx(4e-4 / 0.015**2)
+
+
 def test_answers_that_are_less_accurate_decide_nothing():
     some = [point("a", "united", 2.0, 5e-4) | {"reference": 2e-3}]
     (row,) = measure.at_a_glance(some)
