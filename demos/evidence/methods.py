@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     import ufl
     from dolfinx import fem
+    from petsc4py import PETSc
 
 #: Every method, the package itself first.
 METHODS = ("united", "mortar", "penalty", "penalty_surface", "lagrange", "augmented", "barrier")
@@ -84,22 +85,35 @@ def counts(steps: Iterable[uem.LoadStep]) -> tuple[int, int]:
 
 
 def condition_number(problem: uem.UnitedProblem) -> float:
-    """Largest over smallest magnitude of the eigenvalues of the last linear system (serial).
+    """Largest over smallest magnitude of the eigenvalues of the last linear system (serial)."""
+    largest, smallest = extreme_eigenvalues(problem)
+    return largest / smallest
+
+
+def extreme_eigenvalues(problem: uem.UnitedProblem) -> tuple[float, float]:
+    """Largest and smallest magnitude of the eigenvalues of the last linear system (serial).
 
     Idle unknowns are left out; the equations of a saddle point are scaled by the mean diagonal of K.
     """
     system = problem.system
-    matrix = system.saddle if isinstance(system, LagrangeSystem) else system.solver.A
-    indptr, columns, values = matrix.getValuesCSR()
-    A = csr_matrix((values, columns, indptr), shape=matrix.getSize())
-    off = A - diags(A.diagonal())
-    idle = (
-        np.abs(off).sum(axis=1).A1 if hasattr(np.abs(off).sum(axis=1), "A1") else np.asarray(np.abs(off).sum(axis=1)).ravel()
-    ) == 0
+    A = _sparse(system.saddle if isinstance(system, LagrangeSystem) else system.solver.A)
+    idle = np.asarray(np.abs(A - diags(A.diagonal())).sum(axis=1)).ravel() == 0
     A = A[~idle][:, ~idle].tocsc()
-    start = np.random.default_rng(0).standard_normal(A.shape[0])
     solver = splu(A)
-    inverse = LinearOperator(A.shape, matvec=solver.solve)
-    largest = eigsh(A, k=1, which="LM", return_eigenvectors=False, v0=start, tol=1e-6)
-    smallest = eigsh(inverse, k=1, which="LM", return_eigenvectors=False, v0=start, tol=1e-6)
-    return float(abs(largest[0]) * abs(smallest[0]))
+    return _largest(A), 1 / _largest(LinearOperator(A.shape, matvec=solver.solve))
+
+
+def largest_without_contact(problem: uem.UnitedProblem) -> float:
+    """Largest eigenvalue of the last tangent of the bodies alone (serial)."""
+    return _largest(_sparse(problem.system.forces.tangent.K))
+
+
+def _sparse(matrix: PETSc.Mat) -> csr_matrix:
+    indptr, columns, values = matrix.getValuesCSR()
+    return csr_matrix((values, columns, indptr), shape=matrix.getSize())
+
+
+def _largest(A: csr_matrix | LinearOperator) -> float:
+    """Largest magnitude of the eigenvalues."""
+    start = np.random.default_rng(0).standard_normal(A.shape[0])
+    return float(abs(eigsh(A, k=1, which="LM", return_eigenvectors=False, v0=start, tol=1e-6)[0]))

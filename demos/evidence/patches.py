@@ -71,17 +71,19 @@ def strict_error(u: fem.Function, stress: Any, p: float, E: float, nu: float) ->
     return float(max(common.comm.allgather(max(np.abs(f.x.array).max(initial=0.0) for f in found))))
 
 
-def merged_condition(n: int, degree: int, E: float, nu: float) -> float:
-    """Condition number of one body of the shape of both, on rollers at its bottom and its sides (2D, serial)."""
-    domain = mesh.create_rectangle(common.comm, [[0.0, 0.0], [1.0, 2.0]], [n, 2 * n])
-    V = uem.function_space(domain, degree, (2,))
+def smallest_in_one_piece(dim: int, n: int, degree: int, E: float, nu: float) -> float:
+    """Smallest eigenvalue of one body of the shape of both, with n cells along its sides, on rollers at its bottom and its sides."""
+    corners = [[0.0] * dim, [1.0] * (dim - 1) + [2.0]]
+    make = mesh.create_rectangle if dim == 2 else mesh.create_box
+    domain = make(common.comm, corners, [n] * (dim - 1) + [2 * n])
+    V = uem.function_space(domain, degree, (dim,))
     u, v = fem.Function(V), ufl.TestFunction(V)
-    F = uem.LinearElastic(E, nu, kind="plane_strain").residual(u, v) * ufl.dx + v[1] * ufl.ds
-    sides = ((1, lambda x: x[1] < 1e-9), (0, lambda x: np.abs(x[0] - 0.5) > 0.5 - 1e-9))
+    material = uem.LinearElastic(E, nu, kind="plane_strain" if dim == 2 else "3d")
+    F = material.residual(u, v) * ufl.dx + v[dim - 1] * ufl.ds
     bcs = []
-    for i, where in sides:
-        facets = mesh.locate_entities_boundary(domain, 1, where)
-        bcs.append(uem.dirichlet(V, facets, i))
+    for i in range(dim):
+        sides = mesh.locate_entities_boundary(domain, dim - 1, lambda x, i=i: (x[i] < 1e-9) | ((x[i] > 1 - 1e-9) & (i < dim - 1)))
+        bcs.append(uem.dirichlet(V, sides, i))
     problem = uem.UnitedProblem(F, u, bcs=bcs)
     problem.solve()
-    return methods.condition_number(problem)
+    return methods.extreme_eigenvalues(problem)[1]
