@@ -13,7 +13,7 @@ from helpers import blocks, gathered_matrix, gathered_vector
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.algebra.linear_solver import UnitedSolver, default_options
+from uem_dolfinx.algebra.linear_solver import UnitedSolver, default_options, is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
 
@@ -99,6 +99,27 @@ def test_chains_of_any_length(comm, length):
 @pytest.mark.parametrize("size, gdim, direct", [(100_000, 2, True), (900_000, 2, False), (10_000, 3, True), (90_000, 3, False)])
 def test_direct_solvers_up_to(size, gdim, direct):
     assert default_options(size, gdim)["ksp_type"] == ("preonly" if direct else "cg")
+
+
+@pytest.mark.parametrize("part, symmetric", [(0.0, True), (3e-12, True), (3e-11, False)])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
+def test_what_counts_as_symmetric(comm, part, symmetric, scale):
+    """One entry of a stiffness that differs from the one across, in any unit of force, and of each unknown."""
+    V = blocks(comm, "triangle", 5, 5, gap=0.5).V
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a = forms.form((ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) + ufl.div(u) * ufl.div(v)) * ufl.dx)
+    K = forms.create_matrix(a)
+    forms.assemble_matrix(K, a)
+    row = K.getOwnershipRange()[0]
+    if comm.rank == comm.size - 1:
+        column = next(int(c) for c in K.getRow(row)[0] if c > row)
+        K.setValue(row, column, part * np.sqrt(K.getValue(row, row) * K.getDiagonal().array_r[column - row]), addv=True)
+    K.assemble()
+    units = K.createVecLeft()
+    units.array[:] = 10.0 ** (np.arange(units.local_size) % 7)
+    K.diagonalScale(units, units)
+    K.scale(scale)
+    assert is_symmetric(K) == symmetric
 
 
 def near_null_space(config):

@@ -41,6 +41,9 @@ KEPT_SLOWER = 2.0
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 #: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+#: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
+#: [convention; entries; test_thresholds_algebra.py::test_what_counts_as_symmetric]
+SYMMETRIC = 1e-11
 #: Types of PC that cannot see contactors much stiffer than their targets.
 MULTIGRID = ("hypre", "gamg", "ml")
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
@@ -63,10 +66,15 @@ def has_mumps() -> bool:
 
 
 def default_options(size: int, gdim: int) -> dict[str, Any]:
-    """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG."""
+    """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG.
+
+    MUMPS pivots in LDL' as well, PETSc's own Cholesky does not.
+    """
     if size > DIRECT_UP_TO[gdim]:
         return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
-    return {"ksp_type": "preonly", "pc_type": "lu"} | ({"pc_factor_mat_solver_type": "mumps"} if has_mumps() else {})
+    if has_mumps():
+        return {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
+    return {"ksp_type": "preonly", "pc_type": "lu"}
 
 
 def multigrid_options(amg: str = "") -> dict[str, Any]:
@@ -165,8 +173,8 @@ class UnitedSolver:
         #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
         self._made_with: UnitingEquations | None = None
         self._first_pace = self._pace = 0.0
-        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC that the options ask for.
-        self._symmetric = True
+        #: Whether the KSP is for symmetric matrices, whether Q is not P, and the types of KSP and PC that the options ask for.
+        self._symmetric, self._apart = True, False
         self._types = self.ksp.getType(), self.pc.getType()
 
     def _create_ksp(self) -> PETSc.KSP:
@@ -226,15 +234,16 @@ class UnitedSolver:
         """Build ``Q'(K + curvature)P`` and give it to the KSP (collective).
 
         ``restriction`` is P, of the current uniting equations, ``test`` is Q: if None, or the same object, P, and the matrix is
-        symmetric. ``K`` is the tangent matrix without boundary conditions, ``curvature`` second derivatives of gaps times forces.
+        symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``curvature`` second derivatives of gaps times forces.
         """
         test = test or restriction
-        self._adapt(test is restriction)
+        self._apart = test is not restriction
         if test is not restriction:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
                 self.set_operator(restriction, K, curvature)
-                self._adapt(False)
+                self._apart = True
+            self._adapt(False)
             self._set_unsymmetric(restriction, test, K, curvature)
             return
         if restriction.M is None and curvature is None:
@@ -248,8 +257,10 @@ class UnitedSolver:
             restriction.P  # noqa: B018
             with timed("united matrix P'KP"):
                 self.A = self._united.update(restriction, restriction, K, curvature)
+        symmetric = is_symmetric(self.A)
+        self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
-        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
             self.A.setBlockSize(self.config.gdim)
             self.A.setNearNullSpace(self._near_null_space(restriction))
@@ -283,13 +294,10 @@ class UnitedSolver:
         else:
             self._types = self.ksp.getType(), pc.getType()
             self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
-            if self._types[1] == "cholesky":
-                pc.setType("lu")
-        # the other KSP has options of its own
-        with self._in_database(ksp_type=self.ksp.getType()):
+            pc.setType({"cholesky": "lu", "icc": "ilu"}.get(self._types[1], self._types[1]))
+        # the others have options of their own
+        with self._in_database(ksp_type=self.ksp.getType(), pc_type=pc.getType()):
             self.ksp.setFromOptions()
-        if not symmetric and pc.getType() == "cholesky":
-            pc.setType("lu")
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
@@ -342,8 +350,8 @@ class UnitedSolver:
 
     @property
     def _tells_sign(self) -> bool:
-        """Whether the solver tells the sign of the determinant of an unsymmetric matrix."""
-        return not self._symmetric and self.ksp.getPC().getFactorSolverType() == "mumps"
+        """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
+        return self._apart and self.ksp.getPC().getFactorSolverType() == "mumps"
 
     @property
     def negative(self) -> bool:
@@ -417,6 +425,21 @@ def _stiffen_idle(A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> None:
     diagonal, idle = A.getDiagonal(), ~P.used.ravel()
     diagonal.array[idle] = K.getDiagonal().array_r[idle]
     A.setDiagonal(diagonal)
+
+
+def is_symmetric(A: PETSc.Mat) -> bool:
+    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective)."""
+    scale, size = A.getDiagonal(), A.createVecLeft()
+    scale.sqrtabs()
+    if scale.min()[1] == 0.0:
+        return False
+    scale.reciprocal()
+    size.array[:] = scale.array_r * np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], size.local_size)
+    difference, across = A * size, size.duplicate()
+    A.multTranspose(size, across)
+    difference.axpy(-1.0, across)
+    difference.pointwiseMult(difference, scale)
+    return bool(difference.norm(PETSc.NormType.INFINITY) <= SYMMETRIC)
 
 
 def rigid_body_modes(config: Configuration) -> list[Array]:
