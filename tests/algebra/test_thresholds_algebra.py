@@ -110,10 +110,11 @@ def test_what_counts_as_symmetric(comm, part, symmetric, scale):
     a = forms.form((ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) + ufl.div(u) * ufl.div(v)) * ufl.dx)
     K = forms.create_matrix(a)
     forms.assemble_matrix(K, a)
-    row = K.getOwnershipRange()[0]
+    first, end = K.getOwnershipRange()
     if comm.rank == comm.size - 1:
-        column = next(int(c) for c in K.getRow(row)[0] if c > row)
-        K.setValue(row, column, part * np.sqrt(K.getValue(row, row) * K.getDiagonal().array_r[column - row]), addv=True)
+        column = next(int(c) for c in K.getRow(first)[0] if first < c < end)
+        across = np.sqrt(K.getValue(first, first) * K.getValue(column, column))
+        K.setValue(first, column, K.getValue(first, column) + part * across)
     K.assemble()
     units = K.createVecLeft()
     units.array[:] = 10.0 ** (np.arange(units.local_size) % 7)
