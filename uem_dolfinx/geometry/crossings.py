@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -61,22 +60,18 @@ def find_crossings(start: tuple[Array, Array], end: tuple[Array, Array], sign: A
 
     every = np.arange(len(i))
     bounds = _extremes(lambda t: height(t, every)[0], -further, 1.0 + further)
-    point, time, inwards, normal = [], [], [], []
-    for a, b in pairwise(bounds):
-        before, after = height(a, every)[0], height(b, every)[0]
-        k = np.flatnonzero((before >= 0) != (after >= 0))
-        low, high, falls = a[k], b[k], before[k] >= 0
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            passed = (height(middle, k)[0] >= 0) != falls
-            low, high = np.where(passed, low, middle), np.where(passed, middle, high)
-        _, x, n = height(high, k)
-        met = _contain_origin(x)
-        point.append(i[k[met]])
-        time.append(high[met])
-        inwards.append(falls[met])
-        normal.append(n[met] / np.linalg.norm(n[met], axis=1, keepdims=True))
-    return Crossings(np.concatenate(point), np.concatenate(time), np.concatenate(inwards), np.concatenate(normal))
+    passed = np.stack([height(t, every)[0] >= 0 for t in bounds])
+    # from one bound to the next, all of which are halved together
+    interval, k = np.nonzero(passed[:-1] != passed[1:])
+    times = np.stack(bounds)
+    low, high, falls = times[interval, k], times[interval + 1, k], passed[interval, k]
+    for _ in range(HALVINGS if len(k) else 0):
+        middle = 0.5 * (low + high)
+        beyond = (height(middle, k)[0] >= 0) != falls
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    _, x, n = height(high, k)
+    met = _contain_origin(x)
+    return Crossings(i[k[met]], high[met], falls[met], n[met] / np.linalg.norm(n[met], axis=1, keepdims=True))
 
 
 def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Ints, Ints]:
