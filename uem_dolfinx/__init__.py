@@ -32,7 +32,7 @@ __all__ = [
 
 from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
 
-from uem_dolfinx.algebra.linear_solver import multigrid_options
+from uem_dolfinx.algebra.options import multigrid_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.compat import interpolate_expression as interpolate
 from uem_dolfinx.contact.contact import Balance, Contact, Resultant

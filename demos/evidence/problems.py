@@ -19,7 +19,7 @@ from evidence import methods
 from evidence.scene import DIRECT, Scene, overlap
 
 import uem_dolfinx as uem
-from uem_dolfinx.algebra.linear_solver import has_mumps
+from uem_dolfinx.algebra.options import has_mumps
 from uem_dolfinx import compat, forms
 from uem_dolfinx.geometry.surfaces import tributary_areas
 

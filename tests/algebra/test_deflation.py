@@ -14,7 +14,7 @@ from helpers import blocks, gathered_matrix, linear, scattered
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.deflation import deflated, pressed_hard
-from uem_dolfinx.algebra.linear_solver import has_hypre
+from uem_dolfinx.algebra.options import has_hypre
 
 COMM = MPI.COMM_WORLD
 AMG = [pytest.param("hypre", marks=pytest.mark.skipif(not has_hypre(), reason="PETSc without hypre")), "gamg"]

@@ -12,8 +12,10 @@ from helpers import blocks, gathered_matrix, gathered_vector
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra import options
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.algebra.linear_solver import UnitedSolver, default_options, is_symmetric
+from uem_dolfinx.algebra.linear_solver import UnitedSolver, is_symmetric
+from uem_dolfinx.algebra.options import FEW_ITERATIONS, default_options, has_hypre, has_mumps
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
 
@@ -96,9 +98,41 @@ def test_chains_of_any_length(comm, length):
 # -- linear solver ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size, gdim, direct", [(100_000, 2, True), (900_000, 2, False), (10_000, 3, True), (90_000, 3, False)])
-def test_direct_solvers_up_to(size, gdim, direct):
-    assert default_options(size, gdim)["ksp_type"] == ("preonly" if direct else "cg")
+@pytest.mark.parametrize("hypre", [True, False])
+@pytest.mark.parametrize(
+    "size, gdim, first", [(100_000, 2, "preonly"), (900_000, 2, "cg"), (2_000, 3, "preonly"), (90_000, 3, "cg")]
+)
+def test_direct_solvers_up_to(size, gdim, first, hypre, monkeypatch):
+    """CG takes over early in 3D where there is hypre, and leaves what it cannot do to a factorisation there."""
+    monkeypatch.setattr(options, "has_hypre", lambda: hypre)
+    assert default_options(size, gdim)[0]["ksp_type"] == first and not default_options(size, gdim)[1]
+    between, instead = default_options(10_000, 3)
+    assert between["ksp_type"] == ("cg" if hypre else "preonly") and bool(instead) == hypre
+
+
+@pytest.mark.skipif(not (has_hypre() and has_mumps()), reason="needs hypre and MUMPS")
+@pytest.mark.parametrize(
+    "limit, symmetric, gives_way", [(FEW_ITERATIONS, True, False), (2, True, True), (FEW_ITERATIONS, False, True)]
+)
+def test_cg_gives_way(comm, limit, symmetric, gives_way, monkeypatch):
+    """What takes CG long, or is not symmetric, is factorised, to the same answer, until the next step begins."""
+    monkeypatch.setattr(options, "HYPRE_FROM", {2: 0, 3: 0})
+    monkeypatch.setattr(options, "FEW_ITERATIONS", limit)
+    config = Configuration(blocks(comm, "triangle", 5, 5, gap=0.5).u)
+    solver, K, P = UnitedSolver(config, "gives_way_", None), mass(config), united(config, [])
+    if not symmetric:
+        stiffer = K.createVecLeft()
+        stiffer.array[:] = 1.0 + np.arange(stiffer.local_size) % 3
+        K.diagonalScale(stiffer, None)
+    rhs = K.createVecLeft()
+    rhs.array[:] = np.cos(np.arange(rhs.local_size))
+    for _ in range(2):
+        solver.begin_step()
+        solver.set_operator(P, K, None)
+        assert solver.iterative == symmetric
+        dq, _ = solver.solve(rhs)
+        assert solver.iterative != gives_way
+        assert (K * dq - rhs).norm() <= 1e-9 * rhs.norm()
 
 
 @pytest.mark.parametrize("part, symmetric", [(0.0, True), (3e-12, True), (3e-11, False)])

@@ -6,8 +6,7 @@ Any KSP and PC can be chosen through ``petsc_options``.
 from __future__ import annotations
 
 import difflib
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,10 +16,11 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.options import OFTEN_USED, check_options, default_options
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError
+from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
@@ -38,9 +38,6 @@ KEPT_CHANGES = 0.1
 #: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
 #: [convention; ratio of iterations; test_thresholds_algebra.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
-#: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
-#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
-DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 #: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
 #: [convention; entries; test_thresholds_algebra.py::test_what_counts_as_symmetric]
 SYMMETRIC = 1e-11
@@ -48,96 +45,6 @@ SYMMETRIC = 1e-11
 MULTIGRID = ("hypre", "gamg", "ml")
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)
-#: Options that misspelt ones are likely to mean.
-OFTEN_USED = (
-    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_norm_type", "ksp_gmres_restart", "ksp_monitor", "ksp_view", "pc_type",
-    "pc_factor_mat_solver_type", "pc_hypre_type", "pc_gamg_threshold", "mg_levels_ksp_type", "mg_levels_pc_type", "sub_pc_type",
-)  # fmt: skip
-
-
-def has_hypre() -> bool:
-    """Whether PETSc was built with hypre (the PyPI wheel is not)."""
-    return bool(PETSc.Sys.hasExternalPackage("hypre"))
-
-
-def has_mumps() -> bool:
-    """Whether PETSc was built with MUMPS."""
-    return bool(PETSc.Sys.hasExternalPackage("mumps"))
-
-
-def default_options(size: int, gdim: int) -> dict[str, Any]:
-    """PETSc options for a united system with ``size`` unknowns: MUMPS while it is cheap, else CG with AMG.
-
-    MUMPS pivots in LDL' as well, PETSc's own Cholesky does not.
-    """
-    if size > DIRECT_UP_TO[gdim]:
-        return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options()
-    if has_mumps():
-        return {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
-    return {"ksp_type": "preonly", "pc_type": "lu"}
-
-
-def multigrid_options(amg: str = "") -> dict[str, Any]:
-    """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or hypre where PETSc has it.
-
-    Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
-    """
-    amg = amg or ("hypre" if has_hypre() else "gamg")
-    if amg == "gamg":
-        # the smoother's bounds from CG, which finds the few large eigenvalues that stiff contactors make
-        gamg = {"esteig_ksp_type": "cg", "esteig_ksp_max_it": 20, "threshold": 0.02}
-        smoother = {"mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
-        return {"pc_type": "gamg"} | smoother | {f"pc_gamg_{k}": v for k, v in gamg.items()}
-    boomeramg = {
-        "strong_threshold": 0.15, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4, "relax_type_all": "Chebyshev",
-    }  # fmt: skip
-    return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
-
-
-def check_options(options: Any, prefix: Any) -> None:
-    """Refuse options and a prefix that PETSc could not read, and types of KSP and PC that it does not know.
-
-    Raises:
-        InputTypeError, InputError: naming the option.
-        MissingBackendError: where one asks for a library PETSc was built without.
-    """
-    given.kind("petsc_options_prefix", prefix, isinstance(prefix, str), "a text, as 'uem_'")
-    if not re.fullmatch(r"(?!-)\S*", prefix):
-        raise InputError(given.sentence("petsc_options_prefix", prefix, "a text without blanks, and no hyphen before it"))
-    example = "options by name without prefix, as {'ksp_type': 'cg', 'pc_type': 'gamg'}, or None"
-    given.kind("petsc_options", options, isinstance(options, Mapping), example)
-    for key, value in options.items():
-        if not isinstance(key, str) or not re.fullmatch(r"[A-Za-z]\S*", key):
-            raise InputError(given.sentence("a name in petsc_options", key, "an option's name without blanks, hyphen and prefix"))
-        plain = value is None or isinstance(value, (str, bool, int, float, list, tuple, np.generic))
-        given.kind(f"petsc_options[{key!r}]", value, plain, "a text or a number")
-        for name, there in (("hypre", has_hypre), ("mumps", has_mumps)):
-            if str(value).lower() == name and not there():
-                raise MissingBackendError(
-                    f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
-                    + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
-                )
-    for key, of, example in (("ksp_type", PETSc.KSP, "'cg' or 'gmres'"), ("pc_type", PETSc.PC, "'gamg' or 'lu'")):
-        if key in options and not _knows(of, value := options[key]):
-            near = difflib.get_close_matches(str(value), _type_names(of), n=1)
-            remedy = f"did you mean {near[0]!r}?" if near else ""
-            raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
-
-
-def _type_names(of: Any) -> list[str]:
-    """Types of KSP or PC that petsc4py knows by name."""
-    return [name for name in vars(of.Type).values() if isinstance(name, str)]
-
-
-def _knows(of: Any, name: Any) -> bool:
-    """Whether there is a type of KSP or PC of this name, built in or registered since."""
-    if name in _type_names(of):
-        return True
-    try:
-        of().create(PETSc.COMM_SELF).setType(name)
-    except (PETSc.Error, TypeError):
-        return False
-    return True
 
 
 def _last_words(error: PETSc.Error) -> str:
@@ -158,24 +65,22 @@ class UnitedSolver:
         with agreed(config.comm):
             check_options({} if options is None else options, prefix)
         given.alike(config.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
-        self.options = default_options(size, config.gdim) if options is None else dict(options)
         self._prefix = prefix
+        #: Options that are asked for first, and those that take over for the rest of a step where they fail or do not suit.
+        self._first, self._instead = default_options(size, config.gdim) if options is None else (dict(options), {})
+        self.options = self._first
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
-        self.ksp = self._create_ksp()
         self.A: Any = None
+        self._use(self._first)
         #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
         self._united, self._unsymmetric = (UnitedMatrix(config, not self.iterative) for _ in range(2))
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
-        #: Whether the preconditioner has yet to see the present matrix.
-        self._new = False
-        #: Equations that the preconditioner was made with, and the iterations per digit that it took at first and takes now.
-        self._made_with: UnitingEquations | None = None
+        #: Iterations per digit that the preconditioner took at first and takes now.
         self._first_pace = self._pace = 0.0
-        #: Whether the KSP is for symmetric matrices, whether Q is not P, and the types of KSP and PC that the options ask for.
-        self._symmetric, self._apart = True, False
-        self._types = self.ksp.getType(), self.pc.getType()
+        #: Whether Q is not P, and whether a step begins.
+        self._apart = self._begins = False
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.config.comm)
@@ -192,15 +97,27 @@ class UnitedSolver:
                 ) from error
         return ksp
 
+    def _use(self, options: dict[str, Any]) -> None:
+        """Make a KSP with these options, which knows nothing yet (collective)."""
+        self.options = options
+        #: Whether the preconditioner has yet to see the present matrix; equations that it was made with.
+        self._new = True
+        self._made_with: UnitingEquations | None = None
+        self.ksp = self._create_ksp()
+        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC that the options ask for.
+        self._symmetric = True
+        self._types = self.ksp.getType(), self.pc.getType()
+
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self.A = self._crossed = self._made_with = None
-        self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
+        self.A = self._crossed = None
         self.ksp.destroy()
-        self.ksp = self._create_ksp()
+        self._use(self._first)
+        self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
 
     def begin_step(self) -> None:
-        """Let what the united matrix has room for depend on this step alone."""
+        """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
+        self._begins = True
         self._united.begin_step()
         self._unsymmetric.begin_step()
 
@@ -238,6 +155,12 @@ class UnitedSolver:
         """
         test = test or restriction
         self._apart = test is not restriction
+        if self._begins and self.options is not self._first:
+            self._use(self._first)
+        self._begins = False
+        if self._apart and self._instead and self.iterative:
+            # it tells the sign of the determinant as well
+            self._use(self._instead)
         if test is not restriction:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
@@ -258,6 +181,8 @@ class UnitedSolver:
             with timed("united matrix P'KP"):
                 self.A = self._united.update(restriction, restriction, K, curvature)
         symmetric = is_symmetric(self.A)
+        if not symmetric and self._instead and self.iterative:
+            self._use(self._instead)
         self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
@@ -396,14 +321,20 @@ class UnitedSolver:
                     "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
                 ) from error
         self._tell_unused()
-        reason = self.ksp.getConvergedReason()
+        reason, iterations = self.ksp.getConvergedReason(), int(self.ksp.getIterationNumber())
+        if reason < 0 and self._instead and self.iterative:
+            logger.debug("CG left the united system with reason %d after %d iterations: it is factorised", reason, iterations)
+            matrix, _ = self.ksp.getOperators()
+            self._use(self._instead)
+            self.ksp.setOperators(matrix)
+            dq, more = self.solve(rhs)
+            return dq, iterations + more
         if reason < 0 or not np.isfinite(dq.norm()):
             raise LinearSolveError(
                 f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "
-                f"{self.ksp.getIterationNumber()} iterations: a body may be free to move as a rigid body, the tangent may be "
+                f"{iterations} iterations: a body may be free to move as a rigid body, the tangent may be "
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
-        iterations = int(self.ksp.getIterationNumber())
         self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
         self._first_pace = self._first_pace or self._pace
         return dq, iterations

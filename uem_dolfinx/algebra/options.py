@@ -1,0 +1,116 @@
+"""Options of PETSc for the united solve: those by size, and a look at those that users give."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import given
+from uem_dolfinx.errors import InputError, MissingBackendError
+
+#: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
+#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
+DIRECT_UP_TO = {2: 300_000, 3: 30_000}
+#: CG with hypre takes less time from so many unknowns on, where it takes few iterations; GAMG does not.
+#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
+HYPRE_FROM = {2: 300_000, 3: 4_000}
+#: CG that takes more iterations leaves a matrix to a factorisation that pays.
+#: [convention; iterations; test_thresholds_algebra.py::test_cg_gives_way]
+FEW_ITERATIONS = 200
+#: Options that misspelt ones are likely to mean.
+OFTEN_USED = (
+    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_norm_type", "ksp_gmres_restart", "ksp_monitor", "ksp_view", "pc_type",
+    "pc_factor_mat_solver_type", "pc_hypre_type", "pc_gamg_threshold", "mg_levels_ksp_type", "mg_levels_pc_type", "sub_pc_type",
+)  # fmt: skip
+
+
+def has_hypre() -> bool:
+    """Whether PETSc was built with hypre (the PyPI wheel is not)."""
+    return bool(PETSc.Sys.hasExternalPackage("hypre"))
+
+
+def has_mumps() -> bool:
+    """Whether PETSc was built with MUMPS."""
+    return bool(PETSc.Sys.hasExternalPackage("mumps"))
+
+
+def default_options(size: int, gdim: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """PETSc options for a united system with ``size`` unknowns, and those that take over where CG fails; none if empty.
+
+    MUMPS while it is cheap, else CG with AMG. MUMPS pivots in LDL' as well, PETSc's own Cholesky does not.
+    """
+    direct = {"ksp_type": "preonly"}
+    direct |= {"pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"} if has_mumps() else {"pc_type": "lu"}
+    if size > DIRECT_UP_TO[gdim]:
+        return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options(), {}
+    if size > HYPRE_FROM[gdim] and has_hypre():
+        return {"ksp_type": "cg", "ksp_max_it": FEW_ITERATIONS} | multigrid_options("hypre"), direct
+    return direct, {}
+
+
+def multigrid_options(amg: str = "") -> dict[str, Any]:
+    """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or hypre where PETSc has it.
+
+    Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
+    """
+    amg = amg or ("hypre" if has_hypre() else "gamg")
+    if amg == "gamg":
+        # the smoother's bounds from CG, which finds the few large eigenvalues that stiff contactors make
+        gamg = {"esteig_ksp_type": "cg", "esteig_ksp_max_it": 20, "threshold": 0.02}
+        smoother = {"mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
+        return {"pc_type": "gamg"} | smoother | {f"pc_gamg_{k}": v for k, v in gamg.items()}
+    boomeramg = {
+        "strong_threshold": 0.15, "coarsen_type": "HMIS", "interp_type": "ext+i", "P_max": 4, "relax_type_all": "Chebyshev",
+    }  # fmt: skip
+    return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
+
+
+def check_options(options: Any, prefix: Any) -> None:
+    """Refuse options and a prefix that PETSc could not read, and types of KSP and PC that it does not know.
+
+    Raises:
+        InputTypeError, InputError: naming the option.
+        MissingBackendError: where one asks for a library PETSc was built without.
+    """
+    given.kind("petsc_options_prefix", prefix, isinstance(prefix, str), "a text, as 'uem_'")
+    if not re.fullmatch(r"(?!-)\S*", prefix):
+        raise InputError(given.sentence("petsc_options_prefix", prefix, "a text without blanks, and no hyphen before it"))
+    example = "options by name without prefix, as {'ksp_type': 'cg', 'pc_type': 'gamg'}, or None"
+    given.kind("petsc_options", options, isinstance(options, Mapping), example)
+    for key, value in options.items():
+        if not isinstance(key, str) or not re.fullmatch(r"[A-Za-z]\S*", key):
+            raise InputError(given.sentence("a name in petsc_options", key, "an option's name without blanks, hyphen and prefix"))
+        plain = value is None or isinstance(value, (str, bool, int, float, list, tuple, np.generic))
+        given.kind(f"petsc_options[{key!r}]", value, plain, "a text or a number")
+        for name, there in (("hypre", has_hypre), ("mumps", has_mumps)):
+            if str(value).lower() == name and not there():
+                raise MissingBackendError(
+                    f"petsc_options ask for {key} = {value}, but this PETSc was built without {name}: "
+                    + ("use pc_type gamg" if name == "hypre" else "use another factorisation, or pc_type gamg")
+                )
+    for key, of, example in (("ksp_type", PETSc.KSP, "'cg' or 'gmres'"), ("pc_type", PETSc.PC, "'gamg' or 'lu'")):
+        if key in options and not _knows(of, value := options[key]):
+            near = difflib.get_close_matches(str(value), _type_names(of), n=1)
+            remedy = f"did you mean {near[0]!r}?" if near else ""
+            raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
+
+
+def _type_names(of: Any) -> list[str]:
+    """Types of KSP or PC that petsc4py knows by name."""
+    return [name for name in vars(of.Type).values() if isinstance(name, str)]
+
+
+def _knows(of: Any, name: Any) -> bool:
+    """Whether there is a type of KSP or PC of this name, built in or registered since."""
+    if name in _type_names(of):
+        return True
+    try:
+        of().create(PETSc.COMM_SELF).setType(name)
+    except (PETSc.Error, TypeError):
+        return False
+    return True
