@@ -221,6 +221,6 @@ with uem.figure(args.plot, comm, panels=2) as (left, right):
 
 # %%
 #: Bytes for each contactor and facet of a rank's own, two answers at most, and for every rank that talks to it.
-PER_OWN, PER_RANK = 1100, 64
+PER_OWN, PER_RANK = 550, 64
 for row in results["plates"]:
     assert row["bytes_max"] <= (PER_OWN * row["share_max"] + PER_RANK * row["ranks"]) * (row["ranks"] > 1), row

@@ -17,8 +17,8 @@ from helpers import highest, serial, start_process
 from uem_dolfinx.parallel import Exchange
 
 SCRIPT = Path(__file__).parents[2] / "demos" / "scaling.py"
-#: Bytes of the numbers in the answer for one contactor over quadrilaterals, and what is said about each message.
-ANSWER, MESSAGE = 8 * 68, 64
+#: Bytes of the numbers in question and answer for one contactor over quadrilaterals, and what is said about each message.
+ANSWER, MESSAGE = 8 * 37, 64
 
 
 def test_counting_is_exact(comm):

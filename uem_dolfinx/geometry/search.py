@@ -1,20 +1,19 @@
 """Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
 
-A point is sent only to the ranks whose part of the target can be nearest, and only its answer comes back, so that no rank ever
-holds a whole surface.
+A point is sent only to the ranks whose part of the target can be nearest, and only its foot and facet come back, so that no rank
+ever holds a whole surface; what follows from them is found where the point is.
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
-from uem_dolfinx.arrays import AnyArray, Array, Indices, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
@@ -33,6 +32,32 @@ IN_PLANE = 4
 #: Facets whose distances or heights differ by less are equally near.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
 EQUALLY_NEAR = 1e-9
+
+
+class Feet(NamedTuple):
+    """Closest points on facets: all that travels from the facets' ranks to the points'.
+
+    Attributes:
+        facet: number over all ranks ``(n,)``.
+        key: what tells the facet in any partition ``(n,)``.
+        xi: reference coordinates ``(n, fdim)``.
+        x: the facet's nodes where they are now ``(n, nn, gdim)``.
+        nodes: their global numbers ``(n, nn)``.
+        nodal_normals: averaged normals there ``(n, nn, gdim)``.
+        sign: that turns the parametrisation's normal outwards ``(n,)``.
+        open_sides: which sides bound the surface ``(n, n_sides)``.
+        open_nodes: which nodes lie on such a side ``(n, nn)``.
+    """
+
+    facet: Ints
+    key: Ints
+    xi: Array
+    x: Array
+    nodes: Ints
+    nodal_normals: Array
+    sign: Array
+    open_sides: Bools
+    open_nodes: Bools
 
 
 class MeshTarget:
@@ -57,15 +82,14 @@ class MeshTarget:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
         data, size = self.facets.current(), self.comm.size
         if size == 1:
-            return self._project_here(points, data)
+            return self._evaluate(points, self._project_here(points, data))
         # the answer of the rank that seems nearest tells who else can be as near
         near, far = self.bounds(points, data.x)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
-        nearest = self._ask(Exchange.to(self.comm, first), data, points)
-        found, _ = nearest
+        found, feet = self._ask(Exchange.to(self.comm, first), data, points)
         bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
         others = (near <= bound) & (first != np.arange(size)[:, None])
-        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=nearest)[0]
+        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=feet)[0]
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
@@ -175,34 +199,26 @@ class MeshTarget:
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
-        found: tuple[FacetProjection, Ints] | None = None,
-    ) -> tuple[FacetProjection, Ints]:  # fmt: skip
-        """Send points to ranks (with the facet, or facet and foot, if given), keep the nearest answer, or what was found; and its keys."""
+        found: Feet | None = None,
+    ) -> tuple[FacetProjection, Feet]:  # fmt: skip
+        """Send points to ranks (with the facet, or facet and foot, if given), and keep the nearest foot, or that found before."""
         p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
         if rest:
             rest[0] = rest[0] - self.first[self.comm.rank]
-        answer = self._project_here(p, data, *rest)
-        keys = self.facets.keys[answer.facet - self.first[self.comm.rank]]
+        feet = self._project_here(p, data, *rest)
         if self.comm.size == 1:
-            return answer, keys
+            return self._evaluate(points, feet), feet
         # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
-        rows, columns = exchange.rows, exchange.back(*self._judged(p, answer, keys))
+        rows, feet = exchange.rows, Feet._make(exchange.back(*feet))
         if found is not None:
-            rows = np.append(rows, np.arange(len(points)))
-            columns = [np.concatenate(pair) for pair in zip(columns, self._judged(points, *found))]
-        distance, height, keys, *columns = columns
-        best = _nearest(rows, distance, height, keys, ON_SIDE * self.stride)
-        return FacetProjection(*(column[best] for column in columns)), keys[best]
-
-    def _judged(self, points: Array, answer: FacetProjection, keys: Ints) -> list[npt.NDArray[Any]]:
-        """What tells the nearest of several answers: distance, height over the facet's own plane, key; and the answer's fields."""
-        away = points - answer.foot
+            rows, feet = np.append(rows, np.arange(len(points))), Feet._make(map(np.concatenate, zip(feet, found)))
+        answer = self._evaluate(points[rows], feet)
+        away = points[rows] - answer.foot
         height = np.einsum("ng,ng->n", away, self.outward(answer))
-        return [np.linalg.norm(away, axis=1), height, keys, *(getattr(answer, f.name) for f in fields(answer))]
+        best = _nearest(rows, np.linalg.norm(away, axis=1), height, feet.key, ON_SIDE * self.stride)
+        return FacetProjection(*(getattr(answer, f.name)[best] for f in fields(answer))), Feet._make(a[best] for a in feet)
 
-    def _project_here(
-        self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None
-    ) -> FacetProjection:
+    def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> Feet:
         """Project onto this rank's facets."""
         if facet is None:
             pairs, candidates = candidate_pairs(self.shape, data.x, points)
@@ -214,27 +230,31 @@ class MeshTarget:
             facet, xi = candidates[best], xi[best]
         elif xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
-        return self._evaluate(points, facet, xi, data)
+        of = self.facets
+        return Feet(
+            facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],
+            of.sign[facet], of.open_sides[facet], of.open_nodes[facet],
+        )  # fmt: skip
 
-    def _evaluate(self, points: Array, facet: Ints, xi: Array, data: FacetData) -> FacetProjection:
-        """Gap, normal and geometry at the feet ``xi`` on this rank's facets."""
+    def _evaluate(self, points: Array, feet: Feet) -> FacetProjection:
+        """Gap, normal and geometry at the feet of ``points (n, gdim)``."""
+        xi, x = feet.xi, feet.x
         tab = self.shape.tabulate(xi)
-        x = data.x[facet]
         foot = np.einsum("na,nag->ng", tab.N, x)
-        facet_normal = unit_normals(tab, x) * self.facets.sign[facet, None]
-        raw = np.einsum("na,nag->ng", tab.N, data.nodal_normals[facet])
+        facet_normal = unit_normals(tab, x) * feet.sign[:, None]
+        raw = np.einsum("na,nag->ng", tab.N, feet.nodal_normals)
         length = np.linalg.norm(raw, axis=1, keepdims=True)
         divisor = np.where(length > 0, length, 1.0)
         averaged_normal = raw / divisor
         on_side = self.shape.side_distances(xi) < ON_SIDE
-        is_open = self.facets.open_sides[facet]
+        is_open = feet.open_sides
         away = points - foot
         # exactly on a shared side either facet's normal would be an arbitrary choice
         at_side = np.linalg.norm(away, axis=1) <= ON_SIDE * np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
         use_average = np.full(len(points), True) if self.averaged else at_side & (on_side & ~is_open).any(axis=1)
         use_average &= length[:, 0] > 0
         normal = np.where(use_average[:, None], averaged_normal, facet_normal)
-        bend = np.einsum("naf,nag->nfg", tab.dN, data.nodal_normals[facet]) / divisor[:, :, None]
+        bend = np.einsum("naf,nag->nfg", tab.dN, feet.nodal_normals) / divisor[:, :, None]
         bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
         bend[~use_average] = 0.0
         # along an averaged normal, which leans, the way to the facet is longer than to its closest point
@@ -242,13 +262,12 @@ class MeshTarget:
         gap = np.einsum("ng,ng->n", facet_normal, away) / np.where(lean > LEAST_LEAN, lean, 1.0)
         beyond = away - gap[:, None] * normal
         # a facet may touch the surface's end with a vertex alone
-        at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & self.facets.open_nodes[facet]).any(axis=1)
+        at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & feet.open_nodes).any(axis=1)
         beyond[~at_end] = 0.0
         from_end = np.where(is_open, self.shape.side_distances(xi), np.inf).min(axis=1, initial=np.inf)
         from_end[at_end] = 0.0
-        number = facet + self.first[self.comm.rank]
         return FacetProjection(
-            gap, normal, data.nodes[facet], tab.N, number, beyond, from_end, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
+            gap, normal, feet.nodes, tab.N, feet.facet, beyond, from_end, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
         )
 
 
