@@ -102,6 +102,28 @@ def clocks() -> np.ndarray:
 
 
 # %% [markdown]
+# ## On paper: a thousand ranks
+# Bytes that go with a rank's own contactors and facets are those of the most ranks that were measured, as many for each; bytes that
+# every rank tells every other are as many for each pair.
+
+
+# %%
+def on_paper(row: dict, share: int) -> list[dict[str, float]]:
+    """Bytes that a rank with so many contactors and facets receives in one search on more and more ranks, from a row of "plates"."""
+    own = row["bytes_per_share"] - row["bytes_per_rank"] * (row["ranks"] - 1) / row["share_max"]
+    return [
+        {
+            "ranks": ranks,
+            "contactors_and_facets": share * ranks,
+            "bytes_own": own * share,
+            "bytes_told_by_all": row["bytes_per_rank"] * (ranks - 1),
+            "partners": min(row["partners"], ranks - 1),
+        }
+        for ranks in (8, 64, 512, 1000, 4096)
+    ]
+
+
+# %% [markdown]
 # ## Here: on the ranks of this call
 
 
@@ -186,6 +208,10 @@ for row in results["ranks"]:
 for row, last in zip(results["search"], [None, *results["search"]]):
     more, longer = (1.0, 1.0) if last is None else (row[key] / last[key] for key in ("contactors", "seconds"))
     row["exponent"] = float(np.log(longer) / np.log(more)) if last is not None else None
+widest = max(
+    (row for row in results["plates"] if row["ranks"] > 1), key=lambda row: (row["ranks"], row["contactors"]), default=None
+)
+results["paper"] = on_paper(widest, 2000) if widest else []
 common.report(args, {name: rows for name, rows in results.items() if rows})
 
 # %% [markdown]

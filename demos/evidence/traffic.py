@@ -37,10 +37,13 @@ class Counting:
 
     Attributes:
         received: bytes so far.
+        by_ranks: bytes of them in calls in which every rank tells every other the same number of them.
+        partners: number of ranks that have sent rows here.
     """
 
     def __init__(self, whole: MPI.Comm):
-        self._whole, self.size, self.rank, self.received = whole, whole.size, whole.rank, 0
+        self._whole, self.size, self.rank = whole, whole.size, whole.rank
+        self.received, self.by_ranks, self.partners = 0, 0, 0
 
     def Alltoall(self, sent: np.ndarray, received: np.ndarray) -> None:
         """As many bytes of an array to every rank (collective)."""
@@ -57,9 +60,11 @@ class Counting:
         self._whole.Alltoallv(sent, received)
         (_, (counts, _), row) = received
         self.received += int(np.sum(counts) - counts[self.rank]) * row.Get_size()
+        self.partners = max(self.partners, int((np.delete(counts, self.rank) > 0).sum()))
 
     def _count_all_but_mine(self, received: np.ndarray) -> None:
-        self.received += received.nbytes * (self.size - 1) // self.size
+        told = received.nbytes * (self.size - 1) // self.size
+        self.received, self.by_ranks = self.received + told, self.by_ranks + told
 
 
 class Watch:
@@ -145,7 +150,8 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
     Returns:
         ``contactors`` and ``facets`` on all ranks; ``share_max``, the most contactors and facets that a rank has; ``bytes_max``, the
         most bytes that a rank receives; ``bytes_per_share``, the most per contactor and facet of its own; ``asked``, ranks that a
-        contactor asks; ``halo_bytes_max``, the most bytes that come with the values at ghost nodes of which nodal normals are made;
+        contactor asks; ``bytes_per_rank``, those of them that every other rank sends; ``partners``, the most ranks that send a rank rows
+        in one call; ``halo_bytes_max``, the most bytes that come with the values at ghost nodes of which nodal normals are made;
         ``imbalance``, the most contactors owned and points projected over the mean.
     """
     config, target, points = surfaces.config, surfaces.target, surfaces.points
@@ -156,7 +162,8 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
     # sums go to the owners, and back to the ghosts
     halo = 8 * config.gdim * (len(ghosts) + sum(elsewhere))
     told = (len(points), len(target.facets.dofs), watch.counting.received, watch.projected, halo)
-    contactors, facets, received, projected, halos = np.array(comm.allgather(told)).T
+    told += (watch.counting.by_ranks, watch.counting.partners)
+    contactors, facets, received, projected, halos, by_ranks, partners = np.array(comm.allgather(told)).T
     shares, work = contactors + facets, contactors + projected
     return {
         "contactors": int(contactors.sum()),
@@ -164,6 +171,8 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
         "share_max": int(shares.max()),
         "bytes_max": int(received.max()),
         "bytes_per_share": float((received / np.maximum(shares, comm.size)).max()),
+        "bytes_per_rank": float(by_ranks.max() / max(comm.size - 1, 1)),
+        "partners": int(partners.max()),
         "asked": float(projected.sum() / contactors.sum()),
         "halo_bytes_max": int(halos.max()),
         "imbalance": float(work.max() / work.mean()),

@@ -108,5 +108,11 @@ def test_script(folder):
     assert one["search_bytes_max"] == 0 < two["search_bytes_max"]
     assert one["contact_imbalance"] == 1.0 <= two["contact_imbalance"] <= 2.0
     assert [row["ranks"] for row in found["plates"]] == [2]
+    (measured,) = found["plates"]
+    assert 0 < measured["bytes_per_rank"] < 200 and measured["partners"] == 1
+    # what a rank receives for its own stays, what all tell all grows with the ranks
+    few, *_, many = found["paper"]
+    assert few["bytes_own"] == many["bytes_own"] > 0
+    assert many["bytes_told_by_all"] == pytest.approx(few["bytes_told_by_all"] * (many["ranks"] - 1) / (few["ranks"] - 1))
     assert [row["contactors"] for row in found["search"]] == [25, 81]
     assert found["search"][0]["exponent"] is None and isinstance(found["search"][1]["exponent"], float)
