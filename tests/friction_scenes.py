@@ -92,11 +92,12 @@ def loose(
     *,
     rigid: bool = False,
     E: float = 50.0,
+    n: Any = (3, 4),
     coupling: str = "node_to_surface",
     **options: Any,
 ) -> Loose:
     """A block of unit volume on another one, or on a plane, that nothing but contact holds."""
-    b = blocks(MPI.COMM_WORLD, cell, 3, 4, overhang=0.5)
+    b = blocks(MPI.COMM_WORLD, cell, *n, overhang=0.5)
     g = b.gdim
     target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
     contact = uem.Contact(b.high, target, friction=mu, coupling=coupling)
