@@ -99,6 +99,18 @@ def test_when_the_worst_goes_alone():
     assert [i for i, n in enumerate(counts) if not pivoting.all_at_once(n)] == alone
 
 
+def test_when_others_go_with_the_worst():
+    """When it goes alone, until it has gone alone from the same pattern twice."""
+    pivoting = active_set.Pivoting()
+    assert [pivoting.all_at_once(n) and pivoting.ahead for n in (1, 1, 1, 1)] == [False] * 4
+    assert not pivoting.all_at_once(1) and not pivoting.repeats([7]) and pivoting.ahead
+    pivoting.start_again()
+    assert pivoting.all_at_once(5) and not pivoting.ahead
+    for _ in range(4):
+        pivoting.all_at_once(5)
+    assert pivoting.ahead and pivoting.repeats([7]) and not pivoting.ahead
+
+
 @pytest.mark.parametrize("radius", [1e-6, 1.0, 1e6])
 def test_first_touch_of_a_paraboloid(radius):
     """Hertz: pressed in by d, a ball touches within sqrt(R d) and overlaps within sqrt(2 R d); those inside enter, to 2 %."""

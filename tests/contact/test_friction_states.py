@@ -84,3 +84,17 @@ def test_the_direction_turns_with_the_motion():
     k, part = friction.turn_stiffness(np.array([2.0, 1.0]), np.array([1.0, 1.0]), np.array([10.0, 10.0]))
     assert (k[0], part[0]) == pytest.approx((10.0, 1.0))
     assert part[1] == pytest.approx(friction.LEAST_TURN / (1 - friction.LEAST_TURN))
+
+
+def test_slip_that_eats_its_way_goes_ahead():
+    """Others go along as far ahead as slip has come, twice as far the next time, and a quarter of that once it was too far."""
+    front, points = friction.Front(), np.column_stack([np.arange(100.0), np.zeros(100)])
+
+    def ahead(place, too_far=False):
+        near, nearest = front.move(points[[place]], too_far, points)
+        assert not nearest.any()
+        return np.flatnonzero(near[place + 1 :]).size
+
+    assert [ahead(0), ahead(1), ahead(3), ahead(6)] == [0, 1, 2, 4]
+    assert [ahead(11), ahead(17, too_far=True), ahead(20)] == [8, 2, 4]
+    assert not front.move(points[:0], False, points)[0].any()

@@ -129,7 +129,17 @@ class Pivoting:
     def __init__(self) -> None:
         self._fewest: float = np.inf
         self._tries = PATIENCE
+        self._again = False
         self._seen: set[tuple[int, ...]] = set()
+
+    @property
+    def ahead(self) -> bool:
+        """Whether others that are not wrong yet may be exchanged with the worst: in a pattern that it went alone in before they may not."""
+        return self._tries < 0 and not self._again
+
+    def start_again(self) -> None:
+        """Exchange all wrong contactors again, after others have been exchanged with them."""
+        self._fewest, self._tries = np.inf, PATIENCE
 
     def all_at_once(self, count: int) -> bool:
         """Whether all ``count`` wrong contactors are exchanged."""
@@ -139,10 +149,11 @@ class Pivoting:
         self._tries -= 1
         return self._tries >= 0
 
-    def repeats(self, active: Sequence[int]) -> bool:
-        """Whether the worst has been exchanged alone in this active set before, told by a number of each rank."""
-        again = tuple(active) in self._seen
-        self._seen.add(tuple(active))
+    def repeats(self, pattern: Sequence[int]) -> bool:
+        """Whether the worst has been exchanged alone among such contactors before, told by a number of each rank."""
+        again = tuple(pattern) in self._seen
+        self._seen.add(tuple(pattern))
+        self._again = self._again or again
         return again
 
 

@@ -53,8 +53,11 @@ class FrictionalPair(ContactPair):
         #: None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
         self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None] | None = None
         self._moved: Array = np.zeros((n, g))
-        #: Contactors that have been let go of in the present linearised problem ``(n,)``, and what it foretells: forces and slips.
-        self._released: Bools = np.zeros(n, dtype=bool)
+        #: In the present linearised problem: contactors that have been let go of, that slip the other way, and that slip ahead of the
+        #: last that were to ``(n,)``; where these were and how far others go along.
+        self._released, self._reversed, self._taken = np.zeros((3, n), dtype=bool)
+        self._front = friction.Front()
+        #: What that problem foretells: forces and slips.
         self._foreseen = np.zeros((n, g)), np.zeros((n, g))
         #: Friction that belongs to the forces last read or foreseen ``(n, gdim)``.
         self._told: Array = np.zeros((n, g))
@@ -159,6 +162,12 @@ class FrictionalPair(ContactPair):
         """Parts of forces ``(n, gdim)`` along the target."""
         return friction.along(self.tangents, force)
 
+    @property
+    def pattern(self) -> bytes:
+        """What tells one distribution of contactors that are open, stick and slip from others, and where to they slip."""
+        rub = self._rub()
+        return super().pattern + rub.stick.tobytes() + np.sign(rub.direction).astype(np.int8).tobytes()
+
     def largest_gap(self) -> float:
         """Largest gap of an active contactor, or distance from the anchor that it sticks to, a length (collective)."""
         off = np.linalg.norm(self.slip[self.rubbing & self._rub().stick & ~self.redundant], axis=1).max(initial=0.0)
@@ -205,24 +214,43 @@ class FrictionalPair(ContactPair):
             gap_rounding=gap_rounding,
         )
 
-    def exchange(self, wrong: Wrong) -> None:
-        """Let wrong contactors change sides, or between stick and slip (collective)."""
+    def exchange(self, wrong: Wrong, ahead: bool) -> bool:
+        """Let wrong contactors change sides, or between stick and slip; see ``ContactPair`` (collective)."""
         assert isinstance(wrong, friction.FrictionWrong)
         tau, slip = self._foreseen
-        self.trial = replace(self.trial, friction=friction.exchange(self._rub(), wrong, tau))
-        super().exchange(wrong)
+        if ahead:
+            self._taken, tau = self._next_in_line(wrong, tau)
+        slide = wrong.slide | self._taken if ahead else wrong.slide
+        # one whose slip turns slips the other way first: where a surface turns back they would else follow one after the other; bodies
+        # that slide without end are held
+        size = np.linalg.norm(slip, axis=1)
+        turns = wrong.hold & ~self._reversed & (size > 0) & (size < self.config.size)
         # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
-        back = wrong.enter & (self.committed.active | self._released) & slip.any(axis=1)
+        back = turns | (wrong.enter & (self.committed.active | self._released) & (size > 0))
+        changed = replace(wrong, slide=slide, hold=wrong.hold & ~turns)
+        self.trial = replace(self.trial, friction=friction.exchange(self._rub(), changed, tau))
+        super().exchange(wrong, ahead)
         self.trial = replace(self.trial, friction=friction.turned(self._rub(), back, slip))
-        self._released = self._released | wrong.release
+        self._released, self._reversed = self._released | wrong.release, self._reversed | turns
         # where they begin to slip the linearised problem has taken the forces to
         tau = tau / self._shares[:, None]
-        self._q[wrong.slide], self._tau[wrong.slide] = -tau[wrong.slide], tau[wrong.slide]
+        self._q[slide], self._tau[slide] = -tau[slide], tau[slide]
         self._q[back], self._tau[back] = slip[back] * self._c[back, None], 0.0
+        return ahead and bool(self.config.comm.allreduce(self._taken.any(), op=MPI.LOR))
+
+    def _next_in_line(self, wrong: friction.FrictionWrong, tau: Array) -> tuple[Bools, Array]:
+        """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
+        comm, stick = self.config.comm, self.rubbing & self._rub().stick
+        here, force = (np.concatenate(part) for part in zip(*comm.allgather((self.points[wrong.slide], tau[wrong.slide]))))
+        too_far = comm.allreduce(bool((self._taken & stick).any()), op=MPI.LOR)
+        near, nearest = self._front.move(here, too_far, self.points)
+        near &= stick & ~wrong.slide & ~wrong.release
+        return near, np.where(near[:, None], self.tangential(force[nearest]), tau) if near.any() else tau
 
     def turn(self, stiffness: Array) -> None:
         """Take the directions of slip from where the contactors are and from the forces last foreseen; see ``ContactPair``."""
-        self._released = np.zeros(len(self.nodes), dtype=bool)
+        self._released, self._reversed, self._taken = np.zeros((3, len(self.nodes)), dtype=bool)
+        self._front = friction.Front()
         if self.config.gdim == 2:
             return
         self._c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
@@ -327,10 +355,9 @@ class FrictionalPair(ContactPair):
         nodes = np.concatenate([self.config.to_global(self.nodes), followed])
         return nodes, np.concatenate([tau, -weight[:, None] * tau[row]])
 
-    def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
-        """Give the trial state contact forces, with the friction that was read or foreseen with them; see ``ContactPair``."""
-        super().set_forces(lam, nodal, force, active)
-        self.trial = replace(self.trial, friction=replace(self._rub(), tau=self._told))
+    def with_forces(self, lam: Array, nodal: Array, force: Array) -> PairState:
+        """The trial state with contact forces and the friction that was read or foreseen with them; see ``ContactPair``."""
+        return replace(super().with_forces(lam, nodal, force), friction=replace(self._rub(), tau=self._told))
 
     @property
     def _multipliers(self) -> Array:

@@ -152,6 +152,11 @@ class ContactPair:
         """Number of active contactors over all ranks (collective)."""
         return int(self.config.comm.allreduce(int(self.trial.active.sum())))
 
+    @property
+    def pattern(self) -> bytes:
+        """What tells one distribution of active contactors of this rank from others."""
+        return self.trial.active.tobytes()
+
     def largest_gap(self) -> float:
         """Largest gap of an active contactor over all ranks, a length (collective)."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
@@ -242,9 +247,10 @@ class ContactPair:
         """Those that break the conditions of contact and those that break the ones of friction; arguments as of ``wrong`` (collective)."""
         return wrong
 
-    def exchange(self, wrong: active_set.Wrong) -> None:
-        """Let wrong contactors change sides (collective)."""
+    def exchange(self, wrong: active_set.Wrong, ahead: bool) -> bool:
+        """Let wrong contactors change sides, and those that are to follow them if ``ahead`` (collective): whether there are any."""
         self._set_active(active_set.exchange(self.trial, wrong))
+        return False
 
     def place_again(self) -> None:
         """Put contactors whose equations have changed where they now belong (collective)."""
@@ -300,18 +306,20 @@ class ContactPair:
         """The contact forces of a state at nodes of both bodies; see ``Coupling.nodal_forces``."""
         return self.coupling.nodal_forces(self.placement, state)
 
-    def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
-        """Give the trial state contact forces, and an active set if another method than elimination decides on it.
+    def with_forces(self, lam: Array, nodal: Array, force: Array) -> PairState:
+        """The trial state with contact forces that were read or foreseen.
 
         Args:
             lam: force along the normal that decides on contact ``(n,)``.
             nodal: of the node along the normal ``(n,)``.
             force: on the contactor ``(n, gdim)``.
-            active: ``(n,)``.
         """
-        self.trial = replace(
-            self.trial, lam=lam, nodal=nodal, force=force, active=self.trial.active if active is None else active
-        )
+        return replace(self.trial, lam=lam, nodal=nodal, force=force)
+
+    def set_forces(self, lam: Array, nodal: Array, force: Array, active: Bools | None = None) -> None:
+        """Give the trial state contact forces, and an active set ``(n,)`` if another method than elimination decides on it."""
+        state = self.with_forces(lam, nodal, force)
+        self.trial = state if active is None else replace(state, active=active)
 
     def curvature(self) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mpi4py import MPI
 
@@ -142,7 +142,6 @@ def unbalanced(pairs: Sequence[ContactPair], F: PETSc.Vec, forces: Sequence[tupl
     """
     every = F.array_r.reshape(-1, F.getBlockSize()).copy()
     left = every.copy()
-    for pair, (lam, nodal, force) in zip(pairs, forces):
-        state = replace(pair.trial, lam=lam, nodal=nodal, force=force)
-        left -= pair.config.add_at_owners(*pair.nodal_forces(state))
+    for pair, found in zip(pairs, forces):
+        left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(*found)))
     return left, every

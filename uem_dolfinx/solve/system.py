@@ -254,8 +254,8 @@ class BodySystem:
                 self._take(forces)
                 return None
             wrong = self._choose(wrong, foreseen, count)
-            for pair, w in zip(self.pairs, wrong):
-                pair.exchange(w)
+            if any([pair.exchange(w, self._pivoting.ahead) for pair, w in zip(self.pairs, wrong)]):
+                self._pivoting.start_again()
             rows = self._rows()
             # a body that is let go has to fall first
             self._adrift = self.floating.adrift
@@ -275,8 +275,8 @@ class BodySystem:
         worst = max(w.worst for w in wrong)
         deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, worst))
         if not self._pivoting.all_at_once(count):
-            active = zlib.crc32(b"".join(pair.trial.active.tobytes() for pair in self.pairs))
-            if self._pivoting.repeats(self.comm.allgather(active)) and self._curvature is not None:
+            pattern = zlib.crc32(b"".join(pair.pattern for pair in self.pairs))
+            if self._pivoting.repeats(self.comm.allgather(pattern)) and self._curvature is not None:
                 # with curvature the problem may have no solution, or several; without there is one
                 self._curvature, self._pivoting = None, Pivoting()
             return [w.among_the_worst(worst) for w in wrong]
