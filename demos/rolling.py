@@ -1,0 +1,127 @@
+"""A disc rolls down a rough incline, or slides, against the closed forms of a rigid one.
+
+python3 demos/rolling.py --plot rolling.png
+"""
+
+# %% [markdown]
+# # Rolling down an incline
+#
+# A disc with a narrow hole, of radii R and r, lies on a rough rigid plane, which is tilted by alpha at once. With `k = (1 + r^2/R^2) / 2`
+# its moment of inertia over m R^2, a rigid disc rolls with the acceleration
+#
+#     g sin(alpha) / (1 + k)        while        tan(alpha) < mu (1 + 1/k),
+#
+# which is 2/3 g sin(alpha) up to 3 mu without a hole. Beyond, friction is not enough: it slides and turns with
+#
+#     g (sin(alpha) - mu cos(alpha)),        angular acceleration  mu g cos(alpha) / (k R).
+#
+# This disc is elastic: it rests on some of its nodes, whose anchors it leaves one after the other as it rolls over them.
+
+# %%
+import common
+import numpy as np
+import ufl
+from common import comm
+from dolfinx import fem
+
+import uem_dolfinx as uem
+
+args = common.arguments(__doc__, n=64, layers=6, E=1e3, mu=0.3, dt=0.02, end=2.0)
+R, r, g = 1.0, 0.1, 1.0
+k = (1 + (r / R) ** 2) / 2
+
+
+# %% [markdown]
+# ## One disc
+# It is pressed on by its weight across the plane first. Its way is that of its centre of mass; its angular velocity that about it.
+
+
+# %%
+def run(alpha: float):
+    """Times, ways and angular velocities; shares of contactors that stick while it moves; frames."""
+    mesh, tags = uem.read_gmsh(
+        common.MESHES / "ring.geo", comm, gdim=2, parameters={"R": R, "r": r, "n": args.n, "layers": args.layers}
+    )
+    V = uem.function_space(mesh, 1, (2,))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    material = uem.StVenantKirchhoff(args.E, 0.3, kind="plane_strain")
+    weight = fem.Constant(mesh, (0.0, -g * np.cos(alpha)))
+    F = material.residual(u, v) * ufl.dx - ufl.inner(weight, v) * ufl.dx
+    plane = uem.RigidPlane((0.0, -R), (0.0, 1.0))
+    lies = uem.UnitedProblem(
+        F, u, contacts=[uem.Contact(tags["outside"], plane, friction=args.mu)], petsc_options_prefix="lying_"
+    )
+    lies.solve()
+
+    contact = uem.Contact(tags["outside"], plane, friction=args.mu)
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=uem.generalised_alpha(0.5))
+    problem = uem.UnitedProblem(
+        F, u, contacts=[contact], dynamics=dynamics, petsc_options_prefix="rolling_", verbose=args.verbose
+    )  # fmt: skip
+    weight.value[:] = g * np.sin(alpha), -g * np.cos(alpha)
+    writer = uem.ResultsWriter(f"{args.output}/rolling_{alpha:.2f}", problem) if args.output else None
+    place, area, w = ufl.SpatialCoordinate(mesh) + u, uem.integrate(fem.Constant(mesh, 1.0) * ufl.dx), dynamics.velocity
+    rows, frames, every, slips = (
+        [(0.0, uem.integrate(place[0] * ufl.dx) / area, 0.0)],
+        [],
+        max(1, round(args.end / args.dt / 6)),
+        0,
+    )
+    for step in uem.time_steps(problem, args.dt, args.end):
+        x, y = (uem.integrate(place[i] * ufl.dx) / area for i in range(2))
+        turning = uem.integrate(((place[0] - x) * w[1] - (place[1] - y) * w[0]) * ufl.dx)
+        inertia = uem.integrate(((place[0] - x) ** 2 + (place[1] - y) ** 2) * ufl.dx)
+        rows.append((step.time, x, -turning / inertia))
+        slips += comm.allreduce(int((contact.status.x.array[contact.pair.nodes] == 2).sum())) > 0
+        if step.number % every == 1:
+            if writer:
+                writer.write(step)
+            if args.plot:
+                frames.append(uem.outline(problem))
+    if writer:
+        writer.close()
+    t, x, omega = np.array(rows).T
+    return t, x - x[0], omega, slips / (len(t) - 1), frames
+
+
+# %% [markdown]
+# ## The figures
+# Accelerations are those of the parabola and the line that come nearest to what was measured.
+
+# %%
+rows, curves = [], []
+for part in (0.5, 0.9, 1.25, 2.0):
+    alpha = float(np.arctan(part * args.mu * (1 + 1 / k)))
+    t, x, omega, slips, frames = run(alpha)
+    rolls = part < 1
+    exact = g * (np.sin(alpha) / (1 + k) if rolls else np.sin(alpha) - args.mu * np.cos(alpha))
+    turns = exact / R if rolls else args.mu * g * np.cos(alpha) / (k * R)
+    along, about = 2 * (x @ t**2) / (t**2 @ t**2), (omega @ t) / (t @ t)
+    rows.append({
+        "tan(alpha)/mu": part * (1 + 1 / k), "acceleration": float(along), "exact": exact, "angular": float(about), "exact ": turns,
+        "slipping": float(slips), "error": float(max(abs(along / exact - 1), abs(about / turns - 1))),
+    })  # fmt: skip
+    curves.append((t, x, exact, frames))
+results = {
+    "disc": rows,
+    "rolling_error": max(row["error"] for row in rows[:2]),
+    "sliding_error": max(row["error"] for row in rows[2:]),
+}
+common.report(args, results)
+
+# %%
+if args.plot:
+    with uem.figure(args.plot, comm, panels=2, size=(6.4, 4.0)) as (left, right):
+        if left:
+            for lines in curves[1][3]:
+                left.plot(*lines.transpose(2, 1, 0), color="C1", lw=0.8)
+            left.axhline(-R, color="0.3", lw=2)
+            left.set_aspect("equal")
+            for (t, x, exact, _), row in zip(curves, rows):
+                (line,) = right.plot(t, x, label=f"tan(alpha) = {row['tan(alpha)/mu']:.2f} mu")
+                right.plot(t[::10], exact * t[::10] ** 2 / 2, "o", ms=3, color=line.get_color())
+            right.set(xlabel="time", ylabel="way, dots: rigid disc")
+            right.legend(frameon=False)
+
+# %%
+assert results["rolling_error"] < 0.02 and results["sliding_error"] < 0.02, results
