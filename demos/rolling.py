@@ -26,7 +26,7 @@ from dolfinx import fem
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, n=64, layers=6, E=1e3, mu=0.3, dt=0.02, end=2.0)
+args = common.arguments(__doc__, n=64, layers=5, E=400.0, mu=0.3, dt=0.02, end=3.0)
 R, r, g = 1.0, 0.1, 1.0
 k = (1 + (r / R) ** 2) / 2
 
@@ -38,7 +38,7 @@ k = (1 + (r / R) ** 2) / 2
 
 # %%
 def run(alpha: float):
-    """Times, ways and angular velocities; shares of contactors that stick while it moves; frames."""
+    """Times, ways and angular velocities; the share of steps in which contactors slip; frames; k of the masses at the nodes."""
     mesh, tags = uem.read_gmsh(
         common.MESHES / "ring.geo", comm, gdim=2, parameters={"R": R, "r": r, "n": args.n, "layers": args.layers}
     )
@@ -60,18 +60,26 @@ def run(alpha: float):
     )  # fmt: skip
     weight.value[:] = g * np.sin(alpha), -g * np.cos(alpha)
     writer = uem.ResultsWriter(f"{args.output}/rolling_{alpha:.2f}", problem) if args.output else None
-    place, area, w = ufl.SpatialCoordinate(mesh) + u, uem.integrate(fem.Constant(mesh, 1.0) * ufl.dx), dynamics.velocity
-    rows, frames, every, slips = (
-        [(0.0, uem.integrate(place[0] * ufl.dx) / area, 0.0)],
-        [],
-        max(1, round(args.end / args.dt / 6)),
-        0,
-    )
+    M, X = dynamics.mass.M, V.tabulate_dof_coordinates()[:, :2]
+    vector, frames, every, slips = M.createVecRight(), [], max(1, round(args.end / args.dt / 6)), 0
+
+    def moments(values: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Integral of the mass times values, and of their moment about the origin (collective)."""
+        vector.array[:] = values[: len(vector.array) // 2].ravel()
+        p = (M * vector).array_r.reshape(-1, 2)
+        x = x[: len(p)]
+        return comm.allreduce(np.array([*p.sum(axis=0), (x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0]).sum()]))
+
+    def look() -> tuple[float, float]:
+        """Where the centre is along the plane, and how fast the disc turns about it (collective)."""
+        x = X + u.x.array.reshape(-1, 2)
+        x = x - moments(x, x)[:2] / dynamics.mass.total[0]
+        turning = moments(dynamics.velocity.x.array.reshape(-1, 2), x)[2] / moments(x[:, ::-1] * (-1, 1), x)[2]
+        return float((X + u.x.array.reshape(-1, 2) - x)[0, 0]), -float(turning)
+
+    rows = [(0.0, *look())]
     for step in uem.time_steps(problem, args.dt, args.end):
-        x, y = (uem.integrate(place[i] * ufl.dx) / area for i in range(2))
-        turning = uem.integrate(((place[0] - x) * w[1] - (place[1] - y) * w[0]) * ufl.dx)
-        inertia = uem.integrate(((place[0] - x) ** 2 + (place[1] - y) ** 2) * ufl.dx)
-        rows.append((step.time, x, -turning / inertia))
+        rows.append((step.time, *look()))
         slips += comm.allreduce(int((contact.status.x.array[contact.pair.nodes] == 2).sum())) > 0
         if step.number % every == 1:
             if writer:
@@ -81,25 +89,28 @@ def run(alpha: float):
     if writer:
         writer.close()
     t, x, omega = np.array(rows).T
-    return t, x - x[0], omega, slips / (len(t) - 1), frames
+    inertia = moments(X[:, ::-1] * (-1, 1), X)[2] / (dynamics.mass.total[0] * R**2)
+    return t, x - x[0], omega, slips / (len(t) - 1), frames, float(inertia)
 
 
 # %% [markdown]
 # ## The figures
-# Accelerations are those of the parabola and the line that come nearest to what was measured.
+# After the tilt friction grows with the shear of the disc first, and the disc trembles. Accelerations are those of the parabola and the
+# line that come nearest to what was measured in the later three quarters.
 
 # %%
 rows, curves = [], []
 for part in (0.5, 0.9, 1.25, 2.0):
     alpha = float(np.arctan(part * args.mu * (1 + 1 / k)))
-    t, x, omega, slips, frames = run(alpha)
+    t, x, omega, slips, frames, inertia = run(alpha)
     rolls = part < 1
-    exact = g * (np.sin(alpha) / (1 + k) if rolls else np.sin(alpha) - args.mu * np.cos(alpha))
-    turns = exact / R if rolls else args.mu * g * np.cos(alpha) / (k * R)
-    along, about = 2 * (x @ t**2) / (t**2 @ t**2), (omega @ t) / (t @ t)
+    exact = g * (np.sin(alpha) / (1 + inertia) if rolls else np.sin(alpha) - args.mu * np.cos(alpha))
+    turns = exact / R if rolls else args.mu * g * np.cos(alpha) / (inertia * R)
+    later = t >= args.end / 4
+    along, about = 2 * np.polyfit(t[later], x[later], 2)[0], np.polyfit(t[later], omega[later], 1)[0]
     rows.append({
         "tan(alpha)/mu": part * (1 + 1 / k), "acceleration": float(along), "exact": exact, "angular": float(about), "exact ": turns,
-        "slipping": float(slips), "error": float(max(abs(along / exact - 1), abs(about / turns - 1))),
+        "slipping": float(slips), "k": inertia, "error": float(max(abs(along / exact - 1), abs(about / turns - 1))),
     })  # fmt: skip
     curves.append((t, x, exact, frames))
 results = {
@@ -124,4 +135,6 @@ if args.plot:
             right.legend(frameon=False)
 
 # %%
-assert results["rolling_error"] < 0.02 and results["sliding_error"] < 0.02, results
+# a polygon rolls over its corners: it trembles less the more of them there are, and the mean is the better the longer it rolls
+bound = 0.02 * (64 / args.n) * (3.0 / args.end)
+assert results["rolling_error"] < bound and results["sliding_error"] < bound, results

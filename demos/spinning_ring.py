@@ -122,4 +122,5 @@ if args.plot:
 
 # %%
 assert results["cone_excess"] < 1e-10 and results["momentum_error"] < 1e-10 and results["angular_momentum_error"] < 1e-10, results
-assert all(row["friction"] > 0 > row["energy"] > -0.01 for row in rows), rows
+# what the wall's grip on a step costs is of first order in it
+assert all(row["friction"] > 0 > row["energy"] > -args.dt for row in rows), rows
