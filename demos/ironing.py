@@ -110,10 +110,13 @@ problem = uem.UnitedProblem(
     verbose=args.verbose,
 )  # fmt: skip
 writer = uem.ResultsWriter(f"{args.output}/ironing", problem) if args.output else None
-done, forces, balances, middle = [], [], [], u.x.array.copy()
+done, forces, balances, local, middle = [], [], [], [], u.x.array.copy()
 for step in uem.load_steps(problem, steps):
     done.append(step)
     forces.append(contact.resultant(on="target" if rigid else "contactor").force)
+    state = contact.pair.trial
+    tau = np.zeros(1) if state.friction is None else np.linalg.norm(state.friction.tau, axis=1)
+    local.append(comm.allreduce(np.array([tau.sum(), state.lam.sum()])))
     balance = contact.balance()
     balances.append((0.0, 0.0) if balance is None else (balance.force, balance.moment))
     if step.factor * steps <= 2 + len(before) - 1 + samples // 2:
@@ -144,6 +147,8 @@ results = {
     "moment_imbalance": None if rigid else float(worst_moment),
     "force": float(mean[-1]),
     "mean_drag_ratio": float(abs(mean[0] / mean[-1])),
+    # each contactor's friction along the surface over its force normal to it; the drag is another ratio, for normals lean
+    "local_drag_ratio": float(np.divide(*np.array(local)[inside].sum(axis=0))),
     "largest_drag_ratio": float(np.abs(force[inside][:, 0] / force[inside][:, -1]).max()),
     "return_error": float(np.abs(force[inside][-1] - force[inside][0]).max() / mean[-1]),
     "drag_elements": float((L - begin) / pitch),
