@@ -13,7 +13,6 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.algebra import linear_solver
 from uem_dolfinx.parallel import agree
 
 COMM = MPI.COMM_WORLD
@@ -258,7 +257,7 @@ def test_prescribed_normal_of_a_contactor(target):
     [("hypre", {"pc_type": "hypre"}), ("mumps", {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"})],
 )
 def test_missing_backend(monkeypatch, backend, options):
-    monkeypatch.setattr(linear_solver, f"has_{backend}", lambda: False)
+    monkeypatch.setattr(f"uem_dolfinx.algebra.options.has_{backend}", lambda: False)
     b = blocks(COMM, "triangle", 2, 2)
     error = raised(uem.MissingBackendError, f"{backend}.*built without {backend}", lambda: problem_of(b, petsc_options=options))
     assert "use" in str(error)
@@ -267,9 +266,9 @@ def test_missing_backend(monkeypatch, backend, options):
 def test_without_backends_a_default_is_found(monkeypatch):
     """Without MUMPS and hypre the default options still solve."""
     for backend in ("hypre", "mumps"):
-        monkeypatch.setattr(linear_solver, f"has_{backend}", lambda: False)
+        monkeypatch.setattr(f"uem_dolfinx.algebra.options.has_{backend}", lambda: False)
     if COMM.size > 1:
-        monkeypatch.setattr("uem_dolfinx.algebra.linear_solver.DIRECT_UP_TO", {2: 0, 3: 0})
+        monkeypatch.setattr("uem_dolfinx.algebra.options.DIRECT_UP_TO", {2: 0, 3: 0})
     b = blocks(COMM, "triangle", 2, 4)
     contact = uem.Contact(b.high, b.low)
     problem = problem_of(b, contact, bcs=b.oedometer(0.01))

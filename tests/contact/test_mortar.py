@@ -186,6 +186,19 @@ def test_rigid_plane(cell, degree, sliding):
     assert contact.resultant(on="target").force[-1] == pytest.approx(-0.02 * M, rel=1e-10)
 
 
+@pytest.mark.parametrize(("angle", "covers"), [(40.0, True), (43.0, False)])
+def test_rigid_surfaces_cover_what_faces_them(angle, covers):
+    """A plane covers facets that lean by less than 41 degrees; nodes of others have equations of their own."""
+    s = scene(COMM, "triangle", [box("triangle", [0.0, 0.0], [1.0, 1.0], [2, 2])])
+    u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+    a = np.deg2rad(angle)
+    plane = uem.RigidPlane((0.0, -0.8), (np.sin(a), np.cos(a)))
+    contact = uem.Contact(s.tag("bottom", 0, at(1, 0.0)), plane, coupling="mortar", max_penetration=1.0)
+    uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(u.function_space, s.tag("top", 0, at(1, 1.0))), contacts=[contact])
+    contact.pair.project()
+    assert (contact.pair.placement.details.covered == covers).all()
+
+
 @pytest.mark.parametrize("punch", [0.03, 0.1])
 def test_what_is_hardly_covered(punch):
     """A punch on 3 % of a facet far from its nodes is carried by one row of all of them; on 10 % by a row for each."""

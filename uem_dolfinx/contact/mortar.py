@@ -39,6 +39,10 @@ from uem_dolfinx.log import timed
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
 #: [convention; radians; test_mortar.py::test_parallel_facets]
 PARALLEL = 1e-10
+#: A rigid surface covers a facet if the cosine of the angle between its normal and the facet's reversed is larger at all points: the
+#: rows of small and fixed sliding are kept along the facet's normal.
+#: [convention; cosine; test_mortar.py::test_rigid_surfaces_cover_what_faces_them]
+COVERS = 0.75
 #: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
 #: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
 COVERED_AGAIN = 0.5
@@ -222,7 +226,7 @@ class Mortar(NodeToSurface):
         lean = -np.einsum("qg,qg->q", p.normal, planes.normal[row])
         flat = np.einsum("qfg,qeg->qfe", tangents(tab, x[row]), planes.axes[row][:, :-1])
         weight = np.tile(weights, m) * np.abs(np.linalg.det(flat))
-        i = np.flatnonzero((lean.reshape(m, q) > FACING).all(axis=1)[row])
+        i = np.flatnonzero((lean.reshape(m, q) > COVERS).all(axis=1)[row])
         none = np.zeros((len(i), 0))
         s = Segments(row[i], xi[i], none, weight[i], p.gap[i])
         return Pieces(s, np.arange(m), p.normal[i], none, np.zeros((m, 0), np.int64), np.zeros((m, 0, g)), p.hessians(i))
