@@ -142,7 +142,9 @@ def test_shorter_steps_are_no_worse(cfl):
     assert path.stress[(path.ahead > 0.3) & (path.ahead < 0.95)].mean() == pytest.approx(1.0, abs=0.07)
 
 
-@pytest.mark.parametrize(("mass", "stiffness"), [(0.01, 1.0), (0.1, 0.1), (0.3, 1.0)])
+@pytest.mark.parametrize(
+    ("mass", "stiffness"), [(0.01, 1.0), *(pytest.param(*how, marks=pytest.mark.slow) for how in ((0.1, 0.1), (0.3, 1.0)))]
+)
 def test_a_light_block_leaves_again(mass, stiffness):
     """Steps to the instants are so short that rounding hides the forces of some; these are passed over, and nothing is won."""
     path = Landing(mass, stiffness).run(2.2)

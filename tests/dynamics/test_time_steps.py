@@ -137,7 +137,7 @@ def test_damping_form(rate):
     ("cell", "mass"),
     [
         pytest.param("quadrilateral", uem.lumped_mass, marks=pytest.mark.slow),
-        ("quadrilateral", uem.consistent_mass),
+        pytest.param("quadrilateral", uem.consistent_mass, marks=pytest.mark.slow),
         pytest.param("hexahedron", uem.consistent_mass, marks=pytest.mark.slow),
         ("triangle", uem.lumped_mass),
     ],
@@ -198,6 +198,7 @@ def test_massless_contactors_have_no_velocity_of_their_own():
     assert np.all((v > 5) & (v < 15))
 
 
+@pytest.mark.slow
 def test_instants_are_found():
     """A step begins at the touch and at the departure, to the tolerance asked for; departures converge with the steps."""
 
@@ -302,7 +303,7 @@ def test_ranks_see_the_same_motion():
             material.residual(u, w) * ufl.dx, u, bcs=clamp(V, s.tag("base", 0, at(1, 0.0))), contacts=[contact],
             dynamics=dynamics, rtol=1e-11,
         )  # fmt: skip
-        rows = [[*contact.resultant().force, *dynamics.momentum()] for _ in uem.time_steps(problem, 0.01, 0.4)]
+        rows = [[*contact.resultant().force, *dynamics.momentum()] for _ in uem.time_steps(problem, 0.01, 0.25)]
         found.append(np.array(rows))
     assert found[0][:, 1].max() > 1.0
     assert np.allclose(*found, rtol=1e-7, atol=1e-7 * np.abs(found[1]).max())

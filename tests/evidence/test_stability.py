@@ -46,7 +46,11 @@ def test_correct(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["E ratio 1e-09", "vertex ridge", "edge 3D", "off the end", "beside 2D finite", "two-pass 3:4", "chain"]
+    "name",
+    [
+        *("E ratio 1e-09", "edge 3D", "beside 2D finite", "two-pass 3:4", "chain"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("vertex ridge", "vertex flat", "sharp corner", "off the end")),
+    ],
 )
 def test_correct_with_mortar(name):
     """Forces along the facets' own normals, gaps closed in the mean."""

@@ -217,7 +217,8 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
 @pytest.mark.parametrize(
     ("cell", "normals"),
     [
-        ("triangle", "averaged"), ("quadrilateral", "facet"), ("tetrahedron", "facet"),
+        ("triangle", "averaged"), ("quadrilateral", "facet"),
+        pytest.param("tetrahedron", "facet", marks=pytest.mark.slow),
         pytest.param("triangle", "facet", marks=pytest.mark.slow),
         pytest.param("quadrilateral", "averaged", marks=pytest.mark.slow),
         pytest.param("tetrahedron", "averaged", marks=pytest.mark.slow),

@@ -59,7 +59,7 @@ def kept(kind, folder):
 
 
 @pytest.mark.parametrize(
-    "stops", [pytest.param((3,), marks=pytest.mark.slow), (4, 1), (3, 2, 1)] if COMM.size == 1 else [(4, 1)], ids=str
+    "stops", [*(pytest.param(n, marks=pytest.mark.slow) for n in ((3,), (3, 2, 1)) if COMM.size == 1), (4, 1)], ids=str
 )
 @pytest.mark.parametrize("kind", RAMPS)
 def test_interrupted_is_uninterrupted(kind, stops, folder):

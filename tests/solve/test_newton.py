@@ -188,6 +188,7 @@ def test_failure_restores_the_committed_state():
     assert problem.solve()[-1].residual <= 1e-10
 
 
+@pytest.mark.slow
 def test_failure_after_all_cuts_keeps_the_last_step():
     """The load, too, is the one of the last converged state."""
     b = blocks(COMM, "triangle", 2, 4)

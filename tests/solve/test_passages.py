@@ -193,7 +193,7 @@ def above(target, top, way, moves=None):
     [
         (lambda: slab(0.02), 0.02, [0.0, -0.12], None),
         (lambda: slab(0.02), 0.02, [0.1, -0.12], None),
-        (lambda: slab(0.02), 0.02, [0.0, 0.0], ([0.0, 0.12],)),
+        pytest.param(lambda: slab(0.02), 0.02, [0.0, 0.0], ([0.0, 0.12],), marks=pytest.mark.slow),
         (lambda: slab(0.02), 0.02, [0.0, -0.05], ([0.3, 0.07],)),
         (lambda: slab(0.02), 0.02, [0.0, -0.02], ([0.0, 0.1], [0.1])),
     ],
