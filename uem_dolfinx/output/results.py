@@ -84,7 +84,7 @@ class ResultsWriter(Closing):
     names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree 2 is interpolated.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
-    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``.
+    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``::
 
         with uem.Checkpoint("out/run.uem") as checkpoint:
             checkpoint.begin(problem.state())
