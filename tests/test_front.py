@@ -52,6 +52,20 @@ def test_readme(folder, monkeypatch, capsys):
         assert all((folder / "results" / name).exists() for name in ("scene.png", "hertz.csv"))
 
 
+@pytest.mark.slow
+def test_tutorial(folder, monkeypatch):
+    """The geometry and the script of the tutorial run as they stand there, and their figures are those of the text."""
+    page = (REPO / "demos" / "site" / "tutorial.md").read_text(encoding="utf-8")
+    if COMM.rank == 0:
+        (folder / "roller.geo").write_text(re.search(r"```c\n(.*?)```", page, re.DOTALL)[1], encoding="utf-8")
+    COMM.barrier()
+    monkeypatch.chdir(folder)
+    known = {}
+    exec(compile("".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), "tutorial.md", "exec"), known)
+    assert known["pressure"] == pytest.approx(1.03 * known["hertz"], rel=0.01)
+    assert max(known["balance"].force, known["balance"].moment) < 1e-14
+
+
 def test_readme_is_short_and_needs_no_inner_module():
     assert len(README.splitlines()) <= 20
     sources = {"README.md": README} | {p.name: p.read_text(encoding="utf-8") for p in (REPO / "demos").glob("*.py")}
@@ -65,7 +79,8 @@ def test_readme_is_short_and_needs_no_inner_module():
 
 def test_links_of_the_readmes():
     """Files that READMEs link to are there, and modules that the package's docstring names."""
-    for path in [REPO / "README.md", *(REPO / "uem_dolfinx").glob("README.md")]:
+    assert len((REPO / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+    for path in [REPO / "README.md", REPO / "demos" / "README.md", *(REPO / "uem_dolfinx").glob("README.md")]:
         for link in re.findall(r"\]\(([\w/.-]+)", path.read_text(encoding="utf-8")):
             assert link.startswith("http") or (path.parent / link).exists(), f"{path.name}: {link}"
     for module in re.findall(r"``([a-z_.]+)``", uem.__doc__):

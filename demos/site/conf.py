@@ -4,23 +4,26 @@
 """
 
 import sys
+import tomllib
 from pathlib import Path
 
-import uem_dolfinx
+
+
+sys.path.insert(0, str(Path(__file__).parent))
+import reading
 
 project = "uem_dolfinx"
 author = "uem_dolfinx contributors"
 copyright = f"2025-2026, {author}"
-version = release = "0.2.0"
-sys.path.insert(0, str(Path(__file__).parent))
+version = release = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["version"]
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode", "sphinx_design"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_design"]
 root_doc = "site/index"
 # the demos are written as scripts with cells; pages show them, and do not run them
 nb_custom_formats = {".py": "reading.demo"}
 nb_execution_mode = "off"
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
-exclude_patterns = ["common.py", "README.md", "evidence/**", "report/tables.py", "site/*.py", "**/__pycache__/**", "**/results/**"]
+exclude_patterns = ["common.py", "evidence/**", "report/tables.py", "site/*.py", "**/__pycache__/**", "**/results/**"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
 
@@ -31,7 +34,20 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 add_module_names = False
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "uem_dolfinx"
 html_copy_source = False
 html_show_sphinx = False
+
+
+def with_pages(app, name: str, source: list[str]) -> None:
+    """Let the pages of the demos follow the gallery."""
+    if name == "README":
+        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
+
+
+def setup(app):
+    """Formulas as MathML, which browsers draw themselves."""
+    app.connect("source-read", with_pages)
+    app.add_html_math_renderer("mathml", (reading.formula, None), (reading.formula, None))

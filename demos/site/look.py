@@ -17,7 +17,7 @@ import matplotlib.image
 import numpy as np
 
 #: Pages that are looked at.
-SHOWN = ("site/index", "site/tutorial", "site/gallery", "site/reference/contact", "site/explanation/elimination", "hertz_cylinder")
+SHOWN = ("site/index", "site/tutorial", "README", "site/reference/contact", "site/explanation/elimination", "hertz_cylinder")
 #: A page that shows less than this part of its pixels in other colours than the ground is empty.
 INK = 0.01
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import jupytext
+import latex2mathml.converter
+from docutils import nodes
 from nbformat import NotebookNode
 
 
@@ -17,3 +19,10 @@ def demo(text: str) -> NotebookNode:
         title, _, rest = notebook.cells[0].source.partition("\n")
         notebook.cells[0].source = f"{title}\n\n```sh\n{run}\n```\n{rest}" if run else notebook.cells[0].source
     return notebook
+
+
+def formula(writer, node: nodes.math | nodes.math_block) -> None:
+    """Write a formula of a page as MathML."""
+    block = isinstance(node, nodes.math_block)
+    writer.body.append(latex2mathml.converter.convert(node.astext(), display="block" if block else "inline"))
+    raise nodes.SkipNode
