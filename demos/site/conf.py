@@ -8,7 +8,6 @@ import tomllib
 from pathlib import Path
 
 
-
 sys.path.insert(0, str(Path(__file__).parent))
 import reading
 
