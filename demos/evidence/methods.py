@@ -27,6 +27,8 @@ METHODS = ("united", "mortar", "penalty", "penalty_surface", "lagrange", "augmen
 OWN = ("united", "mortar")
 #: Those that need a number.
 NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
+#: Those that know friction.
+RUB = ("united", "mortar", "penalty", "augmented")
 #: Overlap at which Uzawa's multipliers are good enough, as part of the model's size.
 UZAWA_OVERLAP = 1e-9
 #: Linear solves of a step: every update of the multipliers takes one or more.
@@ -69,9 +71,14 @@ def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None
         options.setdefault("max_iterations", MOST_BARRIER_ITERATIONS)
         method_of = partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter)
         return uem.UnitedProblem(F, u, method=method_of, **options)
+    rough = [contact.friction for contact in options.get("contacts", ())]
+    for contact in options.get("contacts", ()):
+        # springs have friction of their own
+        contact.friction = 0.0
     system = partial(
-        PenaltySystem, tags=tags, stiffness=parameter, points=SurfacePoints if method == "penalty_surface" else NodePoints
-    )
+        PenaltySystem, tags=tags, stiffness=parameter, friction=rough,
+        points=SurfacePoints if method == "penalty_surface" else NodePoints,
+    )  # fmt: skip
     if method == "augmented":
         options.setdefault("max_iterations", MOST_UZAWA_ITERATIONS)
         system = partial(system, overlap=UZAWA_OVERLAP)

@@ -7,7 +7,8 @@ quadrature points of the contactor's facets (integrated over the surface). Newto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,6 +58,7 @@ class Springs:
         area: reference area that each point stands for ``(k,)``.
         projection: of the points onto the target.
         force: with which each is pushed along the normal ``(k,)``.
+        friction: force of friction on each ``(k, gdim)``, and what it would be without slip; None without friction.
     """
 
     nodes: Ints
@@ -64,6 +66,7 @@ class Springs:
     area: Array
     projection: Projection
     force: Array
+    friction: tuple[Array, Array] | None = None
 
 
 def facet_rule(cell: str, n: int) -> tuple[Array, Array]:
@@ -141,6 +144,7 @@ class PenaltySystem(PushedSystem):
         stiffness: of the springs, a pressure per length.
         points: ``NodePoints`` or ``SurfacePoints``.
         overlap: at which the multipliers are good enough, as part of the model's size; None is plain penalty.
+        friction: coefficient of every contact.
     """
 
     def __init__(
@@ -153,9 +157,10 @@ class PenaltySystem(PushedSystem):
         stiffness: float,
         points: type,
         overlap: float | None = None,
+        friction: Sequence[float] = (),
         **options: Any,
     ):
-        self._stiffness_of_springs, self._overlap = stiffness, overlap
+        self._stiffness_of_springs, self._overlap, self._mu = stiffness, overlap, list(friction) or [0.0] * len(pairs)
         self._springs: list[Springs] = []
         self._A: PETSc.Mat | None = None
         for pair in pairs:
@@ -165,6 +170,10 @@ class PenaltySystem(PushedSystem):
         self._points = [points(pair, tag) for pair, tag in zip(pairs, tags)]
         self._none = [np.zeros(len(p.area)) for p in self._points]
         self._multipliers = self._committed = self._none
+        self._rough = any(self._mu)
+        #: Friction at the start of the step, with Uzawa as last brought up to date, and the displacement there.
+        self._held = self._held_before = [np.zeros((len(p.area), self.config.gdim)) for p in self._points]
+        self._start = np.array(self.config.displacement)
         self._known = [pair.committed for pair in pairs]
         self._averaged = [pair.target.averaged for pair in pairs]
 
@@ -173,7 +182,8 @@ class PenaltySystem(PushedSystem):
         committed = [pair.committed for pair in self.pairs]
         if any(now is not then for now, then in zip(committed, self._known)):
             self._committed = [s.force for s in self._springs]
-        self._known = committed
+            self._held_before = [s.friction[0] if s.friction else held for s, held in zip(self._springs, self._held_before)]
+        self._known, self._held, self._start = committed, list(self._held_before), np.array(self.config.displacement)
         for pair, points, averaged in zip(self.pairs, self._points, self._averaged):
             points.begin()
             if isinstance(pair.target, MeshTarget):
@@ -189,19 +199,41 @@ class PenaltySystem(PushedSystem):
         for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
             p = points.project()
             force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * ~_past_the_end(p)
-            self._springs.append(s := Springs(points.nodes, points.shape, points.area, p, force))
+            s = Springs(points.nodes, points.shape, points.area, p, force)
             pushed = force > 0
             overlap = max(overlap, float(np.max(np.abs(p.gap) if self._overlap else -p.gap, where=pushed, initial=0.0)))
+            if self._mu[k]:
+                s, crept = self._rub(k, s)
+                overlap = max(overlap, crept if self._overlap else 0.0)
+            self._springs.append(s)
             self._hand_on(total, s)
             self._tell(pair, s)
         total.assemble()
         return total, max(self.comm.allgather(overlap))
 
+    def _rub(self, k: int, s: Springs) -> tuple[Springs, float]:
+        """Springs along the target that slip on Coulomb's cone, and how far the others have crept (collective)."""
+        p, config = s.projection, self.config
+        moved = config.displacement - self._start
+        along = np.einsum("ka,kag->kg", s.shape, moved[s.nodes])
+        if p.nodes.shape[1]:
+            theirs = config.ask_owners(p.nodes.ravel(), moved[: config.n_owned]).reshape(*p.nodes.shape, config.gdim)
+            along = along - np.einsum("ka,kag->kg", p.weights, theirs)
+        without_slip = self._held[k] - self._stiffness_of_springs * s.area[:, None] * along
+        without_slip -= np.einsum("kg,kg->k", without_slip, p.normal)[:, None] * p.normal
+        size, most = np.linalg.norm(without_slip, axis=1), self._mu[k] * s.force
+        slips = size > most
+        friction = without_slip * np.where(slips, most / np.where(size > 0, size, 1.0), 1.0)[:, None]
+        along -= np.einsum("kg,kg->k", along, p.normal)[:, None] * p.normal
+        crept = np.linalg.norm(along, axis=1).max(where=~slips & (s.force > 0), initial=0.0)
+        return replace(s, friction=(friction, without_slip)), float(crept)
+
     def _hand_on(self, total: PETSc.Vec, s: Springs) -> None:
         """Add the forces of a pair's springs at the nodes of both bodies."""
         g = self.config.gdim
         nodes, weights = self._both(s)
-        t = s.force[:, None, None] * weights[..., None] * s.projection.normal[:, None, :]
+        push = s.force[:, None] * s.projection.normal + (s.friction[0] if s.friction else 0.0)
+        t = weights[..., None] * push[:, None, :]
         rows = (nodes[..., None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
         total.setValues(rows, t.ravel(), addv=PETSc.InsertMode.ADD)
 
@@ -233,6 +265,7 @@ class PenaltySystem(PushedSystem):
             deep = self._overlap is not None and overlap > self._overlap * self.config.size
             if deep and R.norm() <= max(SETTLED * F.norm(), rounding):
                 self._multipliers = [s.force for s in self._springs]
+                self._held = [s.friction[0] if s.friction else held for s, held in zip(self._springs, self._held)]
                 forces, _ = self._stretch()
                 R, changed = P.reduce(F - forces), True
         return IterationState(
@@ -283,13 +316,13 @@ class PenaltySystem(PushedSystem):
 
     def _with_springs(self) -> PETSc.Mat:
         """``K + sum stiffness area grad g grad g' - t grad^2 g`` over the springs that push (collective)."""
-        blocks = [self._blocks(s) for s in self._springs]
+        blocks = [self._blocks(s, mu) for s, mu in zip(self._springs, self._mu)]
         A = self.forces.tangent.K.copy()
         if self.comm.allreduce(sum(len(nodes) for nodes, _ in blocks)):
             A.axpy(1.0, contact_curvature(blocks, self.forces.vector()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return A
 
-    def _blocks(self, s: Springs) -> tuple[Ints, Array]:
+    def _blocks(self, s: Springs, mu: float) -> tuple[Ints, Array]:
         """Global nodes and stiffness of each spring that pushes."""
         i = np.flatnonzero(s.force > 0)
         nodes, weights = self._both(s)
@@ -299,7 +332,23 @@ class PenaltySystem(PushedSystem):
         finite = isinstance(s.projection, FacetProjection) or s.projection.nodes.shape[1] == 0
         if finite and self.consistent_tangent and any(pair.sliding == "finite" for pair in self.pairs):
             blocks -= s.force[i, None, None] * self._bend(s, i)
+        if s.friction:
+            blocks += self._friction_blocks(s, i, weights[i], mu)
         return nodes, blocks
+
+    def _friction_blocks(self, s: Springs, i: Ints, weights: Array, mu: float) -> Array:
+        """Stiffness of friction: of springs along the target where they hold, of the cone where they slip."""
+        n, (friction, without_slip), g = s.projection.normal[i], s.friction, self.config.gdim
+        size, most = np.linalg.norm(without_slip[i], axis=1), mu * s.force[i]
+        across = np.eye(g) - n[:, :, None] * n[:, None, :]
+        way = without_slip[i] / np.where(size > 0, size, 1.0)[:, None]
+        turned = np.eye(g) - way[:, :, None] * way[:, None, :]
+        slips = (size > most)[:, None, None]
+        part = np.where(slips, (most / np.where(size > 0, size, 1.0))[:, None, None] * turned @ across, across)
+        part = part + np.where(slips, mu * way[:, :, None] * n[:, None, :], 0.0)
+        part = part * (self._stiffness_of_springs * s.area[i])[:, None, None]
+        k, m = weights.shape
+        return np.einsum("ka,kgh,kb->kagbh", weights, part, weights).reshape(k, m * g, m * g)
 
     def _bend(self, s: Springs, i: Ints) -> Array:
         """Second derivative of the gap in the displacements of the nodes on both sides."""
@@ -315,7 +364,8 @@ class PenaltySystem(PushedSystem):
         """The increment; after some full steps, only as much of it as the potential falls."""
         du = super().move(state, dq)
         slope = dq.dot(state.residual)
-        if self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.trial.c.norm() > 0.0 or slope >= 0.0:
+        # friction has no potential
+        if self._rough or self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.trial.c.norm() > 0.0 or slope >= 0.0:
             return du
         start = self.displacement()
 

@@ -6,13 +6,13 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from evidence import cases_bending, cases_motion, cases_pressing, cases_scales, cases_touching, methods
+from evidence import cases_bending, cases_friction, cases_motion, cases_pressing, cases_scales, cases_touching, methods
 from evidence.cases import COLUMNS, FORCE, Case, Check, judge
 from evidence.cases_laws import check_laws
 from evidence.cases_scales import springs
 
 COMM = MPI.COMM_WORLD
-TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_motion)
+TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_friction, cases_motion)
 CASES = {case.name: case for m in TABLES for case in m.CASES}
 UNITED, MORTAR = COLUMNS[:2]
 
