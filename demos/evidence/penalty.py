@@ -306,7 +306,7 @@ class PenaltySystem(PushedSystem):
         sliding = any(pair.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
         made_of = self.comm.allgather((self.forces.tangent.number, on))
-        if self._A is None or sliding or made_of != self.made_of:
+        if self._A is None or sliding or self._rough or made_of != self.made_of:
             with timed("springs"):
                 A = self._with_springs()
             self.solver.set_operator(state.trial, A, None)
