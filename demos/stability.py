@@ -42,7 +42,14 @@ args = common.arguments(__doc__, methods="all", cases="all")
 asked, picked = args.methods.split(","), args.cases.split(",")
 COLUMN_NAMES = [column.name for column in COLUMNS]
 columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.method in asked]
-every = [*cases_scales.CASES, *cases_touching.CASES, *cases_pressing.CASES, *cases_bending.CASES, *cases_friction.CASES, *cases_motion.CASES]
+every = [
+    *cases_scales.CASES,
+    *cases_touching.CASES,
+    *cases_pressing.CASES,
+    *cases_bending.CASES,
+    *cases_friction.CASES,
+    *cases_motion.CASES,
+]
 rows = [c for c in every if (args.cases == "all" and (c.quick or not flag.quick)) or c.name in picked]
 if not columns or not rows:
     sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in every)}")

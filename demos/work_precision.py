@@ -6,12 +6,13 @@ python3 demos/work_precision.py --plot work_precision.png
 # %% [markdown]
 # # Which method reaches 1 %, 0.1 %, 0.01 % first?
 #
-# Four problems, each solved by every method on the same meshes, surfaces, search and Newton loop:
+# Five problems, each solved by every method on the same meshes, surfaces, search and Newton loop:
 #
 # - `signorini`: two elastic bodies, in contact for x < 0, with their exact solution, for three ratios of their stiffnesses;
 # - `hertz_cylinder`: an elastic cylinder on an elastic block, against quadratic elements on a fine mesh;
 # - `hertz_penalty`: a rigid paraboloid in 3D, against the exact solution of the discrete problem, which springs spread over the
 #   surface and a barrier do not aim at;
+# - `cattaneo`: the cylinder pushed to the side, with friction, against Mindlin's solution;
 # - `bar_impact`: a bar hits a wall, against the exact wave.
 #
 # A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best on each mesh counts,
@@ -31,11 +32,15 @@ from common import comm
 from evidence import methods
 from evidence.graphs import draw_all
 from evidence.measure import at_a_glance, at_equal_error, grouped, label, machine, measure, name_of, rate, sweep
-from evidence.problems import bar_impact, hertz_answer, hertz_cylinder, indenter
+from evidence.problems import bar_impact, cattaneo, hertz_answer, hertz_cylinder, indenter
 from evidence.signorini import signorini
 
 args = common.arguments(
-    __doc__, sizes=4, runs=5, problems="signorini,hertz_cylinder,hertz_penalty,bar_impact", methods=",".join(methods.METHODS)
+    __doc__,
+    sizes=4,
+    runs=5,
+    problems="signorini,hertz_cylinder,hertz_penalty,cattaneo,bar_impact",
+    methods=",".join(methods.METHODS),
 )
 # the indenter's overlap at the start is meant
 logging.getLogger("uem_dolfinx").setLevel(logging.ERROR)
@@ -96,6 +101,11 @@ if "hertz_cylinder" in args.problems:
     keep({})
 if "hertz_penalty" in args.problems:
     points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface", "barrier"), args.runs, progress=args.verbose)
+if "cattaneo" in args.problems:
+    without = set(methods.METHODS) - set(methods.RUB)
+    points += sweep(
+        cattaneo, (1 / 15, 1 / 30, 1 / 45)[: args.sizes], names(1, *without), min(args.runs, 1), progress=args.verbose
+    )
 
 # %% [markdown]
 # ## Impact

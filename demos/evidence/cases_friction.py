@@ -24,7 +24,10 @@ def rubbing(trial: Trial, mu: float, E: tuple[float, float] = (1.0, 1.0), width:
     if trial.column.method not in methods.RUB:
         raise NotApplicable("without friction here")
     n = round(0.6 / H)
-    boxes = [Box((0.5 - width / 2, -0.4), (0.5 + width / 2, 0.0), (round(width / H), 4), E[0]), Box((0.2, 0.0), (0.8, 0.4), (n, 4), E[1])]
+    boxes = [
+        Box((0.5 - width / 2, -0.4), (0.5 + width / 2, 0.0), (round(width / H), 4), E[0]),
+        Box((0.2, 0.0), (0.8, 0.4), (n, 4), E[1]),
+    ]
     scene = BoxScene(boxes)
     scene.hold(scene.side(0, 1, 0))
     contact = scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), friction=mu, sliding="fixed")
@@ -104,9 +107,16 @@ def to_and_fro(mu: float, trial: Trial) -> None:
 
 
 CASES = [
-    *(Case(f"slip mu {mu:g}", "a block slips on all its contactors", partial(slipping, mu, (1.0, 1.0), 4)) for mu in (1e-3, 0.3, 1.0)),
     *(
-        Case(f"slip E ratio {ratio:g}", "block over base, mu 0.3", partial(slipping, 0.3, (max(1.0, 1 / ratio), max(1.0, ratio)), 4))
+        Case(f"slip mu {mu:g}", "a block slips on all its contactors", partial(slipping, mu, (1.0, 1.0), 4))
+        for mu in (1e-3, 0.3, 1.0)
+    ),
+    *(
+        Case(
+            f"slip E ratio {ratio:g}",
+            "block over base, mu 0.3",
+            partial(slipping, 0.3, (max(1.0, 1 / ratio), max(1.0, ratio)), 4),
+        )
         for ratio in (1e-6, 1e-3, 1e3, 1e6)
     ),
     Case("slip in one step", "pressed and pushed past slip in a single step", partial(slipping, 0.3, (1.0, 1.0), 1)),

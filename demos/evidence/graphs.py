@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from common import comm
-from evidence.measure import Point, best, grouped, label, name_of
+from evidence.measure import DECISIVE, Point, best, grouped, label, name_of
 
 import uem_dolfinx as uem
 
@@ -75,7 +75,7 @@ def tidy(axis: Any) -> None:
 def draw_scene(path: Path, points: Sequence[Point]) -> None:
     """One picture of one scene: time, unknowns or time step, and condition numbers (collective)."""
     in_time = "dt" in points[0]
-    y = "error_l2" if in_time else "error_energy"
+    y = DECISIVE.get(points[0]["problem"], "error_energy")
     last = ("dt", "error_pressure") if in_time else ("dofs", "condition")
     with uem.figure(path, comm, panels=3, size=(5.4, 4.6)) as panels:
         draw(panels[0], points, "seconds", y, label(points[0]))
@@ -100,5 +100,5 @@ def draw_all(path: str, points: Sequence[Point]) -> list[str]:
     if chosen:
         with uem.figure(main, comm, panels=len(chosen), size=(5.4, 4.6)) as panels:
             for panel, group in zip(panels, chosen):
-                draw(panel, group, "seconds", "error_energy", label(group[0]))
+                draw(panel, group, "seconds", DECISIVE.get(group[0]["problem"], "error_energy"), label(group[0]))
     return [str(main), *names]

@@ -338,7 +338,7 @@ class PenaltySystem(PushedSystem):
 
     def _friction_blocks(self, s: Springs, i: Ints, weights: Array, mu: float) -> Array:
         """Stiffness of friction: of springs along the target where they hold, of the cone where they slip."""
-        n, (friction, without_slip), g = s.projection.normal[i], s.friction, self.config.gdim
+        n, (_, without_slip), g = s.projection.normal[i], s.friction, self.config.gdim
         size, most = np.linalg.norm(without_slip[i], axis=1), mu * s.force[i]
         across = np.eye(g) - n[:, :, None] * n[:, None, :]
         way = without_slip[i] / np.where(size > 0, size, 1.0)[:, None]
@@ -365,7 +365,13 @@ class PenaltySystem(PushedSystem):
         du = super().move(state, dq)
         slope = dq.dot(state.residual)
         # friction has no potential
-        if self._rough or self._solves <= FULL_STEPS or state.norm <= NEAR_BY * state.scale or state.trial.c.norm() > 0.0 or slope >= 0.0:
+        if (
+            self._rough
+            or self._solves <= FULL_STEPS
+            or state.norm <= NEAR_BY * state.scale
+            or state.trial.c.norm() > 0.0
+            or slope >= 0.0
+        ):
             return du
         start = self.displacement()
 

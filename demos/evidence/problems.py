@@ -128,6 +128,62 @@ def hertz_answer(h: float) -> HertzAnswer:
     return replace(fine, accuracy=float(np.sqrt(abs(coarse.energy / fine.energy - 1))))
 
 
+# -- Cattaneo and Mindlin ------------------------------------------------------------------------------------------------------
+
+
+def cattaneo(h: float) -> Scene:
+    """A cylinder pressed onto a block, and its flat side led to the side, see ``cattaneo_mindlin.py``: one mesh of linear elements.
+
+    The error is that of friction, read from the residual of the bodies, against Mindlin for the forces that they feel, in L2 where
+    Hertz' pressure has no vertical tangent; relative to mu times Hertz' pressure.
+    """
+    E, nu, R, depth, way, mu, reach = 1.0, 0.3, 1.0, 0.0012, 0.0004, 0.3, 0.03
+    mesh, tags = uem.read_gmsh(common.MESHES / "cattaneo_mindlin.geo", comm, gdim=2, parameters={"h": h, "R": R, "zone": reach})
+    V = compat.function_space(mesh, 1, (2,))
+    u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+    place = fem.Constant(mesh, np.zeros(2))
+    F = uem.LinearElastic(E, nu, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["block_bottom"]), uem.dirichlet(V, tags["disc_top"], value=place)]
+    residual = forms.form(F)
+
+    def nodal_forces(contact: uem.Contact) -> tuple[np.ndarray, np.ndarray]:
+        """Contact forces ``(n, 2)`` of this rank's contactors, and their areas (collective)."""
+        b = compat.create_vector(V)
+        forms.assemble_vector(b, residual)
+        nodes = contact.pair.nodes
+        # the arc ends where the disc is held
+        loose = ~np.isin(nodes, fem.locate_dofs_topological(V, 1, tags["disc_top"].entities))
+        return np.array(b.array_r).reshape(-1, 2)[nodes] * loose[:, None], tributary_areas(contact.config, contact.contactor)[
+            nodes
+        ]
+
+    def run(problem: uem.UnitedProblem) -> Iterable[Any]:
+        for aside, down in ((0.0, 0.5), (0.0, 1.0), (0.5, 1.0), (1.0, 1.0)):
+            place.value[:] = way * aside, -depth * down
+            yield from uem.load_steps(problem)
+
+    def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:
+        force, area = nodal_forces(contact)
+        parts = comm.allgather((contact.pair.points[:, 0], force, area))
+        x, force, area = (np.concatenate(part) for part in zip(*parts))
+        Q, P = -force[:, 0].sum(), force[:, 1].sum()
+        p0 = np.sqrt(P * E / (2 * (1 - nu**2)) / (np.pi * R))
+        a, x = 2 * P / (np.pi * p0), x - (x * force[:, 1]).sum() / P
+        c = a * np.sqrt(max(1 - Q / (mu * P), 0.0))
+        whole, stuck = (np.sqrt(np.maximum(part**2 - x**2, 0.0)) / a for part in (a, c))
+        exact, q = whole - stuck, -force[:, 0] / np.where(area > 0, area, 1.0) / (mu * p0)
+        inside = np.abs(x) < a - h * reach
+        return {
+            "error_pressure": norm((q - exact)[inside], area[inside]) / norm(whole[inside], area[inside]),
+            "overlap": overlap(contact) / depth,
+        }
+
+    return Scene(
+        "cattaneo", 1, F, u, bcs, lambda: uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], friction=mu, sliding="fixed"),
+        errors, stiffness=E / (h * reach), h=h * reach, run=run,
+    )  # fmt: skip
+
+
 # -- a rigid indenter --------------------------------------------------------------------------------------------------------
 
 
