@@ -38,7 +38,7 @@ def arguments(description: str | None, **options: Any) -> argparse.Namespace:
     parser.add_argument("--json", metavar="FILE", help="write the figures measured")
     parser.add_argument("--plot", metavar="FILE.png", help="draw a picture")
     parser.add_argument("--output", metavar="DIR", help="write fields for ParaView and a CSV history")
-    parser.add_argument("--verbose", action="store_true", help="show every Newton iteration")
+    parser.add_argument("--verbose", action="store_true", help="show every Newton iteration, and where time went")
     for name, value in options.items():
         if isinstance(value, tuple):
             kind: Any = {"choices": value, "default": value[0]}
@@ -79,7 +79,7 @@ def order(step: uem.LoadStep, rounding: float = 1e-12) -> float:
 
 
 def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
-    """Print the figures measured, lists of dictionaries as tables, and write the JSON file, on rank 0."""
+    """Print the figures measured, lists of dictionaries as tables, and write the JSON file, on rank 0; if verbose, where time went."""
     if comm.rank != 0:
         return
     for key, value in results.items():
@@ -91,6 +91,9 @@ def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
             print(f"{key}: " + ", ".join(f"{k} {show(v)}" for k, v in value.items()))
         else:
             print(f"{key:>20}: {show(value)}")
+    if getattr(args, "verbose", False):
+        spent = sorted(uem.timings().items(), key=lambda item: -item[1][1])
+        print("\n".join(["seconds  times  stage, some within others"] + [f"{s:7.3f} {n:6d}  {stage}" for stage, (n, s) in spent]))
     if args.json:
         Path(args.json).parent.mkdir(parents=True, exist_ok=True)
         Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

@@ -292,6 +292,7 @@ def test_interpolation_and_timing():
     uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom) + clamp(b.V, b.top))
     after = uem.timing("compile forms")
     assert after[0] > before[0] and after[1] >= before[1] and uem.timing("no such stage") == (0, 0.0)
+    assert uem.timings()["compile forms"] == after and "no such stage" not in uem.timings()
 
 
 # -- Dirichlet conditions ----------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ __all__ = [
     "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "consistent_mass",
     "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
     "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene",
-    "read_checkpoint", "read_gmsh", "time_steps", "timing", "write_checkpoint",
+    "read_checkpoint", "read_gmsh", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
@@ -69,7 +69,7 @@ from uem_dolfinx.errors import (
 from uem_dolfinx.geometry.gmsh import read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
 from uem_dolfinx.geometry.tags import Tag, Tags
-from uem_dolfinx.log import timing
+from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.materials.von_mises import VonMises
 from uem_dolfinx.output.energy import Energies, EnergyBook

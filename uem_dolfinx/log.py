@@ -45,8 +45,18 @@ def timed(stage: str) -> Iterator[None]:
     Args:
         stage: what is done inside, e.g. ``"search"``.
     """
+    _stages[stage] = None
     with Timer(f"~UEM: {stage}"):
         yield
+
+
+#: Stages that have been timed so far, in the order of their first time.
+_stages: dict[str, None] = {}
+
+
+def timings() -> dict[str, tuple[int, float]]:
+    """How often each stage has been timed on this rank so far, and its wall time in seconds; some hold others."""
+    return {stage: timing(stage) for stage in _stages}
 
 
 def timing(stage: str) -> tuple[int, float]:
