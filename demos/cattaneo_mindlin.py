@@ -149,7 +149,7 @@ if args.plot:
             right.set(xlabel="way of the disc's flat side", ylabel="Q / (mu P)")
             for ax in (left, right):
                 ax.grid(alpha=0.25)
-            left.legend(frameon=False, fontsize="small")
+            left.legend(frameon=False, fontsize="small", ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 # %%
 assert results["stick_edge_error"] <= 1 and results["loop_error"] < 1e-8 and results["iterations"] <= 5, results
