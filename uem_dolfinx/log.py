@@ -38,6 +38,10 @@ def say(line: str) -> None:
         print(line, flush=True)
 
 
+#: Stages that have been timed so far, in the order of their first time.
+_stages: dict[str, None] = {}
+
+
 @contextmanager
 def timed(stage: str) -> Iterator[None]:
     """Time a stage of the method; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
@@ -48,10 +52,6 @@ def timed(stage: str) -> Iterator[None]:
     _stages[stage] = None
     with Timer(f"~UEM: {stage}"):
         yield
-
-
-#: Stages that have been timed so far, in the order of their first time.
-_stages: dict[str, None] = {}
 
 
 def timings() -> dict[str, tuple[int, float]]:

@@ -19,7 +19,7 @@ from evidence.cases import BALANCE, COMM, FORCE, OVERLAP, Box, BoxScene, Case, N
 H = 0.1
 
 
-def rubbing(trial: Trial, mu: float, E: tuple[float, float] = (1.0, 1.0), width: float = 1.0) -> tuple[BoxScene, uem.Contact]:
+def rubbing(trial: Trial, mu: float, E: tuple[float, float] = (1.0, 1.0), width: float = 1.0) -> BoxScene:
     """Block of modulus ``E[1]`` on a base of ``E[0]`` that is held at its bottom."""
     if trial.column.method not in methods.RUB:
         raise NotApplicable("without friction here")
@@ -30,8 +30,8 @@ def rubbing(trial: Trial, mu: float, E: tuple[float, float] = (1.0, 1.0), width:
     ]
     scene = BoxScene(boxes)
     scene.hold(scene.side(0, 1, 0))
-    contact = scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), friction=mu, sliding="fixed")
-    return scene, contact
+    scene.unite(scene.side(1, 1, 0), scene.side(0, 1, 1), friction=mu, sliding="fixed")
+    return scene
 
 
 def forces(scene: BoxScene) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +65,7 @@ def check_coulomb(trial: Trial, scene: BoxScene, mu: float) -> tuple[float, floa
 
 def slipping(mu: float, E: tuple[float, float], steps: int, trial: Trial) -> None:
     """Pushed so far that all contactors slip: the sum of friction is mu times that of the normal forces."""
-    scene, _ = rubbing(trial, mu, E)
+    scene = rubbing(trial, mu, E)
     soft = min(E)
     down = 0.01 * soft / E[1]
     scene.hold(scene.side(1, 1, 1), value=(8 * (mu + 0.1) * (0.01 + down), -(0.01 + down)))
@@ -76,7 +76,7 @@ def slipping(mu: float, E: tuple[float, float], steps: int, trial: Trial) -> Non
 
 def sticking(trial: Trial) -> None:
     """Two blocks of the same width that rough friction holds together, against one body of the same mesh."""
-    scene, _ = rubbing(trial, 10.0, width=0.6)
+    scene = rubbing(trial, 10.0, width=0.6)
     whole = BoxScene([Box((0.2, -0.4), (0.8, 0.4), (round(0.6 / H), 8))])
     whole.hold(whole.side(0, 1, 0))
     push = (0.004, -0.01)
@@ -91,7 +91,7 @@ def sticking(trial: Trial) -> None:
 
 def to_and_fro(mu: float, trial: Trial) -> None:
     """Pressed, pushed until it slips, pushed back until it slips the other way, and once more: the same force each time."""
-    scene, _ = rubbing(trial, mu)
+    scene = rubbing(trial, mu)
     place = fem.Constant(scene.mesh, np.zeros(2))
     scene.bcs.append(uem.dirichlet(scene.V, scene.side(1, 1, 1), value=place))
     way = 8 * (mu + 0.1) * 0.01

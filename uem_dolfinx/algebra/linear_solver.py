@@ -158,10 +158,10 @@ class UnitedSolver:
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
-        if self._apart and self._instead and self.iterative:
-            # it tells the sign of the determinant as well
-            self._use(self._instead)
-        if test is not restriction:
+        if self._apart:
+            if self._instead and self.iterative:
+                # it tells the sign of the determinant as well
+                self._use(self._instead)
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
                 self.set_operator(restriction, K, curvature)
