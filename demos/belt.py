@@ -62,7 +62,7 @@ def belt(mu: float):
         })  # fmt: skip
     if writer:
         writer.close()
-    x, p = (np.concatenate(part) for part in zip(*comm.allgather((contact.pair.points, contact.pressures))))
+    x, p = (np.concatenate(part) for part in zip(*comm.allgather((contact.points, contact.pressures))))
     angle = np.pi - np.arctan2(x[:, 1], x[:, 0])
     order = np.argsort(angle)
     return rows, angle[order], p[order] * R / slack, problem

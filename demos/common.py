@@ -8,6 +8,7 @@ import json
 import logging
 import os
 from fractions import Fraction
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,14 @@ def order(step: uem.LoadStep, rounding: float = 1e-12) -> float:
     residuals = [iteration.residual for iteration in step.iterations]
     r = [value for value in residuals if value > rounding][-3:]
     return float(np.log(r[2] / r[1]) / np.log(r[1] / r[0])) if len(r) == 3 else float("nan")
+
+
+def draws_3d() -> bool:
+    """Whether 3D scenes can be drawn here; said where not."""
+    found = find_spec("pyvista") is not None
+    if not found and comm.rank == 0:
+        print("no picture in 3D: pip install pyvista")
+    return found
 
 
 def report(args: argparse.Namespace, results: dict[str, Any]) -> None:

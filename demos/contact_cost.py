@@ -103,7 +103,7 @@ def cg_iterations(dim: int, amg: str, fused: bool) -> tuple[int, int]:
     problem = uem.UnitedProblem(
         F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="cg_", petsc_options=common.cg(amg, 1e-8), rtol=1e-6
     )
-    solves = [i.linear_iterations for i in problem.solve() if i.linear_iterations]
+    solves = [i.linear_iterations / (1 + i.exchanges) for i in problem.solve() if i.linear_iterations]
     return round(sum(solves) / len(solves)), dim * V.dofmap.index_map.size_global
 
 

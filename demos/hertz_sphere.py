@@ -34,6 +34,7 @@ args = common.arguments(
 )  # fmt: skip
 E, nu, R = 1e6, 0.3, 1.0
 E_star, a = E / (2 * (1 - nu**2)), np.sqrt(R * args.d)
+material = uem.LinearElastic(E, nu)
 F_hertz = 4 / 3 * E_star * np.sqrt(R) * args.d**1.5
 
 
@@ -52,7 +53,7 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
     )  # fmt: skip
     V = uem.function_space(mesh, args.degree, (3,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
-    residual = uem.LinearElastic(E, nu).residual(u, v) * ufl.dx
+    residual = material.residual(u, v) * ufl.dx
     bcs = [
         uem.dirichlet(V, tags["symmetry_x"], 0),
         uem.dirichlet(V, tags["symmetry_y"], 1),
@@ -110,7 +111,10 @@ if args.output:
         writer.write(1.0)
 if args.plot:
     p0 = 1.5 * F_hertz / (np.pi * a**2)
-    with uem.figure(args.plot, comm, panels=2) as (left, right):
+    s = ufl.dev(material.stress(problem.u))
+    von_mises = ufl.sqrt(1.5 * ufl.inner(s, s))
+    solid = common.draws_3d()
+    with uem.figure(args.plot, comm, panels=3 if solid else 2) as (left, right, *scene):
         if left is not None:
             cells, percent = [a / r["h"] for r in rows], [100 * abs(r["error"]) for r in rows]
             left.loglog(cells, percent, "o-")
@@ -122,6 +126,10 @@ if args.plot:
             left.grid(alpha=0.25)
         uem.plot_pressure(problem.contacts, right, window=(0.0, 1.3 * a), reference_label="Hertz",
                           reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)))  # fmt: skip
+        if solid:
+            box = a * np.array([0.0, 1.6, 0.0, 1.6, -1.2, 1.2])
+            uem.plot_scene(problem, scene[0], field=von_mises / p0, label="von Mises stress / p0", window=box, levels=10,
+                           view=(-1.0, -1.6, 0.5))  # fmt: skip
 
 # %%
 errors = [abs(r["error"]) for r in rows]

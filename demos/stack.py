@@ -92,7 +92,11 @@ if args.plot:
     if dim == 2:
         uem.plot_scene(problem, args.plot, label="settlement")
     else:
-        uem.plot_pressure(contacts, args.plot, reference=lambda r: np.full_like(r, force), reference_label="closed form")
+        solid = common.draws_3d()
+        with uem.figure(args.plot, comm, panels=2 if solid else 1) as panels:
+            uem.plot_pressure(contacts, panels[0], reference=lambda r: np.full_like(r, force), reference_label="closed form")
+            if solid:
+                uem.plot_scene(problem, panels[1], label="settlement", view=(1.0, -1.5, 0.6))
 if args.output:
     with uem.ResultsWriter(f"{args.output}/stack", problem) as writer:
         writer.write(steps[-1])

@@ -1,4 +1,4 @@
-// Quarter of a half sphere (radius R, centre (0, 0, R)) on the quarter [0, W]^2 x [-W, 0] of a block.
+// Quarter of a half sphere (radius R, centre (0, 0, R)) on the quarter [0, W]^2 x [-W, 0] of a block; or half of both, from x = -R and -W.
 //
 // h scales the whole mesh: it is the size of the cells in the contact zone, and cells grow with the distance from there.
 SetFactory("OpenCASCADE");
@@ -9,7 +9,8 @@ DefineConstant[
   W = 2,         // width and height of the block
   zone = 0.05,   // the contact zone reaches this far from the tip
   growth = 30,   // cells at distance r are growth * h * r large
-  order = 1      // of the cells: 2 follows the sphere with curved ones
+  order = 1,     // of the cells: 2 follows the sphere with curved ones
+  half = 0       // 1: half of both bodies, not a quarter
 ];
 h_block = h * (ratio > 1 ? ratio : 1);
 h_sphere = h / (ratio < 1 ? ratio : 1);
@@ -18,17 +19,18 @@ h_sphere = h / (ratio < 1 ? ratio : 1);
 Sphere(1) = {0, 0, 0, R};
 Rotate {{1, 0, 0}, {0, 0, 0}, Pi / 2} { Volume{1}; }
 Translate {0, 0, R} { Volume{1}; }
-Box(2) = {0, 0, 0, R, R, R};
+Box(2) = {-half * R, 0, 0, (1 + half) * R, R, R};
 BooleanIntersection(3) = { Volume{1}; Delete; }{ Volume{2}; Delete; };
-Box(4) = {0, 0, -W, W, W, W};
+Box(4) = {-half * W, 0, -W, (1 + half) * W, W, W};
 
 e = 1e-3 * R;
+x0 = -half * W - e;
 plane_x() = Surface In BoundingBox {-e, -e, -W - e, e, W + e, R + e};
-plane_y() = Surface In BoundingBox {-e, -e, -W - e, W + e, e, R + e};
-sphere_top() = Surface In BoundingBox {-e, -e, R - e, R + e, R + e, R + e};
-block_top() = Surface In BoundingBox {-e, -e, -e, W + e, W + e, e};
-block_bottom() = Surface In BoundingBox {-e, -e, -W - e, W + e, W + e, -W + e};
-cap() = Surface In BoundingBox {-e, -e, -e, R + e, R + e, R + e};
+plane_y() = Surface In BoundingBox {x0, -e, -W - e, W + e, e, R + e};
+sphere_top() = Surface In BoundingBox {x0, -e, R - e, R + e, R + e, R + e};
+block_top() = Surface In BoundingBox {x0, -e, -e, W + e, W + e, e};
+block_bottom() = Surface In BoundingBox {x0, -e, -W - e, W + e, W + e, -W + e};
+cap() = Surface In BoundingBox {x0, -e, -e, R + e, R + e, R + e};
 cap() -= plane_x();
 cap() -= plane_y();
 cap() -= sphere_top();
@@ -39,7 +41,9 @@ Physical Surface("sphere_cap") = {cap()};
 Physical Surface("sphere_top") = {sphere_top()};
 Physical Surface("block_top") = {block_top()};
 Physical Surface("block_bottom") = {block_bottom()};
-Physical Surface("symmetry_x") = {plane_x()};
+If (!half)
+  Physical Surface("symmetry_x") = {plane_x()};
+EndIf
 Physical Surface("symmetry_y") = {plane_y()};
 
 Field[1] = MathEval;

@@ -18,13 +18,13 @@ Mechanics and Engineering 191 (2001) 843-860.
 from __future__ import annotations
 
 __all__ = [
-    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Energies",
+    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Elastic", "Energies",
     "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
     "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
     "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
     "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
-    "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "consistent_mass",
+    "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "consistent_mass",
     "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
     "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene",
     "read_checkpoint", "read_gmsh", "time_steps", "timing", "timings", "write_checkpoint",
@@ -70,14 +70,17 @@ from uem_dolfinx.geometry.gmsh import read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
-from uem_dolfinx.materials.elastic import LinearElastic, NeoHooke, StVenantKirchhoff
+from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.materials.von_mises import VonMises
 from uem_dolfinx.output.energy import Energies, EnergyBook
-from uem_dolfinx.output.pictures import figure, outline, plot_pressure, plot_scene
+from uem_dolfinx.output.films import animate
+from uem_dolfinx.output.frames import outline
+from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
 from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.scripting import dirichlet, ds, dx, integrate
-from uem_dolfinx.solve.load_steps import LoadStep, load_steps
+from uem_dolfinx.solve.load_step import LoadStep
+from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps

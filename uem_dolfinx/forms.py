@@ -117,11 +117,37 @@ def sum_ghosts(u: Any) -> None:
 
 
 def form(integrals: Any) -> Any:
-    """Compile a UFL form, or a nested sequence of them, for real arithmetic."""
+    """Compile a UFL form, or a nested sequence of them, for real arithmetic; one with two kinds of rules becomes a list of parts."""
     if not isinstance(integrals, ufl.Form):
         return fem.form(integrals, dtype=np.float64)
-    with compat.named_for_code(integrals):
-        return fem.form(_of_one_subdomain_data(_of_sensible_degree(integrals)), dtype=np.float64)
+    parts = [_compiled(part) for part in _by_rules(integrals)]
+    return parts[0] if len(parts) == 1 else parts
+
+
+def _compiled(F: ufl.Form) -> Any:
+    with compat.named_for_code(F):
+        return fem.form(_of_one_subdomain_data(_of_sensible_degree(F)), dtype=np.float64)
+
+
+def _by_rules(F: ufl.Form) -> list[ufl.Form]:
+    """A form parted into what rules of one point integrate and the rest.
+
+    In code for both, FFCx (0.5 to 0.11) takes values of Functions at the one point for those at every point.
+    """
+    parts: dict[bool, list[Any]] = {}
+    for integral in F.integrals():
+        rule = integral.metadata()
+        one = rule.get("quadrature_degree") in (0, 1) or len(rule.get("quadrature_weights", ())) == 1
+        parts.setdefault(one, []).append(integral)
+    if len(parts) < 2:
+        return [F]
+    # the part with cells first, since matrices get its pattern
+    return [ufl.Form(own) for own in sorted(parts.values(), key=lambda own: all(i.integral_type() != "cell" for i in own))]
+
+
+def parts_of(compiled: Any) -> list[Any]:
+    """The compiled parts of a form."""
+    return compiled if isinstance(compiled, list) else [compiled]
 
 
 def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
@@ -199,14 +225,15 @@ def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], l
 
 
 def create_matrix(a: Any) -> PETSc.Mat:
-    """Matrix without values, with the layout, block size and sparsity of a compiled bilinear form."""
-    return compat.petsc_forms().create_matrix(a)
+    """Matrix without values, with the layout, block size and sparsity of a compiled bilinear form on all cells."""
+    return compat.petsc_forms().create_matrix(parts_of(a)[0])
 
 
 def assemble_matrix(A: PETSc.Mat, a: Any) -> None:
     """Assemble a compiled bilinear form into a matrix, zeroed first, without boundary conditions (collective)."""
     A.zeroEntries()
-    compat.petsc_forms().assemble_matrix(A, a, [])
+    for part in parts_of(a):
+        compat.petsc_forms().assemble_matrix(A, part, [])
     A.assemble()
 
 
@@ -217,7 +244,8 @@ def assemble_vector(b: PETSc.Vec, L: Any) -> None:
     """
     with b.localForm() as local:
         local.set(0.0)
-    compat.petsc_forms().assemble_vector(b, L)
+    for part in parts_of(L):
+        compat.petsc_forms().assemble_vector(b, part)
     b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
@@ -232,7 +260,7 @@ def assemble_array(V: Any, L: Any) -> npt.NDArray[np.float64]:
 
 def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     """Sum of a compiled functional over all ranks of a communicator, known to all of them (collective)."""
-    return float(comm.allreduce(fem.assemble_scalar(M), op=MPI.SUM))
+    return float(comm.allreduce(sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
 
 
 def free_petsc_garbage(comm: MPI.Comm) -> None:

@@ -130,4 +130,4 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
     elif integrals.arguments():
         raise InputError("integrals hold a test function: expected a functional; leave the test function out")
     M = forms.form(integrals) if isinstance(integrals, ufl.Form) else integrals
-    return forms.assemble_scalar(M, M.mesh.comm)
+    return forms.assemble_scalar(M, forms.parts_of(M)[0].mesh.comm)

@@ -152,7 +152,7 @@ class LagrangeSystem(BodySystem):
             for key in self._options:
                 del database[self._prefix + key]
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns q, by which the loop judges its steps, and the number of linear iterations."""
         b, x = self.saddle.createVecs()
         n = rhs.getLocalSize()

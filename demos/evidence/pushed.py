@@ -114,9 +114,14 @@ class PushedSystem(ABC):
         rhs.scale(-1.0)
         return rhs
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+    @property
+    def inexact(self) -> bool:
+        """No solve asks which contactors change sides."""
+        return False
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, and the number of linear iterations."""
-        return self.solver.solve(rhs, accuracy)
+        return self.solver.solve(rhs, accuracy, near)
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""

@@ -13,6 +13,7 @@ from hypothesis import given
 
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.errors import ConvergenceError
 
 
 def state(active, lam=None, slips=None):
@@ -109,6 +110,17 @@ def test_when_others_go_with_the_worst():
     for _ in range(4):
         pivoting.all_at_once(5)
     assert pivoting.ahead and pivoting.repeats([7]) and not pivoting.ahead
+
+
+def test_circles_are_told():
+    """What has come three times, while no fewer were wrong, comes for ever where the pattern tells all there is."""
+    pivoting = active_set.Pivoting()
+    assert [pivoting.repeats([n], told=True) for n in (7, 8, 7, 8)] == [False, False, True, True]
+    # fewer are wrong than ever: what comes then has not been tried
+    assert pivoting.all_at_once(1) and pivoting.repeats([7], told=True) and pivoting.repeats([7], told=True)
+    assert pivoting.repeats([7])
+    with pytest.raises(ConvergenceError, match="goes in a circle"):
+        pivoting.repeats([7], told=True)
 
 
 @pytest.mark.parametrize("radius", [1e-6, 1.0, 1e6])

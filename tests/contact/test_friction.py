@@ -260,7 +260,7 @@ def test_a_moving_plane_takes_the_block_along():
         u = scene.problem.config.displacement[pair.nodes, 0]
         if sticks:
             assert highest(scene.problem.comm, np.abs(pair.slip)) <= 1e-15
-            assert np.abs(u - u.mean()).max(initial=0.0) <= 1e-3
+            assert not u.size or np.abs(u - u.mean()).max() <= 1e-3
         else:
             assert scene.states[0] == 0
             f = scene.contact.resultant().force

@@ -24,7 +24,7 @@ COMM = MPI.COMM_WORLD
 CG = {"ksp_type": "cg", "pc_type": "gamg"}
 
 
-def sunk(law=linear, options=None, rtol=1e-8, sliding="small"):
+def sunk(law=linear, options=None, rtol=1e-8, sliding="small", way=0.05):
     """A block with a bent bottom that is pressed into a wider one, so that the rim of the contact must be found."""
     low = box("tetrahedron", [-0.5, -0.5, -1.0], [1.5, 1.5, 0.0], [6, 6, 3])
     high = box("tetrahedron", [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [5, 5, 3])
@@ -38,7 +38,7 @@ def sunk(law=linear, options=None, rtol=1e-8, sliding="small"):
     s = scene(COMM, "tetrahedron", [low, high], pose=pose)
     V = compat.function_space(s.mesh, 1, (3,))
     u = fem.Function(V)
-    bcs = [*clamp(V, s.tag("bottom", 0, at(2, -1.0))), *clamp(V, s.tag("top", 1, at(2, 1.0)), value=[0.0, 0.0, -0.05])]
+    bcs = [*clamp(V, s.tag("bottom", 0, at(2, -1.0))), *clamp(V, s.tag("top", 1, at(2, 1.0)), value=[0.0, 0.0, -way])]
     contact = uem.Contact(s.tag("high", 1, at(2, 0.0)), s.tag("low", 0, at(2, 0.0)), sliding=sliding)
     problem = uem.UnitedProblem(
         law(u, modulus(s, 1.0, 2.0)),
@@ -73,14 +73,14 @@ def test_solves_are_as_accurate_as_they_need_be(law):
     """CG stops early while the active set may change: fewer iterations, the same contact, the same state to the tolerance."""
     answers, iterations = [], []
     for options in (CG, CG | {"ksp_rtol": 1e-12}, None):
-        s, contact, problem = sunk(law, options)
+        s, contact, problem = sunk(law, options, way=0.08)
         history = problem.solve()
         assert history[-1].residual <= 1e-8
         answers.append((s.gather(problem.u), s.gather(contact.active), contact.resultant().force))
         iterations.append(sum(i.linear_iterations for i in history))
     (u, active, force), *others = answers
     assert 0 < active.sum() < 36
-    assert iterations[0] < 0.8 * iterations[1]
+    assert iterations[0] < 0.6 * iterations[1]
     for v, same, push in others:
         assert np.array_equal(active, same)
         assert np.abs(u - v).max() < 1e-7 * np.abs(u).max()
@@ -97,6 +97,8 @@ def test_preconditioner_is_kept():
     with counted() as calls:
         history = problem.solve()
     assert calls[FACTORISATION] == len(history) - 1 + sum(i.exchanges for i in history)
+    # who touches first is told by how the bodies would move rigidly
+    assert history[0].exchanges == 0 and history[0].active > 0
 
 
 def test_small_residuals_are_reduced_too():

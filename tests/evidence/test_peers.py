@@ -25,7 +25,8 @@ from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
 SCRIPT = Path(__file__).parents[2] / "demos" / "peers.py"
-NUMBERS = {"h": 1 / 30, "E": 1e6, "nu": 0.3, "R": 3.0, "push": 0.006}
+NUMBERS = {"h": 1 / 30, "E": 1e6, "nu": 0.3, "R": 3.0}
+SUPPORTS = [("symmetry", 0, 0.0), ("block_bottom", 1, 0.0), ("disc_top", 1, -0.006)]
 KEYS = {"code", "nodes", "seconds", "newton_iterations", "P", "p_max_ratio", "error"}
 
 
@@ -34,7 +35,7 @@ def bodies():
     """A coarse mesh with its tags, and its arrays (rank 0 only)."""
     geo = common.MESHES / "hertz_cylinder.geo"
     mesh, tags = uem.read_gmsh(geo, COMM, gdim=2, parameters={"h": NUMBERS["h"]})
-    return mesh, tags, peers.gathered(mesh, tags, **NUMBERS)
+    return mesh, tags, peers.gathered(mesh, tags, "disc", contactor="disc_arc", supports=SUPPORTS, parts=2, **NUMBERS)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,7 @@ def united(bodies):
     V = compat.function_space(mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = uem.LinearElastic(NUMBERS["E"], NUMBERS["nu"], kind="plane_strain").residual(u, v) * ufl.dx
-    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["block_bottom"], 1)]
-    bcs.append(uem.dirichlet(V, tags["disc_top"], 1, -NUMBERS["push"]))
+    bcs = [uem.dirichlet(V, tags[name], *what) for name, *what in SUPPORTS]
     contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], sliding="fixed")
     list(uem.load_steps(uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact]), 1))
     return 2 * contact.resultant().force[1], contact.max_pressure()
@@ -83,12 +83,12 @@ def test_arrays_hold_the_whole_mesh(comm, bodies):
             "sizes": [len(x), len(scene.cells)],
             "all used": len(np.unique(scene.cells)) == len(x),
             "least area": area.min(),
-            "block": area[~scene.disc].sum(),
-            "disc": area[scene.disc].sum(),
-            "disc above": (middle[scene.disc][:, 1].min(), middle[~scene.disc][:, 1].max()),
+            "block": area[~scene.upper].sum(),
+            "disc": area[scene.upper].sum(),
+            "disc above": (middle[scene.upper][:, 1].min(), middle[~scene.upper][:, 1].max()),
             "arc": np.abs(np.hypot(*(x[scene.nodes("disc_arc")] - [0, 3]).T) - 3).max(),
-            "lengths": [scene.lengths(name).sum() for name in ("disc_arc", "block_top", "block_bottom", "disc_top", "symmetry")],
-            "sides": all(len(scene.sides(name)) == len(edges) for name, edges in scene.edges.items()),
+            "lengths": [scene.sizes(name).sum() for name in ("disc_arc", "block_top", "block_bottom", "disc_top", "symmetry")],
+            "sides": all(len(scene.sides(name)) == len(edges) for name, edges in scene.facets.items()),
         }
 
     t = first(comm, told)
@@ -122,7 +122,7 @@ def test_calculix_input_keeps_everything(comm, bodies, folder):
         for name in ("disc_arc", "block_top"):
             ends = [(int(cell), int(side[1])) for cell, side in data[f"*SURFACE,NAME={name},TYPE=ELEMENT"]]
             on[name] = {frozenset((cells[c - 1, s], cells[c - 1, s % 3 + 1])) for c, s in ends}
-            on[name] = on[name] == {frozenset(edge) for edge in (scene.edges[name] + 1).tolist()}
+            on[name] = on[name] == {frozenset(edge) for edge in (scene.facets[name] + 1).tolist()}
         return {
             "numbers": [np.array_equal(rows[:, 0], np.arange(1, len(rows) + 1)) for rows in (nodes, cells)],
             "nodes": np.abs(nodes[:, 1:3] - scene.x).max(),
@@ -189,6 +189,7 @@ def script(folder, monkeypatch, *options):
     return json.loads(file.read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_script_tells_who_is_absent_and_who_fails(folder, monkeypatch):
     """Codes that are not there are named with the way to install them, those that fail with the reason, and the rest runs."""
 
@@ -199,7 +200,7 @@ def test_script_tells_who_is_absent_and_who_fails(folder, monkeypatch):
     monkeypatch.setattr(by_getfem, "available", lambda: True)
     monkeypatch.setattr(by_getfem, "solve", fail)
     results = script(folder, monkeypatch, "--plot", str(folder / "peers.png"))
-    assert [run["code"] for run in results["runs"]] == ["uem", "uem_finite"]
+    assert [run["code"] for run in results["runs"]] == ["uem", "uem_finite", "uem_mortar"]
     assert all(run.keys() >= KEYS for run in results["runs"])
     assert all(isinstance(run[key], (int, float)) for run in results["runs"] for key in KEYS - {"code"})
     assert results["absent"].keys() == {"calculix"} and "calculix-ccx" in results["absent"]["calculix"]
@@ -208,16 +209,36 @@ def test_script_tells_who_is_absent_and_who_fails(folder, monkeypatch):
     assert (folder / "peers.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_script_compares_what_is_there(folder, monkeypatch):
     """All codes that are installed, side by side on one mesh."""
     results = script(folder, monkeypatch)
     codes = [run["code"] for run in results["runs"]]
-    assert results["failed"] == [] and {*codes, *results["absent"]} == {"uem", "uem_finite", "calculix", "getfem"}
+    assert results["failed"] == [] and {*codes, *results["absent"]} == {"uem", "uem_finite", "uem_mortar", "calculix", "getfem"}
     assert len({run["nodes"] for run in results["runs"]}) == 1
     for run in results["runs"]:
         assert run["error"] < 0.05 and run["p_max_ratio"] == pytest.approx(1.0, abs=0.06)
     (row,) = results["times_of_the_first"]
     assert row[row["first"]] == 1.0 and min(row[code] for code in codes) == 1.0
+
+
+@pytest.mark.slow
+def test_same_force_under_a_sphere(folder, monkeypatch):
+    """Tetrahedra: GetFEM solves the same discrete problem, the others another one of nearly the same answer."""
+    results = script(folder, monkeypatch, "--dim", "3", "--sizes", "400")
+    assert results["failed"] == []
+    apart = {"uem": 0.0, "uem_finite": 1e-4, "uem_mortar": 0.02, "calculix": 0.01, "getfem": 1e-9}
+    for run in results["runs"]:
+        assert abs(run["difference"]) <= apart[run["code"]], run
+
+
+@pytest.mark.slow
+def test_same_friction(folder, monkeypatch):
+    """The same force along the surface, where part of the contact slips: under Mindlin's limit, and near that of the finer mesh."""
+    results = script(folder, monkeypatch, "--friction", "0.3", "--sizes", "800")
+    assert results["failed"] == [] and len(results["runs"]) == 4 - len(results["absent"])
+    for run in results["runs"]:
+        assert 0.5 < run["Q/(mu P)"] < 1 and run["error_Q"] < 0.01, run
 
 
 def test_script_refuses_codes_it_does_not_know(folder, monkeypatch):

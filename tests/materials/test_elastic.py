@@ -169,3 +169,86 @@ def test_degrees_that_are_asked_for(law, degree):
     assert degrees(residual * ufl.dx) == degrees(ufl.derivative(residual * ufl.dx, b.u)) == wanted
     assert degrees(ufl.derivative(energy, b.u, v)) == wanted
     assert degrees(residual * ufl.dx(metadata={"quadrature_degree": 6})) == [6]
+
+
+# ------------------------------------------------------------------------------ bodies that hardly change their volume
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("cell,degree", [("quadrilateral", 1), ("quadrilateral", 2), ("triangle", 2), ("hexahedron", 1)])
+def test_forms_of_fewer_points(law, cell, degree):
+    """Forces are derivatives of the energy, and the tangent those of the forces: rules of one and of several points meet."""
+    if cell == "hexahedron" and law is not uem.NeoHooke:
+        pytest.skip("2D says it for the others")
+    b = blocks(MPI.COMM_WORLD, cell, 1, 2, degree=degree)
+    body = law(1.0, 0.4, "3d" if b.gdim == 3 else "plane_strain")
+    start, way = (0.05 * noise(b.u, seed) for seed in (1, 2))
+    F = body.residual_form(b.u, ufl.TestFunction(b.V))
+    forces, energy, tangent = forms.form(F), forms.form(body.energy_form(b.u)), forms.form(ufl.derivative(F, b.u))
+    own, h = b.V.dofmap.index_map.size_local * b.gdim, 1e-5
+
+    def at(length, of):
+        b.u.x.array[:] = start + length * way
+        return of()
+
+    def assembled():
+        return forms.assemble_array(b.V, forces)
+
+    K = forms.create_matrix(tangent)
+    at(0.0, lambda: forms.assemble_matrix(K, tangent))
+    along = K.createVecRight()
+    along.array[:] = way[:own]
+    change = (at(h, assembled) - at(-h, assembled)) / (2 * h)
+    total = MPI.COMM_WORLD.allreduce
+    assert total(np.sum(((K * along).array_r - change) ** 2)) < 1e-12 * total(np.sum(change**2))
+    work = total(at(0.0, assembled) @ way[:own])
+    ends = [at(end, lambda: forms.assemble_scalar(energy, MPI.COMM_WORLD)) for end in (h, -h)]
+    gain = (ends[0] - ends[1]) / (2 * h)
+    assert gain == pytest.approx(work, rel=1e-7)
+
+
+def noise(u, seed):
+    """The same smooth field on any number of ranks."""
+    f, (a, b) = fem.Function(u.function_space), np.random.default_rng(seed).normal(size=(2, 3))
+    g = len(u)
+    f.interpolate(lambda x: np.stack([np.sin(3 * (a[i] * x[0] + b[i] * x[1] + x[2]) + i) for i in range(g)]))
+    return np.array(f.x.array)
+
+
+@pytest.mark.parametrize(
+    "cell,degree,least", [("quadrilateral", 1, 5.0), pytest.param("hexahedron", 1, 3.0, marks=pytest.mark.slow)]
+)
+def test_no_locking(cell, degree, least):
+    """A cantilever of nu = 0.4999 bends as one of nu = 0.49 does, within the change of its stiffness; integrated fully it hardly bends."""
+    bend = {}
+    for nu in (0.49, 0.4999):
+        for full in (False, True):
+            ends, n = (
+                ([(0.0, 0.0), (4.0, 1.0)], [16, 4]) if cell == "quadrilateral" else ([(0.0,) * 3, (4.0, 1.0, 1.0)], [8, 2, 2])
+            )
+            make = mesh.create_rectangle if len(n) == 2 else mesh.create_box
+            domain = make(MPI.COMM_WORLD, ends, n, getattr(mesh.CellType, cell))
+            g = len(n)
+            V = uem.function_space(domain, degree, (g,))
+            u, v = fem.Function(V), ufl.TestFunction(V)
+            law = uem.LinearElastic(1.0, nu, "3d" if g == 3 else "plane_strain")
+            F = law.residual(u, v) * ufl.dx if full else law.residual_form(u, v)
+            left = mesh.locate_entities_boundary(domain, g - 1, lambda x: np.isclose(x[0], 0.0))
+            right = mesh.locate_entities_boundary(domain, g - 1, lambda x: np.isclose(x[0], 4.0))
+            problem = uem.UnitedProblem(F - 1e-3 * v[g - 1] * uem.ds(right, domain), u, bcs=[uem.dirichlet(V, left)])
+            problem.solve()
+            bend[nu, full] = uem.integrate(u[g - 1] * uem.ds(right, domain))
+    assert bend[0.4999, False] == pytest.approx(bend[0.49, False], rel=0.03)
+    assert bend[0.49, False] > bend[0.4999, False] > least * bend[0.4999, True]
+
+
+def test_cells_that_lock_all_the_same():
+    """Linear simplices are refused by name; in plane stress nothing locks, and nothing is left out."""
+    b = blocks(MPI.COMM_WORLD, "triangle", 1, 2)
+    v = ufl.TestFunction(b.V)
+    with pytest.raises(uem.InputError, match="cells of type triangle and degree 1 lock"):
+        uem.NeoHooke(1.0, 0.4999, "plane_strain").residual_form(b.u, v)
+    law = uem.NeoHooke(1.0, 0.4999, "plane_stress")
+    b.u.interpolate(lambda x: 0.1 * np.stack([x[0] * x[1], x[1]]))
+    whole, parted = (forms.assemble_array(b.V, forms.form(F)) for F in (law.residual(b.u, v) * ufl.dx, law.residual_form(b.u, v)))
+    np.testing.assert_allclose(parted, whole, rtol=0, atol=1e-14 * np.abs(whole).max())

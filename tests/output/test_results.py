@@ -21,7 +21,7 @@ from dolfinx import fem, mesh
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.output import pictures
+from uem_dolfinx.output import frames
 
 comm = MPI.COMM_WORLD
 
@@ -146,17 +146,12 @@ def test_no_matplotlib_is_a_named_error_on_every_rank(folder: Path, monkeypatch:
         uem.plot_scene(pressed("triangle"), folder / "scene.png")
 
 
-def test_scenes_in_3d_are_sent_to_paraview() -> None:
-    with pytest.raises(ValueError, match="ParaView"):
-        uem.plot_scene(pressed("hexahedron"), "scene.png")
-
-
 @pytest.mark.parametrize("cell", helpers.CELLS)
 def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
     b = helpers.blocks(comm, cell)
     E = helpers.modulus(b.scene, 3.0, 7.0)
     S = compat.function_space(b.scene.mesh, 1)
-    values, cells = pictures.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
+    values, cells = frames.nodal_average(E, b.scene.mesh), compat.cell_dofs(S)
     np.testing.assert_allclose(values[cells], np.where(b.scene.body == 0, 3.0, 7.0)[:, None] * np.ones(cells.shape[1]))
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import sys
+
 import numpy as np
 import pytest
-from helpers import blocks, linear, raised
+from dolfinx import fem
+from helpers import blocks, clamp, linear, raised, st_venant
 from resting_scenes import COMM, Bar
 
 import uem_dolfinx as uem
@@ -15,6 +19,22 @@ def pressed_blocks(load=None):
     b = blocks(COMM, "triangle", 2, 4)
     contact = uem.Contact(b.high, b.low)
     return uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.05), contacts=[contact], load=load)
+
+
+@pytest.mark.parametrize("in_time", [False, True])
+def test_bar_on_a_terminal(in_time, monkeypatch):
+    """Who sits at a terminal sees how far the run is, once, whatever the number of ranks."""
+    pytest.importorskip("tqdm")
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    bar = Bar((0.0, -3.0)).problem if in_time else pressed_blocks()
+    list(uem.time_steps(bar, 0.01, 0.03) if in_time else uem.load_steps(bar, 3))
+    words = ("time steps" if in_time else "load steps", "3/3")
+    assert [word in sys.stderr.getvalue() for word in words] == [COMM.rank == 0] * 2
 
 
 # ---------------------------------------------------------------------------------------------- load steps
@@ -34,6 +54,23 @@ def test_failed_remainder_is_halved(monkeypatch):
     monkeypatch.setattr(problem, "solve", fails_on_long_ways)
     done = [step.factor for step in uem.load_steps(problem, 1)]
     assert tried == [1.0, 0.5, 1.0, 0.75, 1.0] and done == [0.5, 0.75, 1.0]
+
+
+def test_stations_are_reached_after_a_cut(monkeypatch):
+    """Steps that were cut come back to multiples of the nominal length, where loads may turn."""
+    problem, solve, tried = pressed_blocks(), None, []
+    solve = problem.solve
+
+    def fails_once(*, start, fraction):
+        tried.append(fraction)
+        if len(tried) in (1, 4, 5):
+            raise uem.ConvergenceError("too long")
+        return solve(start=start, fraction=fraction)
+
+    monkeypatch.setattr(problem, "solve", fails_once)
+    done = [step.factor for step in uem.load_steps(problem, 5)]
+    np.testing.assert_allclose(done, [0.1, 0.2, 0.25, 0.35, 0.4, 0.6, 0.8, 1.0], rtol=1e-14)
+    assert done[1] == 0.2 and done[-1] == 1.0
 
 
 @pytest.mark.parametrize("sendable", [True, False])
@@ -61,3 +98,19 @@ def test_load_that_raises_on_one_rank(in_time, sendable):
     assert np.array_equal(problem.u.x.array, before[0])
     if COMM.rank == COMM.size - 1:
         assert type(found.__cause__) is (ValueError if sendable else LocalError)
+
+
+def test_back_to_nothing():
+    """Unloaded step by step, a body comes to rest at its place in one step, though no force is left to compare with."""
+    b = blocks(COMM, "triangle", 2, 4)
+    top = fem.Function(b.V)
+    contact = uem.Contact(b.high, b.low)
+
+    def load(factor):
+        top.x.array.reshape(-1, 2)[:, 1] = -0.2 * np.sin(np.pi * factor)
+
+    bcs = [*clamp(b.V, b.bottom), fem.dirichletbc(top, fem.locate_dofs_topological(b.V, 1, b.top.entities))]
+    problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=bcs, contacts=[contact], load=load)
+    steps = list(uem.load_steps(problem, 4))
+    assert [step.cuts for step in steps] == [0] * 4 and steps[-1].newton_iterations <= 6
+    assert np.abs(b.u.x.array).max() < 1e-15

@@ -20,7 +20,7 @@ def vector(value):
 class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
 
-    linear = in_contact = False
+    linear = in_contact = inexact = False
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0
@@ -58,7 +58,7 @@ class OneUnknown:
         self.solves += 1
         return vector(-self.F())
 
-    def solve(self, rhs, accuracy):
+    def solve(self, rhs, accuracy, near):
         return vector(1.0), 1
 
     def move(self, state, dq):
@@ -94,3 +94,33 @@ def test_no_convergence_is_an_error_with_its_history():
     with pytest.raises(uem.ConvergenceError, match="no convergence in 4 iterations") as found:
         solve_united(system, rtol=1e-8, max_iterations=4, line_search=False, verbose=False)
     assert [i.residual for i in found.value.history] == [1.0] * 5
+
+
+def test_exchanges_are_settled_by_loose_solves():
+    """Who is wrong is asked of solutions to 1e-3, each begun where the last one ended; the last is as accurate as convergence asks for."""
+    system, asked = OneUnknown(0.5), []
+    system.inexact = system.in_contact = system.linear = True
+    system.F = lambda: 1.0 if system.solves < 3 else 0.0
+
+    def solve(rhs, accuracy, near):
+        asked.append((accuracy, None if near is None else near.array_r[0]))
+        return vector(float(len(asked))), 1
+
+    def unite(settled):
+        state = OneUnknown.unite(system, settled)
+        state.trial = SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))
+        return state
+
+    def exchange(state, du, driving, accuracy):
+        return unite(None) if len(asked) == 1 else None
+
+    def linearise(state):
+        system.solves += 1
+        return vector(-1.0)
+
+    system.linearise, system.solve, system.unite, system.exchange = linearise, solve, unite, exchange
+    history = solve_united(system, rtol=1e-8, max_iterations=10, line_search=False, verbose=False)
+    # the first may not be the last: contact has yet to be met
+    assert asked[:3] == [(1e-3, None), (1e-3, 10.0), (1e-4, 2.0)]
+    assert asked[3] == (1e-3, None) and asked[4] == (pytest.approx(1e-9), 4.0)
+    assert [(i.exchanges, i.linear_iterations) for i in history] == [(1, 3), (0, 2), (0, 0)]

@@ -74,3 +74,18 @@ def test_supports_are_the_same_on_every_number_of_ranks():
         return sorted(sum(comm.allgather([(*config.X[k], d) for k, d in zip(i, c)]), []))
 
     assert supports(COMM) == supports(MPI.COMM_SELF) and len(supports(COMM)) == 3
+
+
+def test_bodies_follow_their_conditions(body):
+    """A side that is moved and turned takes the square with it; one that gives way to the right only takes it there, and no more."""
+    _, config = body
+    x, size = config.X[: config.n_owned], config.size / 2**0.5
+    left = np.abs(x[:, 0]) < 1e-6 * size
+    turned = 1e-3 * np.column_stack([2 * size - x[:, 1], x[:, 0] + size])
+    for free, way in (
+        (np.column_stack([~left, ~left]), turned),
+        (np.column_stack([~left, np.ones_like(left)]), np.full_like(x, 1e-3 * size) * [1, 0]),
+    ):
+        motions = RigidMotions(config, free, False)
+        found = motions.field(motions.following(np.where(free, 7.0, way)))
+        assert np.abs(found - way).max(initial=0.0) < 1e-10 * size

@@ -66,7 +66,7 @@ def history(comm, cell, degree, law):
     g = b.gdim
     # moments of quadratic contactors in corners balance to the second order of their gaps only
     contact = uem.Contact(b.high, b.low, sliding="finite" if degree == 1 or g == 2 else "fixed")
-    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0] * (g - 1) + [-0.2])]
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0] * (g - 1) + [-0.3])]
     problem = uem.UnitedProblem(law(b.u, modulus(b.scene, 1.0, 3.0)), b.u, bcs=bcs, contacts=[contact], rtol=1e-10)
     steps = run(problem, 2)
     complementary(contact, 1e-12, 1e-9)

@@ -88,6 +88,7 @@ class UnitedSolver:
         self.pc = ksp.getPC()
         ksp.setOptionsPrefix(self._prefix)
         ksp.setErrorIfNotConverged(False)
+        ksp.setConvergenceHistory(reset=True)
         with self._in_database():
             try:
                 ksp.setFromOptions()
@@ -290,16 +291,27 @@ class UnitedSolver:
             self.ksp.setUp()
         return bool(self.ksp.getPC().getFactorMatrix().getMumpsRinfog(12) < 0.0)
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0) -> tuple[PETSc.Vec, int]:
+    @property
+    def inexact(self) -> bool:
+        """Whether solves are as accurate as asked, and no more."""
+        return self.iterative and not self._fixed_accuracy
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and the number of linear iterations (collective).
 
-        An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side.
+        An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side; it begins
+        with the unknowns ``near``, if they are given.
 
         Raises:
             LinearSolveError: with PETSc's reason.
         """
         dq = rhs.duplicate()
-        if self.iterative and not self._fixed_accuracy:
+        # a factorisation has no use for a guess
+        near = near if self.iterative else None
+        self.ksp.setInitialGuessNonzero(near is not None)
+        if near is not None:
+            near.copy(dq)
+        if self.inexact:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
         with self._in_database(**({"mat_mumps_icntl_33": 1} if self._tells_sign else {})):
             try:
@@ -335,9 +347,15 @@ class UnitedSolver:
                 f"{iterations} iterations: a body may be free to move as a rigid body, the tangent may be "
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
-        self._pace = iterations / -np.log10(self.ksp.getTolerances()[0])
-        self._first_pace = self._first_pace or self._pace
+        self._keep_pace(iterations)
         return dq, iterations
+
+    def _keep_pace(self, iterations: int) -> None:
+        """Note how many iterations a digit has taken."""
+        norms = self.ksp.getConvergenceHistory()
+        if iterations > 0 and len(norms) > iterations and norms[iterations] > 0:
+            self._pace = iterations / max(np.log10(norms[0] / norms[iterations]), np.finfo(float).eps)
+            self._first_pace = self._first_pace or self._pace
 
     def _tell_unused(self) -> None:
         """Warn, once, of options that PETSc has had no use for."""

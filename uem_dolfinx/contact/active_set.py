@@ -15,6 +15,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.errors import ConvergenceError
 
 #: Contactors whose gap is smaller, as part of the model's size, touch without force.
 #: [convention; the model's size; test_active_set.py::test_what_touches_at_the_start]
@@ -131,6 +132,8 @@ class Pivoting:
         self._tries = PATIENCE
         self._again = False
         self._seen: set[tuple[int, ...]] = set()
+        #: How often each has come since fewer were wrong than ever before.
+        self._times: dict[tuple[int, ...], int] = {}
 
     @property
     def ahead(self) -> bool:
@@ -144,15 +147,27 @@ class Pivoting:
     def all_at_once(self, count: int) -> bool:
         """Whether all ``count`` wrong contactors are exchanged."""
         if count < self._fewest:
-            self._fewest, self._tries = count, PATIENCE
+            self._fewest, self._tries, self._times = count, PATIENCE, {}
             return True
         self._tries -= 1
         return self._tries >= 0
 
-    def repeats(self, pattern: Sequence[int]) -> bool:
-        """Whether the worst has been exchanged alone among such contactors before, told by a number of each rank."""
-        again = tuple(pattern) in self._seen
-        self._seen.add(tuple(pattern))
+    def repeats(self, pattern: Sequence[int], told: bool = False) -> bool:
+        """Whether the worst has been exchanged alone among such contactors before.
+
+        Args:
+            pattern: what tells the contactors' states, a number of each rank.
+            told: whether they tell all there is, so that what has come three times will come for ever.
+
+        Raises:
+            ConvergenceError: if it will.
+        """
+        key = tuple(pattern)
+        self._times[key] = self._times.get(key, 0) + 1
+        if told and self._times[key] > 2:
+            raise ConvergenceError("the active set goes in a circle: take smaller load steps, or a target of finer facets")
+        again = key in self._seen
+        self._seen.add(key)
         self._again = self._again or again
         return again
 

@@ -227,6 +227,16 @@ class Contact:
         return tributary_areas(self.config, self.contactor)[self.pair.nodes]
 
     @property
+    def nodes(self) -> Indices:
+        """Nodes of this rank's contactors, its own alone, by which fields of the displacement's space are asked ``(n_contactors,)``."""
+        return self.pair.nodes
+
+    @property
+    def points(self) -> Array:
+        """Reference places of this rank's contactors ``(n_contactors, gdim)``, a length."""
+        return self.pair.points
+
+    @property
     def pressures(self) -> Array:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
@@ -287,7 +297,7 @@ class Contact:
 
     @property
     def dissipation(self) -> float:
-        """Energy that friction has taken from the bodies in all committed steps; of forces in the mean of a step (collective)."""
+        """Energy that friction has taken from the bodies in all committed steps: slips times means of a step's friction (collective)."""
         friction = self.pair.committed.friction
         return float(self.config.comm.allreduce(0.0 if friction is None else float(friction.work.sum())))
 

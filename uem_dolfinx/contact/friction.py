@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TIED, Wrong
 from uem_dolfinx.contact.state import FrictionState
 
@@ -125,35 +125,6 @@ def exchange(state: FrictionState, wrong: FrictionWrong, tau: Array) -> Friction
     direction = np.where(wrong.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
     direction[wrong.hold] = 0.0
     return replace(state, stick=(state.stick | wrong.hold) & ~wrong.slide, direction=direction)
-
-
-class Front:
-    """Where slip eats its way along a surface, which it would do by one contactor an exchange, and how far ahead others go along."""
-
-    def __init__(self) -> None:
-        self._last: Array | None = None
-        self._reach = 0.0
-
-    def move(self, here: Array, too_far: bool, points: Array) -> tuple[Bools, Ints]:
-        """Which contactors go along: twice as far ahead as the last, or a quarter of that; at first as far as slip has come.
-
-        Args:
-            here: where contactors begin to slip ``(k, gdim)``.
-            too_far: whether some that went along last have been held again.
-            points: where contactors are ``(n, gdim)``.
-
-        Returns:
-            Those that go along, and the nearest of those that begin to, both ``(n,)``.
-        """
-        last, nobody = self._last, np.zeros(len(points), dtype=bool)
-        if not len(here):
-            return nobody, np.zeros(len(points), dtype=np.int64)
-        self._last = here
-        distance = np.linalg.norm(points[:, None] - here, axis=2)
-        if last is not None:
-            come = np.linalg.norm(here[:, None] - last, axis=2).min()
-            self._reach = self._reach * (0.25 if too_far else 2.0) or float(come)
-        return distance.min(axis=1) <= self._reach, distance.argmin(axis=1)
 
 
 def come_and_go(state: FrictionState, before: Bools, now: Bools, rough: Bools) -> FrictionState:

@@ -18,6 +18,7 @@ from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.geometry.rigid import Motion
@@ -56,7 +57,7 @@ class FrictionalPair(ContactPair):
         #: In the present linearised problem: contactors that have been let go of, that slip the other way, and that slip ahead of the
         #: last that were to ``(n,)``; where these were and how far others go along.
         self._released, self._reversed, self._taken = np.zeros((3, n), dtype=bool)
-        self._front = friction.Front()
+        self._front = Front(self.config.comm)
         #: What that problem foretells: forces and slips.
         self._foreseen = np.zeros((n, g)), np.zeros((n, g))
         #: Friction that belongs to the forces last read or foreseen ``(n, gdim)``.
@@ -240,17 +241,15 @@ class FrictionalPair(ContactPair):
 
     def _next_in_line(self, wrong: friction.FrictionWrong, tau: Array) -> tuple[Bools, Array]:
         """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
-        comm, stick = self.config.comm, self.rubbing & self._rub().stick
-        here, force = (np.concatenate(part) for part in zip(*comm.allgather((self.points[wrong.slide], tau[wrong.slide]))))
-        too_far = comm.allreduce(bool((self._taken & stick).any()), op=MPI.LOR)
-        near, nearest = self._front.move(here, too_far, self.points)
-        near &= stick & ~wrong.slide & ~wrong.release
-        return near, np.where(near[:, None], self.tangential(force[nearest]), tau) if near.any() else tau
+        stick, begin = self.rubbing & self._rub().stick, wrong.slide
+        near, force = self._front.move(self.points[begin], tau[begin], bool((self._taken & stick).any()), self.points)
+        near &= stick & ~begin & ~wrong.release
+        return near, np.where(near[:, None], self.tangential(force), tau)
 
     def turn(self, stiffness: Array) -> None:
         """Take the directions of slip from where the contactors are and from the forces last foreseen; see ``ContactPair``."""
         self._released, self._reversed, self._taken = np.zeros((3, len(self.nodes)), dtype=bool)
-        self._front = friction.Front()
+        self._front = Front(self.config.comm)
         if self.config.gdim == 2:
             return
         self._c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)

@@ -184,18 +184,8 @@ class MeshTarget:
             points: ``(n, gdim)``.
             x: nodes of this rank's facets ``(m, nn, gdim)``.
         """
-        nodes, size = x.reshape(-1, points.shape[1]), self.comm.size
-        box = np.stack([nodes.min(axis=0, initial=np.inf), nodes.max(axis=0, initial=-np.inf)])
-        boxes = np.empty((size, *box.shape))
-        self.comm.Allgather(box, boxes)
-        near, far = np.full((2, size, len(points)), np.inf)
-        for r in np.flatnonzero(boxes[:, 0, 0] <= boxes[:, 1, 0]):
-            # curved facets reach out of the box of their nodes
-            out = 0.5 * (self.shape.lebesgue - 1) * (boxes[r, 1] - boxes[r, 0])
-            low, high = boxes[r, 0] - out, boxes[r, 1] + out
-            near[r] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
-            far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1)
-        return near, far
+        # curved facets reach out of the box of their nodes
+        return box_distances(self.comm, points, x.reshape(-1, points.shape[1]), 0.5 * (self.shape.lebesgue - 1))
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
@@ -288,6 +278,55 @@ def _nearest(points: Ints, distance: Array, height: Array, key: Ints, rounding: 
     order = np.lexsort((key, lower, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
+
+
+def box_distances(comm: MPI.Comm, points: Array, places: Array, out: float = 0.0) -> tuple[Array, Array]:
+    """Bounds on the distance of each point from what each rank has, from the boxes around that ``(size, n)`` (collective).
+
+    Args:
+        comm: communicator.
+        points: ``(n, gdim)``.
+        places: that this rank's box is about ``(m, gdim)``.
+        out: part of its size by which the box is larger to each side.
+    """
+    box = np.stack([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
+    boxes = np.empty((comm.size, *box.shape))
+    comm.Allgather(box, boxes)
+    near, far = np.full((2, comm.size, len(points)), np.inf)
+    for r in np.flatnonzero(boxes[:, 0, 0] <= boxes[:, 1, 0]):
+        more = out * (boxes[r, 1] - boxes[r, 0])
+        low, high = boxes[r, 0] - more, boxes[r, 1] + more
+        near[r] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+        far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1)
+    return near, far
+
+
+def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, values: Array) -> tuple[Array, Array]:
+    """Distance of each point from the nearest place of all ranks, and the values there (collective).
+
+    A place travels only to the ranks in whose part of the points it lies.
+
+    Args:
+        comm: communicator.
+        points: ``(n, gdim)``.
+        places: this rank's ``(m, gdim)``.
+        within: what lies farther away is not looked for; the same on all ranks.
+        values: at the places ``(m, k)``.
+
+    Returns:
+        ``(n,)``, infinite where no place is near, and ``(n, k)``, zero there.
+    """
+    near, _ = box_distances(comm, places, points)
+    sent = [np.flatnonzero(n <= within * (1 + EQUALLY_NEAR)) for n in near]
+    there, told = Exchange(comm, sent).send(places, values)
+    distance, found = np.full(len(points), np.inf), np.zeros((len(points), values.shape[1]))
+    if len(there) and len(points):
+        from scipy.spatial import cKDTree
+
+        length, which = cKDTree(there).query(points)
+        i = length <= within
+        distance[i], found[i] = length[i], told[which[i]]
+    return distance, found
 
 
 @timed("search")

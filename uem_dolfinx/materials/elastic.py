@@ -14,18 +14,18 @@ import ufl
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from uem_dolfinx import given
+from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agree
 
 KINDS = ("3d", "plane_strain", "plane_stress")
 #: Poisson's ratios of bodies that resist every strain.
-POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.49")
+POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.4999, with residual_form")
 
 
 @dataclass(frozen=True)
 class Elastic(ABC):
-    """Common part of the laws.
+    """Common part of the elastic laws.
 
     Attributes:
         E: Young's modulus, a force per area: a number, a Constant, a Function or any UFL expression.
@@ -70,20 +70,71 @@ class Elastic(ABC):
         return ufl.Identity(gdim)
 
     @abstractmethod
-    def energy(self, u: Any) -> Expr:
-        """Stored energy per reference volume."""
+    def _energies(self, u: Any) -> tuple[Expr, Expr]:
+        """Stored energy per reference volume in two parts: that of mu, and that of lambda, which resists changes of volume."""
 
     @abstractmethod
+    def _stresses(self, u: Any) -> tuple[Expr, Expr]:
+        """Stress in the same two parts."""
+
+    def energy(self, u: Any) -> Expr:
+        """Stored energy per reference volume."""
+        return sum(self._energies(u))
+
     def stress(self, u: Any) -> Expr:
         """Cauchy stress in small strains, otherwise the second Piola-Kirchhoff stress S."""
+        self._check(u)
+        return sum(self._stresses(u))
 
     def first_piola(self, u: Any) -> Expr:
         """Stress that does work on ``grad(v)``: ``F S``."""
-        return (self._check(u) + ufl.grad(u)) * self.stress(u)
+        return self._first_piola(u, self.stress(u))
+
+    def _first_piola(self, u: Any, stress: Any) -> Expr:
+        return (self._check(u) + ufl.grad(u)) * stress
 
     def residual(self, u: Any, v: Any) -> Expr:
         """Internal virtual work per reference volume, to be integrated with ``dx``."""
         return ufl.inner(self.first_piola(u), ufl.grad(v))
+
+    def residual_form(self, u: fem.Function, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
+        """Internal virtual work of bodies that hardly change their volume, whose cells do not lock as nu approaches 1/2.
+
+        What resists changes of volume is integrated with so few points that a cell can follow: one in quadrilaterals, hexahedra of
+        degree 1 and simplices of degree 2, two in each direction in those of degree 2 (selective reduced integration; in
+        quadrilaterals of small strains it is the mean dilatation) [Malkus and Hughes, Computer Methods in Applied Mechanics and
+        Engineering 15 (1978) 63-81].
+
+        Args:
+            u: displacement.
+            v: test function of its space.
+            dx: measure of the body's cells.
+
+        Raises:
+            InputError: for simplices of degree 1, which lock with one point.
+        """
+        shear, volume = (ufl.inner(self._first_piola(u, part), ufl.grad(v)) for part in self._stresses(u))
+        return shear * dx + volume * self._fewer_points(u, dx)
+
+    def energy_form(self, u: fem.Function, dx: ufl.Measure = ufl.dx) -> ufl.Form:
+        """Stored energy, integrated as in ``residual_form``, which is its derivative."""
+        self._check(u)
+        shear, volume = self._energies(u)
+        return shear * dx + volume * self._fewer_points(u, dx)
+
+    def _fewer_points(self, u: fem.Function, dx: ufl.Measure) -> ufl.Measure:
+        """Measure of the changes of volume; across a stress-free plane they are free."""
+        if self.kind == "plane_stress":
+            return dx
+        V = given.kind("u", u, isinstance(u, fem.Function), "the displacement, whose degree tells the points").function_space
+        cell, degree = compat.cell_name(V.mesh), compat.lagrange_degree(V) or 0
+        simplex = cell in ("triangle", "tetrahedron")
+        if simplex and degree == 1:
+            raise InputError(
+                f"residual_form: cells of type {cell} and degree 1 lock where the volume hardly changes, with one point as well: take "
+                "degree 2, or quadrilaterals or hexahedra"
+            )
+        return dx(degree=1 if simplex else 2 * degree - 1)
 
 
 @dataclass(frozen=True)
@@ -94,19 +145,19 @@ class LinearElastic(Elastic):
         """Symmetric gradient."""
         return ufl.sym(ufl.grad(u))
 
-    def energy(self, u: Any) -> Expr:
+    def _energies(self, u: Any) -> tuple[Expr, Expr]:
         """``mu eps:eps + lambda/2 tr(eps)^2``."""
         eps = self.strain(u)
-        return self.mu * ufl.inner(eps, eps) + self.lam_in_plane / 2 * ufl.tr(eps) ** 2
+        return self.mu * ufl.inner(eps, eps), self.lam_in_plane / 2 * ufl.tr(eps) ** 2
 
-    def stress(self, u: Any) -> Expr:
+    def _stresses(self, u: Any) -> tuple[Expr, Expr]:
         """Cauchy stress."""
         eps = self.strain(u)
-        return 2 * self.mu * eps + self.lam_in_plane * ufl.tr(eps) * self._check(u)
+        return 2 * self.mu * eps, self.lam_in_plane * ufl.tr(eps) * self._check(u)
 
-    def first_piola(self, u: Any) -> Expr:
+    def _first_piola(self, u: Any, stress: Any) -> Expr:
         """In small strains the Cauchy stress."""
-        return self.stress(u)
+        return stress
 
 
 @dataclass(frozen=True)
@@ -118,15 +169,15 @@ class StVenantKirchhoff(Elastic):
         self._check(u)
         return green_lagrange(u)
 
-    def energy(self, u: Any) -> Expr:
+    def _energies(self, u: Any) -> tuple[Expr, Expr]:
         """``mu E:E + lambda/2 tr(E)^2``; in plane stress E33 is eliminated by S33 = 0."""
         E = self.strain(u)
-        return self.mu * ufl.inner(E, E) + self.lam_in_plane / 2 * ufl.tr(E) ** 2
+        return self.mu * ufl.inner(E, E), self.lam_in_plane / 2 * ufl.tr(E) ** 2
 
-    def stress(self, u: Any) -> Expr:
+    def _stresses(self, u: Any) -> tuple[Expr, Expr]:
         """Second Piola-Kirchhoff stress."""
         E = self.strain(u)
-        return 2 * self.mu * E + self.lam_in_plane * ufl.tr(E) * ufl.Identity(len(u))
+        return 2 * self.mu * E, self.lam_in_plane * ufl.tr(E) * ufl.Identity(len(u))
 
 
 @dataclass(frozen=True)
@@ -144,19 +195,18 @@ class NeoHooke(Elastic):
         change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if len(u) == 3 else 0)
         return self.mu * change / (self.mu + self.lam / 2 * (1 + change)) if self.kind == "plane_stress" else change
 
-    def energy(self, u: Any) -> Expr:
-        """Stored energy per reference volume."""
+    def _energies(self, u: Any) -> tuple[Expr, Expr]:
+        """``mu/2 (tr C - 3 - 2 ln J) + lambda/4 (J^2 - 1 - 2 ln J)``."""
         F = self._check(u) + ufl.grad(u)
         JJ = 1 + self._volume_change(u)
         across = JJ / ufl.det(F) ** 2 if len(u) == 2 else 0.0
-        return self.mu / 2 * (ufl.inner(F, F) + across - 3 - ufl.ln(JJ)) + self.lam / 4 * (JJ - 1 - ufl.ln(JJ))
+        return self.mu / 2 * (ufl.inner(F, F) + across - 3 - ufl.ln(JJ)), self.lam / 4 * (JJ - 1 - ufl.ln(JJ))
 
-    def stress(self, u: Any) -> Expr:
+    def _stresses(self, u: Any) -> tuple[Expr, Expr]:
         """Second Piola-Kirchhoff stress ``mu (I - C^-1) + lambda/2 (J^2 - 1) C^-1``."""
-        self._check(u)
         E = green_lagrange(u)
         C_inverse = ufl.inv(ufl.Identity(len(u)) + 2 * E)
-        return 2 * self.mu * C_inverse * E + self.lam / 2 * self._volume_change(u) * C_inverse
+        return 2 * self.mu * C_inverse * E, self.lam / 2 * self._volume_change(u) * C_inverse
 
 
 def check_parameter(what: str, value: Any, within: given.Range) -> None:

@@ -17,7 +17,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.output.tables import Closing, CsvTable, given_path
 from uem_dolfinx.output.xdmf import XdmfSeries, geometry_degree
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.load_steps import LoadStep
+from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
 

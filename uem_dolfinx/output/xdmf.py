@@ -136,7 +136,10 @@ class XdmfSeries:
         place.x.scatter_forward()
         n, keys = _cell_keys(self._mesh)
         cells = compat.vtk_nodes(compat.cell_name(self._mesh), place.x.array[compat.cell_dofs(S)[:n]].astype(np.int64))
-        x = np.ascontiguousarray(S.tabulate_dof_coordinates()[:owned, :gdim])
+        # as they were read: those that DOLFINx tabulates are rounded in one of the cells around, which differs from partition to partition
+        x = np.empty((place.x.array.size, gdim))
+        x[compat.cell_dofs(S)] = self._mesh.geometry.x[compat.geometry_dofs(self._mesh), :gdim]
+        x = x[:owned]
         order = Numbering(self.comm, keys, n_cells(self._mesh))
         return Table(lambda: cells, cells.shape[1], order), Table(lambda: x, gdim, numbering)
 

@@ -5,7 +5,7 @@ Each check looks at this rank's part; whoever asks has the ranks agree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
@@ -59,20 +59,52 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
 
 
-def check_load(load: Any) -> None:
-    """Refuse a load that is neither a scalar Constant nor a function of the factor or the time.
+def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:
+    """The load as a function of the factor or the time, or as Constants and their values, each numbers or a function; or None.
 
     Raises:
         InputTypeError, InputError: naming what it is instead.
     """
-    expected = "a scalar Constant, a function of the load factor or time, or None"
-    if isinstance(load, fem.Constant) and np.shape(load.value) != ():
-        raise InputError(
-            f"load is a Constant of the shape {np.shape(load.value)}: expected {expected}; multiply a scalar Constant by the vector in F, "
-            "or set the Constant in a function of the factor"
-        )
-    if load is not None and not isinstance(load, fem.Constant) and (isinstance(load, Expr) or not callable(load)):
+    expected = "a scalar Constant, a dictionary of Constants and their values, a function of the load factor or time, or None"
+    if isinstance(load, fem.Constant):
+        if np.shape(load.value) != ():
+            raise InputError(
+                f"load is a Constant of the shape {np.shape(load.value)}: expected {expected}; as load={{constant: value}} it grows to "
+                "this value"
+            )
+        return {load: np.float64(1.0)}
+    if isinstance(load, Mapping):
+        given.kind("load", load, bool(load), expected)
+        for constant, value in load.items():
+            given.kind("a name in load", constant, isinstance(constant, fem.Constant), "a Constant")
+            if not callable(value):
+                _fitting(constant, value)
+        return {c: value if callable(value) else np.asarray(value, dtype=float)[()] for c, value in load.items()}
+    if load is not None and (isinstance(load, Expr) or not callable(load)):
         raise InputTypeError(given.sentence("load", load, expected))
+    return load
+
+
+def set_constant(constant: fem.Constant, value: Any) -> None:
+    """Set a Constant to a value of its shape.
+
+    Raises:
+        InputError, InputTypeError: where it is no finite number, or numbers of another shape.
+    """
+    constant.value = _fitting(constant, value)
+
+
+def _fitting(constant: fem.Constant, value: Any) -> Any:
+    """The value as an array of the Constant's shape."""
+    shape = np.shape(constant.value)
+    words = f"finite numbers of the shape {shape}" if shape else "a finite number"
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputTypeError(given.sentence("the value of a Constant in load", value, words)) from None
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(given.sentence("the value of a Constant in load", value, words))
+    return array
 
 
 def check_conditions(config: Configuration, bcs: Any) -> list[Any]:

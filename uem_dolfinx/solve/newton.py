@@ -30,6 +30,9 @@ ENOUGH_DECREASE = 0.9
 #: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
 #: [heuristic; right-hand side; -]
 ACCURACY_ON_THE_WAY = 1e-4
+#: One that asks which contactors are wrong leaves this part of its right-hand side, and goes on where it sees none.
+#: [heuristic; right-hand side; -]
+ACCURACY_OF_EXCHANGES = 1e-3
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 #: [heuristic; right-hand side; -]
 ACCURACY_AT_THE_END = 0.1
@@ -151,8 +154,15 @@ class UnitedSystem(Protocol):
         ``du`` solves the linearised problem, but for this ``accuracy`` of a right-hand side of norm ``driving``.
         """
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
-        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
+    @property
+    def inexact(self) -> bool:
+        """Whether solves are no more accurate than they are asked to be."""
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
+        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations.
+
+        They are looked for from ``near`` on, if it is given. A system that leads the load adds to ``rhs`` what its change contributes.
+        """
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
@@ -201,10 +211,10 @@ def solve_united(
         InvertedElementError: if even the shortest step turns a cell inside out.
     """
     history: list[Iteration] = []
-    start, length, norm, stalled = 0.0, 1.0, 0.0, 0
+    start, length, norm, stalled, left = 0.0, 1.0, 0.0, 0, 0.0
 
     def settled(norm: float, scale: float, rounding: float) -> bool:
-        return norm <= max(max(SETTLED, rtol) * max(scale, start), rounding)
+        return norm <= max(max(SETTLED, rtol) * max(scale, start), rounding, left)
 
     system.place(returning=False)
     if not system.assemble_residual():
@@ -214,12 +224,14 @@ def solve_united(
         )
     for k in range(max_iterations + 1):
         state = system.unite(settled)
-        start = start if k else state.norm
+        if k == 0:
+            # a displacement that comes back to nothing keeps the rounding of what it was
+            start, left = state.norm, min(state.rounding, rtol * forces_before)
         forces = max(state.scale, start)
         steady = state.right and not state.changed
         stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and steady else 0
         norm = state.norm
-        rounding = state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding)
+        rounding = max(state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding), left)
         small = rtol * forces
         if small < norm <= rounding:
             # rounding excuses a residual that is small beside real forces, or where there are none
@@ -299,16 +311,23 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
         wanted: norm of the residual that convergence asks for.
         passing: whether another iteration follows in any case.
     """
-    iterations = 0
+    iterations, du = 0, None
     for exchanges in range(MOST_EXCHANGES + 1):
         rhs = system.linearise(state)
         driving = rhs.norm()
         needed = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
-        accuracy = min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END)
-        dq, count = system.solve(rhs, accuracy)
-        iterations += count
-        du = system.move(state, dq)
-        better = system.exchange(state, du, driving, accuracy)
+        needed = min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END)
+        # who is wrong by far is told long before the solution is accurate
+        first = ACCURACY_OF_EXCHANGES if system.inexact and system.in_contact else needed
+        near = None if du is None else state.trial.reduce(du)
+        for accuracy in (first, needed) if first > needed else (needed,):
+            dq, count = system.solve(rhs, accuracy, near)
+            iterations += count
+            driving = max(driving, rhs.norm())
+            du, near = system.move(state, dq), dq
+            better = system.exchange(state, du, driving, accuracy)
+            if better is not None:
+                break
         if better is None:
             return _Step(state, rhs, dq, du, driving, iterations, exchanges)
         state = better

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.checks import check_conditions, check_load, check_residual, check_values
+from uem_dolfinx.solve.checks import check_conditions, check_load, check_residual, check_values, set_constant
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import StepControl
@@ -50,9 +50,10 @@ class UnitedProblem:
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
             iterative solve is as accurate as its Newton iteration can use.
-        load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped, or
-            a function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values only. Of time
-            steps it is a function of the time.
+        load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped; several as
+            ``{constant: value}``, each with its value at the full load, a number or numbers like its own, to which it grows in
+            proportion, or a function of the factor that returns it; or one function of the factor that sets loads and Dirichlet
+            values itself. None ramps the Dirichlet values only. In time steps the time takes the place of the factor.
         dynamics: mass, velocity and time integration; None is statics.
         materials: laws with history in F, such as ``VonMises``.
         newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
@@ -82,7 +83,7 @@ class UnitedProblem:
         contacts: Sequence[Contact] = (),
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
-        load: fem.Constant | Callable[[float], None] | None = None,
+        load: fem.Constant | Mapping[fem.Constant, Any] | Callable[[float], None] | None = None,
         dynamics: Dynamics | None = None,
         materials: Sequence[HistoryMaterial] = (),
         newton: str = "full",
@@ -99,8 +100,7 @@ class UnitedProblem:
         self.comm = self.config.comm
         with agreed(self.comm):
             check_residual(F, u)
-            check_load(load)
-            self.load = load
+            self.load = check_load(load)
             bcs = check_conditions(self.config, bcs)
             self.contacts = given.items("contacts", contacts, lambda one: isinstance(one, Contact), "a Contact")
             check_new(self.contacts)
@@ -152,8 +152,11 @@ class UnitedProblem:
 
     def set_load(self, at: float) -> None:
         """Set loads, and what else ``load`` sets, of a load factor or a time; a UserFunctionError if it raises (collective)."""
-        if isinstance(self.load, fem.Constant):
-            self.load.value = at
+        if isinstance(self.load, Mapping):
+            for constant, value in self.load.items():
+                now = ask_together(self.comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
+                with agreed(self.comm):
+                    set_constant(constant, now)
         elif self.load is not None:
             ask_together(self.comm, f"load({at:.6g})", self.load, at)
 
@@ -166,12 +169,15 @@ class UnitedProblem:
         self.commit()
         return history
 
-    def attempt(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
+    def attempt(
+        self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: UnitedSystem | None = None
+    ) -> list[Iteration]:
         """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
         Args:
             start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
             fraction: how far the Dirichlet values go, from ``start`` (0) to the values of ``bcs`` (1).
+            along: what leads the load from iteration to iteration, and its steps, which no line search shortens; None is nothing.
 
         Returns:
             The history of iterations.
@@ -189,10 +195,10 @@ class UnitedProblem:
         try:
             self.system.begin_step()
             history = solve_united(
-                self.system,
+                self.system if along is None else along,
                 rtol=self.rtol,
                 max_iterations=self.max_iterations,
-                line_search=self.line_search,
+                line_search=self.line_search and along is None,
                 verbose=self.verbose,
                 forces_before=self._largest_forces,
                 heed=lambda: self.progress.heed(self.comm),

@@ -105,15 +105,29 @@ class RigidMotions:
         """
         if self.finite:
             self.middle = self._middles()
-        i, c = np.nonzero(~self.free)
-        body = self._body[i]
-        held = self._spread(self._modes(self._places[i], body)[np.arange(len(i)), :, c], body)
+        held = self._held()
         resisted = held.T @ held
         if equations is not None:
             rows = self.rates(equations)[equations.active]
             resisted = resisted + rows.T @ rows
         values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
         return vectors[:, values < resistance**2]
+
+    def _held(self) -> Array:
+        """How each motion moves the components with a Dirichlet condition ``(n, n_motions)``."""
+        i, c = np.nonzero(~self.free)
+        body = self._body[i]
+        return self._spread(self._modes(self._places[i], body)[np.arange(len(i)), :, c], body)
+
+    def following(self, prescribed: Array) -> Array:
+        """The motion that follows the Dirichlet conditions by least squares; what they leave open rests (collective).
+
+        Args:
+            prescribed: increments of the owned nodes, those of free components aside ``(n_owned, gdim)``.
+        """
+        held = self._held()
+        gram, along = self.comm.allreduce(held.T @ held), self.comm.allreduce(held.T @ prescribed[~self.free])
+        return np.asarray(np.linalg.pinv(gram, OPEN**2, hermitian=True) @ along)
 
     def load(self, motions: Array, residual: Array, among: Array | None = None) -> Array:
         """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).

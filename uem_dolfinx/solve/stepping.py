@@ -13,9 +13,26 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
+from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
 
 T = TypeVar("T")
+
+
+class Step:
+    """What is told of every converged step, from its history of the Newton loop."""
+
+    iterations: list[Iteration]
+
+    @property
+    def newton_iterations(self) -> int:
+        """Number of iterations, each with a tangent and at least one linear solve."""
+        return len(self.iterations) - 1
+
+    @property
+    def exchanges(self) -> int:
+        """Number of further linear solves with the same tangents, each with another active set."""
+        return sum(i.exchanges for i in self.iterations)
 
 
 @dataclass
@@ -27,7 +44,8 @@ class Progress:
         resumed: how often a checkpoint has been read into it.
         ramp: the call of ``load_steps`` that has brought the load where it is, counted from 1; 0 before the first.
         factor: load factor reached in it.
-        start: displacement at its beginning ``(n_local incl. ghosts,)``.
+        start: displacement at its beginning ``(n_local incl. ghosts,)``; with arc lengths at the beginning of its last step.
+        reach: arc length of the whole call, were all of it like its first step; 0 without arc lengths.
         control: length of its steps.
         interruption: signals that are noted while the problem steps.
     """
@@ -37,6 +55,7 @@ class Progress:
     ramp: int = 0
     factor: float = 0.0
     start: Array = field(default_factory=lambda: np.zeros(0))
+    reach: float = 0.0
     control: StepControl = field(default_factory=StepControl)
     interruption: Interruption | None = None
     _calls: int = 0
@@ -55,6 +74,7 @@ class Progress:
         self._calls += 1
         if self._calls > self.ramp:
             self.ramp, self.factor, self.start = self._calls, 0.0, np.array(displacement)
+            self.reach = 0.0
             self.control = StepControl()
         self.control.begin(1.0 / steps)
         return self._calls == self.ramp
@@ -66,7 +86,7 @@ class Progress:
 
     def to_checkpoint(self, ramped: bool) -> dict[str, Any]:
         """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
-        load = {"load ramp": self.ramp, "load factor": self.factor} if ramped else {}
+        load = {"load ramp": self.ramp, "load factor": self.factor, "arc length": self.reach} if ramped else {}
         return {"steps committed": self.steps} | load | (self.control.to_checkpoint() if ramped else {})
 
     def from_checkpoint(self, kept: dict[str, Any], start: Array | None) -> None:
@@ -74,7 +94,7 @@ class Progress:
         self.steps = kept["steps committed"]
         self.resumed += 1
         if start is not None:
-            self.ramp, self.factor = kept["load ramp"], kept["load factor"]
+            self.ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
             self.start = np.array(start)
             self.control.from_checkpoint(kept)
             # a script that is run anew comes to this call of load_steps once more

@@ -25,6 +25,7 @@ from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
@@ -115,9 +116,11 @@ class BodySystem:
             self.forces.u.x.scatter_forward()
 
     def begin_step(self) -> None:
-        """Begin a step: bodies that only contact holds fall until they touch."""
-        self._doubtful = None
-        self.floating.begin_step(lambda: self.place(returning=False))
+        """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
+        self._doubtful, place = None, partial(self.place, returning=False)
+        self.floating.begin_step(place)
+        if self.forces.dynamics is None and self.floating.motions is None:
+            touch_ahead(self.forces, self.pairs, place)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
@@ -272,11 +275,10 @@ class BodySystem:
         """Which of the wrong contactors are exchanged now (collective)."""
         touching = sum(pair.n_active for pair in self.pairs)
         deepest = -min(float(gap[w.enter].min(initial=0.0)) for gap, w in zip(gaps, wrong))
-        worst = max(w.worst for w in wrong)
-        deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, worst))
+        deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, max(w.worst for w in wrong)))
         if not self._pivoting.all_at_once(count):
-            pattern = zlib.crc32(b"".join(pair.pattern for pair in self.pairs))
-            if self._pivoting.repeats(self.comm.allgather(pattern)) and self._curvature is not None:
+            pattern, told = zlib.crc32(b"".join(pair.pattern for pair in self.pairs)), self._curvature is None and not self.rough
+            if self._pivoting.repeats(self.comm.allgather(pattern), told) and self._curvature is not None:
                 # with curvature the problem may have no solution, or several; without there is one
                 self._curvature, self._pivoting = None, Pivoting()
             return [w.among_the_worst(worst) for w in wrong]
@@ -397,9 +399,14 @@ class BodySystem:
             return None
         return contact_curvature(parts, self.forces.vector())
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float) -> tuple[PETSc.Vec, int]:
+    @property
+    def inexact(self) -> bool:
+        """Whether solves are no more accurate than they are asked to be."""
+        return self.solver.inexact
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
-        return self.solver.solve(rhs, accuracy)
+        return self.solver.solve(rhs, accuracy, near)
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""

@@ -20,7 +20,7 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
-from uem_dolfinx.solve.stepping import between_steps
+from uem_dolfinx.solve.stepping import Step, between_steps
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
@@ -34,7 +34,7 @@ SHORTEST_GIVEN = 1.0 / 128
 
 
 @dataclass(frozen=True)
-class TimeStep:
+class TimeStep(Step):
     """A converged time step.
 
     Attributes:
@@ -54,16 +54,6 @@ class TimeStep:
     cuts: int
     touched: tuple[str, ...]
     left: tuple[str, ...]
-
-    @property
-    def newton_iterations(self) -> int:
-        """Number of iterations, each with a tangent and at least one linear solve."""
-        return len(self.iterations) - 1
-
-    @property
-    def exchanges(self) -> int:
-        """Number of further linear solves with the same tangents, each with another active set."""
-        return sum(i.exchanges for i in self.iterations)
 
     @property
     def start(self) -> float:

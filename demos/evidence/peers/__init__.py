@@ -1,6 +1,6 @@
-"""Other codes on the scene of ``hertz_cylinder.py``: what they are given, what they answer, and how their processes are run.
+"""Other codes on the scenes of ``hertz_cylinder.py`` and ``hertz_sphere.py``: what they are given and answer, how they are run.
 
-Every code gets the same nodes, cells and edges as arrays, runs on one thread in a process told from this one's MPI, and says how
+Every code gets the same nodes, cells and facets as arrays, runs on one thread in a process told from this one's MPI, and says how
 long it took.
 """
 
@@ -30,46 +30,60 @@ class PeerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Hertz:
-    """Two bodies, a disc over a block, as arrays in DOLFINx's input order; plane strain.
+    """Two bodies, a disc or a sphere over a block, as arrays in DOLFINx's input order; plane strain in 2D.
 
     Attributes:
-        x: nodes ``(n, 2)``.
-        cells: nodes of the triangles, counterclockwise ``(n_cells, 3)``.
-        disc: which cells are the disc's ``(n_cells,)``.
-        edges: nodes of the edges of each named line, ``(n_edges, 2)``: ``symmetry``, ``block_bottom``, ``disc_top``, ``disc_arc``
-            and ``block_top``.
+        x: nodes ``(n, gdim)``.
+        cells: nodes of the triangles, counterclockwise, or of the tetrahedra, of positive volume ``(n_cells, gdim + 1)``.
+        upper: which cells are the disc's or the sphere's ``(n_cells,)``.
+        facets: nodes of the facets of each named surface, ``(n_facets, gdim)``.
+        contactor: name of the surface of the upper body that comes into contact; the other is ``block_top``.
+        supports: names of surfaces, and the component and value that are prescribed there.
+        led: those of a second step, in which friction tells.
+        friction: coefficient of friction.
+        parts: how many like it make the whole.
         h: size of the cells in the contact zone.
         E: Young's modulus of both bodies.
         nu: Poisson's ratio.
-        R: radius of the disc.
-        push: by how much ``disc_top`` goes down.
+        R: radius of the disc or sphere.
     """
 
     x: np.ndarray = field(repr=False)
     cells: np.ndarray = field(repr=False)
-    disc: np.ndarray = field(repr=False)
-    edges: dict[str, np.ndarray] = field(repr=False)
+    upper: np.ndarray = field(repr=False)
+    facets: dict[str, np.ndarray] = field(repr=False)
+    contactor: str
+    supports: list[tuple[str, int, float]]
+    parts: int
     h: float
     E: float
     nu: float
     R: float
-    push: float
+    friction: float = 0.0
+    led: list[tuple[str, int, float]] = field(default_factory=list)
+
+    @property
+    def gdim(self) -> int:
+        """2 or 3."""
+        return self.x.shape[1]
 
     def nodes(self, name: str) -> np.ndarray:
-        """Nodes of a line, ascending."""
-        return np.unique(self.edges[name])
+        """Nodes of a surface, ascending."""
+        return np.unique(self.facets[name])
 
     def sides(self, name: str) -> np.ndarray:
-        """Cell and number k of each edge of a line, from the cell's node k to the next ``(n_edges, 2)``."""
-        n = len(self.x)
-        sides = np.sort(np.stack([self.cells, np.roll(self.cells, -1, axis=1)], axis=2), axis=2) @ [n, 1]
-        return np.argwhere(np.isin(sides, np.sort(self.edges[name], axis=1) @ [n, 1]))
+        """Cell of each facet of a surface, and which of its nodes lies opposite ``(n_facets, 2)``."""
+        n, own = len(self.x), np.sort(self.facets[name], axis=1)
+        powers = n ** np.arange(self.gdim)
+        opposite = [np.sort(np.delete(self.cells, k, axis=1), axis=1) @ powers for k in range(self.gdim + 1)]
+        return np.argwhere(np.isin(np.stack(opposite, axis=1), own @ powers))
 
-    def lengths(self, name: str) -> np.ndarray:
-        """Length of line that belongs to each of its nodes, in the order of ``nodes`` ``(n,)``."""
-        a, b = self.edges[name].T
-        half = np.linalg.norm(self.x[a] - self.x[b], axis=1) / 2
-        return np.bincount(np.concatenate([a, b]), np.concatenate([half, half]), len(self.x))[self.nodes(name)]
+    def sizes(self, name: str) -> np.ndarray:
+        """Length or area that belongs to each node of a surface, in the order of ``nodes`` ``(n,)``."""
+        own = self.facets[name]
+        along = self.x[own[:, 1:]] - self.x[own[:, :1]]
+        size = np.sqrt(np.linalg.det(along @ along.transpose(0, 2, 1))) / (self.gdim - 1)
+        return np.bincount(own.ravel(), np.repeat(size / self.gdim, self.gdim), len(self.x))[self.nodes(name)]
 
 
 @dataclass(frozen=True)
@@ -79,44 +93,46 @@ class Answer:
     Attributes:
         seconds: median of the runs that are counted.
         newton_iterations: of one run.
-        P: force of both halves of the cylinder.
+        P: force of all parts of the cylinder or sphere.
         p_max: largest pressure.
+        Q: force along the surface.
     """
 
     seconds: float
     newton_iterations: int
     P: float
     p_max: float
+    Q: float = 0.0
 
 
-def gathered(mesh: Any, tags: Tags, **scene: float) -> Hertz | None:
-    """Arrays of a distributed mesh of triangles with the tags of ``hertz_cylinder.geo``, on rank 0; None elsewhere (collective).
+def gathered(mesh: Any, tags: Tags, upper: str, **scene: Any) -> Hertz | None:
+    """Arrays of a distributed mesh of triangles or tetrahedra, on rank 0; None elsewhere (collective).
 
     Args:
         mesh: the mesh.
-        tags: its tags.
-        scene: the numbers of ``Hertz``.
+        tags: its tags, those of ``hertz_cylinder.geo`` or ``hertz_sphere.geo``.
+        upper: tag of the upper body's cells.
+        scene: the other attributes of ``Hertz``.
     """
     tdim, topology, comm = mesh.topology.dim, mesh.topology, mesh.comm
     topology.create_connectivity(tdim - 1, 0)
     number = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
-    vertices, links = number[forms.vertex_nodes(mesh)], topology.connectivity(tdim - 1, 0).array.reshape(-1, 2)
-    lines = {str(name): vertices[links[tag.entities]] for name, tag in tags.items() if tag.dim == tdim - 1}
+    vertices, links = number[forms.vertex_nodes(mesh)], topology.connectivity(tdim - 1, 0).array.reshape(-1, tdim)
+    surfaces = {str(name): vertices[links[tag.entities]] for name, tag in tags.items() if tag.dim == tdim - 1}
     n_owned = topology.index_map(tdim).size_local
-    disc = np.isin(np.arange(n_owned), tags["disc"].entities)
+    above = np.isin(np.arange(n_owned), tags[upper].entities)
     cells = number[compat.geometry_dofs(mesh)[:n_owned]]
-    parts = comm.gather((number, mesh.geometry.x[:, :2], cells, disc, lines))
+    parts = comm.gather((number, mesh.geometry.x[:, :tdim], cells, above, surfaces))
     if parts is None:
         return None
-    numbers, places, cells, disc = (np.concatenate([part[i] for part in parts]) for i in range(4))
-    x = np.empty((numbers.max() + 1, 2))
+    numbers, places, cells, above = (np.concatenate([part[i] for part in parts]) for i in range(4))
+    x = np.empty((numbers.max() + 1, tdim))
     x[numbers] = places
-    a, b, c = (x[cells[:, i]] for i in range(3))
-    clockwise = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
-    cells[clockwise] = cells[clockwise][:, [0, 2, 1]]
-    # an edge between the parts of two ranks is there twice
-    edges = {name: np.unique(np.sort(np.concatenate([part[4][name] for part in parts]), axis=1), axis=0) for name in lines}
-    return Hertz(x, cells, disc, edges, **scene)
+    turned = np.linalg.det(x[cells[:, 1:]] - x[cells[:, :1]]) < 0
+    cells[turned] = cells[turned][:, [0, 2, 1, 3][: tdim + 1]]
+    # a facet between the parts of two ranks is there twice
+    facets = {name: np.unique(np.sort(np.concatenate([part[4][name] for part in parts]), axis=1), axis=0) for name in surfaces}
+    return Hertz(x, cells, above, facets, **scene)
 
 
 def run(command: Sequence[str], folder: Path, timeout: float) -> str:

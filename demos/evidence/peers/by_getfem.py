@@ -1,4 +1,4 @@
-"""The scene in GetFEM: linear triangles, its nodal contact between meshes that do not match, MUMPS, one step.
+"""The scene in GetFEM: linear triangles or tetrahedra, its nodal contact between meshes that do not match, MUMPS, one step.
 
 Small strain and feet on the target found once, which makes its discrete problem that of the united elements with
 ``sliding="fixed"``. The contact forces are multipliers at the nodes of the arc with the augmentation 100 E, which took as few
@@ -56,22 +56,24 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
     python = interpreter()
     if python is None:
         raise PeerError(f"GetFEM is not installed: {INSTALL}")
-    lines = {name: scene.edges[name] for name in scene.edges} | {f"sides_{name}": scene.sides(name) for name in scene.edges}
-    numbers = {"E": scene.E, "nu": scene.nu, "push": scene.push, "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
+    surfaces = {"contactor": scene.contactor, "target": "block_top"}
+    arrays = {f"sides_{of}": scene.sides(name) for of, name in surfaces.items()} | {
+        name: scene.nodes(name) for name, *_ in scene.supports
+    }
+    numbers = {"nu": scene.nu, "supports": json.dumps(scene.supports), "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        np.savez(folder / "scene.npz", x=scene.x, cells=scene.cells, disc=scene.disc, **lines, **numbers)
+        np.savez(folder / "scene.npz", x=scene.x, cells=scene.cells, upper=scene.upper, **arrays, **numbers)
         run([python, "-I", str(SCRIPT), "scene.npz", "answer.json"], folder, timeout)
         told = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
     if not told["converged"]:
         raise PeerError(f"GetFEM did not converge in {told['iterations']} iterations")
-    x, lengths = scene.x[scene.nodes("disc_arc")], scene.lengths("disc_arc")
     # GetFEM has its own numbers of the nodes
-    here, there = np.argsort(x[:, 0]), np.argsort(told["x"])
-    pressures = scene.E * np.array(told["forces"])[there] / lengths[here]
+    here, there = (np.lexsort(np.round(x.T / scene.h, 6)) for x in (scene.x[scene.nodes(scene.contactor)], np.array(told["x"])))
+    pressures = scene.E * np.array(told["forces"])[there] / scene.sizes(scene.contactor)[here]
     return Answer(
         float(np.median(told["seconds"][1:] or told["seconds"])),
         told["iterations"],
-        2 * scene.E * told["P"],
+        scene.parts * scene.E * told["P"],
         float(pressures.max()),
     )

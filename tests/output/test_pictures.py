@@ -1,0 +1,246 @@
+"""Pictures in 3D and films: what is handed to the drawing is the scene on any number of ranks, and no run loses its film.
+
+Worth reading first: ``test_outside_of_the_bodies`` and ``test_run_that_breaks``.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+import types
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from helpers import raised, refused
+from results_scenes import pressed
+
+import uem_dolfinx as uem
+from uem_dolfinx.output import drawings, films, pictures3d
+
+pytest.importorskip("matplotlib")
+COMM = MPI.COMM_WORLD
+
+
+def need_pyvista():
+    pytest.importorskip("pyvista")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What PyVista would draw on rank 0, as keyword arguments; nothing is drawn."""
+    calls = []
+
+    def images(points, faces, values, colours, box, window, view, edges):
+        calls.append(dict(x=points[0], faces=faces, values=values[0], box=box, window=window, view=view))
+        return [np.zeros((2, 3, 4), np.uint8) for _ in points]
+
+    monkeypatch.setattr(pictures3d, "images", images)
+    monkeypatch.setattr(pictures3d, "require", lambda comm: None)
+    return calls
+
+
+def area(x, faces):
+    """Area of plane facets."""
+    a = x[faces]
+    return 0.5 * np.linalg.norm(sum(np.cross(a[:, i] - a[:, 0], a[:, i + 1] - a[:, 0]) for i in range(1, a.shape[1] - 1)), axis=1)
+
+
+@pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
+def test_outside_of_the_bodies(cell, drawn, folder):
+    """Two unit cubes, one on the other: their 12 sides, each with its displacement, and the pressure where they meet."""
+    problem = pressed(COMM, cell, 2 if cell == "tetrahedron" else 1)
+    contact = problem.contacts[0]
+    uem.plot_scene(problem, folder / "start.png")
+    for _ in uem.load_steps(problem):
+        pass
+    uem.plot_scene(problem, folder / "end.png", levels=[0.0, 0.05, 0.1], view=(0.0, 0.0, 2.0))
+    uem.plot_scene(problem, folder / "pressure.png", field=contact, surface=contact.contactor, levels=[0.0, 1.0])
+    uem.plot_scene(problem, folder / "part.png", window=(0.0, 0.5, 0.0, 1.0, 0.0, 1.0))
+    force = contact.resultant().force[2]
+    if COMM.rank:
+        assert not drawn
+        return
+    start, end, pressure, part = drawn
+    assert area(start["x"], start["faces"]).sum() == pytest.approx(12.0)
+    np.testing.assert_allclose(part["window"], [[0, 0.5], [0, 1], [0, 1]], atol=2 * drawings.EVEN)
+    assert (part["window"][:, 0] < 0).all()
+    assert area(end["x"], end["faces"]).sum() == pytest.approx(8.0 - 4.0 * 0.1 + 4.0)
+    np.testing.assert_allclose(end["box"], [[0, 1], [0, 1], [-1, 0.9]], atol=4 * drawings.EVEN)
+    # colours are numbered from 0; |u| grows from the bottom to the top
+    top = np.isclose(end["x"][:, 2], 0.9)
+    np.testing.assert_allclose(end["values"][top], 2.0)
+    np.testing.assert_allclose(end["values"], 20.0 * 0.05 * (end["x"][:, 2] + 1.0) / 0.95, atol=1e-9)
+    np.testing.assert_allclose(end["view"], [0, 0, 1])
+    assert area(pressure["x"], pressure["faces"]).sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(pressure["values"], force, rtol=1e-9)
+
+
+def test_pictures_of_bodies(folder):
+    """Drawn in fact, into a file and into a panel: the scene is on it, in the colours of the colour map."""
+    need_pyvista()
+    problem = pressed(COMM, "tetrahedron")
+    uem.plot_scene(problem, folder / "scene.png", cells=False)
+    with uem.figure(folder / "both.png", COMM, panels=2) as (left, right):
+        uem.plot_scene(problem, left, field=ufl.div(problem.u), window=(0, 0.5, 0, 1, -1, 1), view="iso")
+        uem.plot_pressure(problem.contacts, right)
+        if left is not None:
+            image = left.get_images()[0].get_array()
+            assert (image[..., 3] > 0).mean() > 0.3 and image.shape[0] > 500
+    raised(uem.InputError, "no part of the scene is in it", lambda: uem.plot_scene(problem, folder / "a.png", window=(5, 6) * 3))
+    raised(ValueError, "no such colours", lambda: uem.plot_scene(problem, folder / "a.png", cmap="no such colours"))
+
+
+def test_arguments_of_other_dimensions(monkeypatch, folder):
+    monkeypatch.setattr(pictures3d, "require", lambda comm: None)
+    flat, solid = pressed(COMM, "triangle"), pressed(COMM, "tetrahedron")
+    given = {
+        "mirror": True, "arrows": True, "window": (0, 1, 0, 1), "view": (0, 0, 0), "field": solid.u, "levels": [1.0, 0.0],
+    }  # fmt: skip
+    for name, value in given.items():
+        refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(solid, folder / "a.png", **{name: value}))
+    for name, value in {
+        "view": "iso",
+        "surface": flat.contacts[0].contactor,
+        "window": (1, 0, 0, 1),
+        "levels": 0,
+        "field": [],
+    }.items():
+        refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(flat, folder / "a.png", **{name: value}))
+
+
+def test_no_pyvista_is_a_named_error_on_every_rank(monkeypatch, folder):
+    if COMM.rank == 0:
+        monkeypatch.setitem(sys.modules, "pyvista", None)
+    problem = pressed(COMM, "tetrahedron")
+    raised(uem.MissingBackendError, "needs PyVista .*pip install pyvista", lambda: uem.plot_scene(problem, folder / "a.png"))
+    steps = uem.load_steps(problem)
+    raised(uem.MissingBackendError, "needs PyVista", lambda: uem.animate(folder / "a.gif", problem, steps))
+
+
+def test_nothing_to_draw_with(monkeypatch, folder):
+    """VTK would end the process."""
+    monkeypatch.setitem(sys.modules, "pyvista", types.ModuleType("pyvista"))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if COMM.rank == 0:
+        monkeypatch.setattr(pictures3d, "find_library", lambda name: None)
+    refused(
+        uem.MissingBackendError, ("libEGL", "apt-get"), lambda: uem.plot_scene(pressed(COMM, "tetrahedron"), folder / "a.png")
+    )
+
+
+def test_a_pressure_that_is_the_same_everywhere(folder):
+    """Is drawn with room above, not on the frame."""
+    problem = pressed(COMM, "triangle")
+    for _ in uem.load_steps(problem):
+        pass
+    largest = problem.contacts[0].max_pressure()
+    with uem.figure(folder / "pressure.png", COMM) as (panel,):
+        uem.plot_pressure(problem.contacts, panel)
+        if panel is not None:
+            assert 0.9 * panel.get_ylim()[1] < largest < 0.97 * panel.get_ylim()[1] and panel.get_ylim()[0] == 0
+
+
+def test_a_field_that_is_the_same_everywhere():
+    """Rounding is not drawn, and what varies a little more is."""
+    even = drawings.EVEN
+    assert drawings._bounds(2.0, 2.0 * (1 + 0.1 * even), 12).tolist() == pytest.approx([1.9, 2.1])
+    assert len(drawings._bounds(2.0, 2.0 * (1 + 10 * even), 12)) > 6
+    assert len(drawings._bounds(0.0, 0.0, 12)) == 2
+
+
+# -- films -----------------------------------------------------------------------------------------------------------------
+
+
+def frames(path):
+    """How many frames a film has, told by rank 0."""
+    from PIL import Image
+
+    COMM.barrier()
+    return COMM.bcast(Image.open(path).n_frames if COMM.rank == 0 else None)
+
+
+def test_frames_of_a_film(folder, monkeypatch):
+    """One for each step, all with the same window and the same colours, and the steps come as they would."""
+    problem, bounds = pressed(COMM, "triangle"), []
+    draw = drawings.Drawn2D.draw
+
+    def seen(self, ax, frame):
+        draw(self, ax, frame)
+        bounds.append((*ax.get_xlim(), *ax.get_ylim(), *self.bounds))
+
+    monkeypatch.setattr(drawings.Drawn2D, "draw", seen)
+    field = 100.0 * problem.contacts[0].pressure
+    steps = list(uem.animate(folder / "new" / "a.gif", problem, uem.load_steps(problem, 4), field=field, label="pressure"))
+    assert [step.factor for step in steps] == [0.25, 0.5, 0.75, 1.0] and frames(folder / "new" / "a.gif") == 4
+    assert len(bounds) == 4 * (COMM.rank == 0) and len(set(bounds)) == COMM.allreduce(len(set(bounds))) * (COMM.rank == 0)
+
+
+def test_every_second_step_in_3d(folder):
+    need_pyvista()
+    problem = pressed(COMM, "hexahedron")
+    assert len(list(uem.animate(folder / "a.gif", problem, uem.load_steps(problem, 3), every=2, field=problem.contacts))) == 3
+    assert frames(folder / "a.gif") == 2
+
+
+def broken(steps):
+    """Steps of which the third fails."""
+    for number, step in enumerate(steps):
+        if number == 2:
+            raise uem.ConvergenceError("no third step")
+        yield step
+
+
+def test_run_that_breaks(folder, caplog, monkeypatch):
+    """Its film has the steps before, and its exception is what it was, even if the film cannot be drawn."""
+    problem = pressed(COMM, "triangle")
+    run = lambda: list(uem.animate(folder / "a.gif", problem, broken(uem.load_steps(problem, 4))))  # noqa: E731
+    error = raised(uem.ConvergenceError, "no third step", run)
+    assert "broken" in [entry.name for entry in traceback.extract_tb(error.__traceback__)]
+    assert frames(folder / "a.gif") == 2
+    monkeypatch.setattr(films, "_write", lambda *args: 1 / 0)
+    problem = pressed(COMM, "triangle")
+    raised(uem.ConvergenceError, "no third step", run)
+    assert "a.gif cannot be written (ZeroDivisionError" in caplog.text or COMM.rank
+
+
+def test_loop_that_is_left(folder):
+    """By ``break``, by an exception, and before its first step, which leaves no film."""
+    problem = pressed(COMM, "triangle")
+    for step in uem.animate(folder / "a.gif", problem, uem.load_steps(problem, 4)):
+        if step.factor > 0.6:
+            break
+    assert frames(folder / "a.gif") == 3
+    problem = pressed(COMM, "triangle")
+
+    def run():
+        for _ in uem.animate(folder / "b.gif", problem, uem.load_steps(problem, 4)):
+            raise ZeroDivisionError("in the loop")
+
+    raised(ZeroDivisionError, "in the loop", run)
+    assert frames(folder / "b.gif") == 1
+    uem.animate(folder / "c.gif", problem, uem.load_steps(problem, 4)).close()
+    COMM.barrier()
+    assert not (folder / "c.gif").exists()
+
+
+def test_films_that_are_refused(folder, monkeypatch):
+    """Before the run."""
+    problem = pressed(COMM, "triangle")
+
+    def film(name, **how):
+        return lambda: uem.animate(folder / name, problem, uem.load_steps(problem, 4), **how)
+
+    refused(uem.InputError, ("path", ".gif or .mp4", "a.png"), film("a.png"))
+    refused(uem.InputError, ("labl", "did you mean 'label'"), film("a.gif", labl="stress"))
+    refused(uem.InputError, "every = 0", film("a.gif", every=0))
+    refused(uem.InputError, "view", film("a.gif", view="iso"))
+    monkeypatch.setenv("PATH", "")
+    refused(uem.MissingBackendError, "needs ffmpeg", film("a.mp4"))
+    if COMM.rank == 0:
+        (folder / "out").write_text("in the way")
+    COMM.barrier()
+    refused(uem.OutputError, "cannot be written", film(Path("out") / "a.gif"))

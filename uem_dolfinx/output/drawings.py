@@ -1,0 +1,182 @@
+"""How a scene is drawn into the panel of a figure, 2D by matplotlib, 3D by PyVista: the same for all frames of a film."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.tags import Part
+from uem_dolfinx.output import pictures3d
+from uem_dolfinx.output.frames import Frame, Gathering, Pieces
+from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.problem import UnitedProblem
+
+#: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it.
+#: [convention; the field's largest value, the window's size; test_pictures.py::test_a_field_that_is_the_same_everywhere]
+EVEN = 1e-9
+FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
+
+
+class Drawing:
+    """Takes frames of a scene and draws them (making one is collective); arguments and errors are those of :func:`plot_scene`."""
+
+    def __init__(
+        self, problem: UnitedProblem, *, field: Any, label: str, levels: int | Sequence[float], scale: float,
+        window: Sequence[float] | None, mirror: bool, cells: bool, arrows: bool | None, cmap: str, view: str | Sequence[float] | None,
+        surface: Part | None,
+    ):  # fmt: skip
+        given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+        gdim, pressed = problem.config.gdim, isinstance(field, Contact)
+        with agreed(problem.comm):
+            refused = {"mirror": mirror, "arrows": arrows} if gdim == 3 else {"view": view, "surface": surface}
+            for name, value in refused.items():
+                if value is not None and value is not False:
+                    raise InputError(
+                        f"{name} = {given.shown(value)} is for {5 - gdim}D scenes, this one is {gdim}D: leave it out"
+                    )
+            if np.ndim(levels) == 0:
+                levels = given.count("levels", levels)
+            elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
+                raise InputError(given.sentence("levels", levels, "the number of colours, or two or more bounds that grow"))
+            if isinstance(field, (list, tuple)) and len(field):
+                pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact), "a contact"))
+            elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
+                raise InputError(given.sentence("field", field, FIELD))
+            scale = given.number("scale", scale)
+            if window is not None and not (np.diff(given.vector("window", window, 2 * gdim))[::2] > 0).all():
+                raise InputError(given.sentence("window", window, "on each axis a lower bound and a larger upper one"))
+            if gdim == 3:
+                toward = (1.0, 1.0, 1.0) if view is None or (isinstance(view, str) and view == "iso") else view
+                self.view = given.direction("view", toward, 3)  # type: ignore[arg-type]
+        if gdim == 3:
+            pictures3d.require(problem.comm)
+        self.label = label or ("|u|" if field is None else "contact pressure" if pressed else "")
+        self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap
+        self.comm = problem.comm
+        gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface)
+        self.take, self.pieces = gathering.take, gathering.pieces
+
+    def over(self, frames: Sequence[Frame]) -> Drawn:
+        """What draws these frames, on rank 0: window, colours and lengths of arrows are the same for all of them."""
+        assert self.pieces is not None
+        return (Drawn3D if frames[0].x.shape[1] == 3 else Drawn2D)(self, self.pieces, frames)
+
+
+class Drawn(ABC):
+    """Frames with a window, bounds of their colours and a colour bar in common."""
+
+    def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
+        self.how, self.pieces, self.frames = how, pieces, frames
+        self.box = self._everything() if how.window is None else np.reshape(how.window, (-1, 2))
+        # a side of the scene that the window ends at is in it, whatever rounding makes of it
+        self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
+        seen = np.concatenate([f.values[self._shown(f.x)] for f in frames])
+        if not len(seen):
+            seen = np.concatenate([f.values for f in frames])
+        least, most = float(seen.min()), float(seen.max())
+        #: Bounds of the colours.
+        self.bounds = np.asarray(how.levels if not isinstance(how.levels, int) else _bounds(least, most, how.levels))
+        #: Which ends of the colour bar have an arrow.
+        self.extend = "neither"
+        if not isinstance(how.levels, int):
+            self.extend = ("neither", "min", "max", "both")[int(least < self.bounds[0]) + 2 * int(most > self.bounds[-1])]
+
+    def _everything(self) -> Array:
+        """Bounds of what is in any frame ``(gdim, 2)``."""
+        return np.stack(
+            [np.min([f.x.min(axis=0) for f in self.frames], axis=0), np.max([f.x.max(axis=0) for f in self.frames], axis=0)],
+            axis=1,
+        )
+
+    def _shown(self, x: Array) -> Array:
+        """Which points are in the window."""
+        return np.asarray(((x >= self.box[:, 0]) & (x <= self.box[:, 1])).all(axis=1))
+
+    @abstractmethod
+    def draw(self, ax: Any, frame: Frame) -> None:
+        """Draw a frame into a panel."""
+
+
+def _bounds(least: float, most: float, levels: int) -> Array:
+    """Round bounds of so many colours; of one colour where the values are all the same."""
+    from matplotlib.ticker import MaxNLocator
+
+    if most - least <= EVEN * max(abs(least), abs(most)):
+        return 0.5 * (least + most) + 0.05 * (max(abs(least), abs(most)) or 1.0) * np.array([-1.0, 1.0])
+    return np.asarray(MaxNLocator(levels).tick_values(least, most))
+
+
+class Drawn2D(Drawn):
+    """Coloured cells, their edges, the colour bar, contact forces as arrows."""
+
+    @property
+    def sides(self) -> tuple[float, ...]:
+        """Signs of x that are drawn."""
+        return (1.0, -1.0) if self.how.mirror else (1.0,)
+
+    def _everything(self) -> Array:
+        box = super()._everything()
+        if self.how.mirror:
+            box[0, 0] = -box[0, 1]
+        return np.asarray(box + 0.02 * np.diff(box, axis=1).max() * np.array([-1.0, 1.0]))
+
+    def _shown(self, x: Array) -> Array:
+        return np.any([super(Drawn2D, self)._shown(x * [side, 1.0]) for side in self.sides], axis=0)
+
+    def draw(self, ax: Any, frame: Frame) -> None:
+        """Draw a frame into a panel."""
+        from matplotlib.collections import LineCollection
+
+        how = self.how
+        for side in self.sides:
+            x = frame.x * [side, 1.0]
+            coloured = ax.tricontourf(
+                *x.T, self.pieces.faces, frame.values, levels=self.bounds, cmap=how.cmap, extend=self.extend
+            )
+            if how.cells:
+                ax.add_collection(LineCollection(x[self.pieces.edges], colors="k", linewidths=0.25, alpha=0.35))
+        ax.figure.colorbar(coloured, ax=ax, label=how.label, shrink=0.85)
+        ax.set(xlim=self.box[0], ylim=self.box[1], aspect="equal", xlabel="x", ylabel="y")
+        longest = max((float(p.max(initial=0.0)) for f in self.frames for _, _, p in f.forces), default=0.0)
+        for at, force, pressure in frame.forces:
+            size = np.linalg.norm(force, axis=1)
+            pressed = size > 0
+            if pressed.any():
+                arrows = force[pressed] / size[pressed, None] * pressure[pressed, None]
+                # the longest is an eighth of the picture
+                unit = longest / (0.125 * np.diff(self.box, axis=1).min())
+                for side in self.sides:
+                    ax.quiver(
+                        *(at[pressed] * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=unit,
+                        color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
+                    )  # fmt: skip
+
+
+class Drawn3D(Drawn):
+    """The outside of the bodies as PyVista sees it, in an image, with matplotlib's colour bar."""
+
+    def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
+        super().__init__(how, pieces, frames)
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import BoundaryNorm, ListedColormap
+
+        n = len(self.bounds) - 1
+        colours = ListedColormap(ScalarMappable(cmap=how.cmap).cmap(np.linspace(0.0, 1.0, n)))
+        self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
+        between = [np.interp(f.values, self.bounds, np.arange(n + 1.0)) for f in frames]
+        box = None if how.window is None else self.box
+        images = pictures3d.images([f.x for f in frames], pieces.faces, between, colours, self.box, box, how.view, how.cells)
+        self.images = {id(f): image for f, image in zip(frames, images)}
+
+    def draw(self, ax: Any, frame: Frame) -> None:
+        """Draw a frame into a panel."""
+        ax.imshow(self.images[id(frame)])
+        ax.axis("off")
+        ax.figure.colorbar(self.colours, ax=ax, label=self.how.label, shrink=0.85, extend=self.extend, spacing="proportional")

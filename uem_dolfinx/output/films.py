@@ -1,0 +1,140 @@
+"""Films of runs: what a drawing needs is taken at each step, and drawn when the run has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from uem_dolfinx import given
+from uem_dolfinx.errors import InputError, MissingBackendError, OutputError
+from uem_dolfinx.files import REMEDY, on_rank_0
+from uem_dolfinx.log import logger
+from uem_dolfinx.output.drawings import Drawing
+from uem_dolfinx.output.frames import Frame
+from uem_dolfinx.output.pictures import plot_scene
+from uem_dolfinx.output.tables import given_path
+from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.load_step import LoadStep
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.time_steps import TimeStep
+
+T = TypeVar("T")
+
+
+def animate(
+    path: str | Path,
+    problem: UnitedProblem,
+    steps: Iterable[T],
+    *,
+    every: int = 1,
+    frames_per_second: float = 12,
+    size: tuple[float, float] = (6.4, 4.8),
+    **how: Any,
+) -> Iterator[T]:
+    """Hand on the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
+
+    All frames have the same window, colours and lengths of arrows::
+
+        for step in uem.animate("out/snap.gif", problem, uem.load_steps(problem, 20), field=stress, label="stress"):
+            ...
+
+    The film is written when the run has ended, also by an exception, a signal, or ``break``. What then goes wrong in writing it is a
+    warning, so that the exception stays what it is. Keep no name for the iterator that you leave by ``break``, or ``close()`` it.
+
+    Args:
+        path: name of the film, which ends in ``.gif`` or ``.mp4``; its folder is made.
+        problem: the scene.
+        steps: ``load_steps`` or ``time_steps`` of the problem, or whatever else brings it forward.
+        every: draw one of so many steps, beginning with the first.
+        frames_per_second: how fast it is shown.
+        size: width and height in inches, of 100 points each.
+        how: arguments of :func:`plot_scene`. A Function in an expression is read anew at each step; hand over a contact for its
+            pressure, which is.
+
+    Returns:
+        An iterator over the same steps.
+
+    Raises:
+        InputError, InputTypeError: for another ending, or an argument that ``plot_scene`` does not know or refuses.
+        MissingBackendError: before the run, if matplotlib cannot be imported, in 3D PyVista, for ``.mp4`` if there is no ffmpeg.
+        OutputError: if the film cannot be written: before the run if its folder cannot be made, or at its end.
+    """
+    path = given_path("path", path, problem.comm)
+    with agreed(problem.comm):
+        if path.suffix not in (".gif", ".mp4"):
+            raise InputError(given.sentence("path", str(path), "a name that ends in .gif or .mp4"))
+        every = given.count("every", every)
+        given.vector("size", size, 2)
+        rate = given.number("frames_per_second", frames_per_second, given.POSITIVE)
+        known = dict(plot_scene.__kwdefaults__ or {})
+        for name in how:
+            given.word("argument of animate", name, ("every", "frames_per_second", "size", *known))
+    on_rank_0(problem.comm, f"the film {path} cannot be written", lambda: _prepare(path))
+    return _film(path, Drawing(problem, **(known | how)), steps, every, rate, size)
+
+
+def _film(path: Path, drawing: Drawing, steps: Iterable[T], every: int, rate: float, size: tuple[float, float]) -> Iterator[T]:
+    """The steps of ``animate``."""
+    frames: list[Frame | None] = []
+    try:
+        for number, step in enumerate(steps):
+            if number % every == 0:
+                frames.append(drawing.take(_title(number, step)))
+            yield step
+    except BaseException:
+        # ranks may leave the loop at different times: nothing here is collective
+        try:
+            _write(path, drawing, frames, rate, size)
+        except Exception as error:
+            logger.warning("the film %s cannot be written (%s: %s)", path, type(error).__name__, error)
+        raise
+    with agreed(drawing.comm):
+        try:
+            _write(path, drawing, frames, rate, size)
+        except OSError as error:
+            raise OutputError(f"the film {path} cannot be written ({error}): {REMEDY}") from error
+
+
+def _title(number: int, step: object) -> str:
+    """What a frame is called."""
+    if isinstance(step, TimeStep):
+        return f"time {step.time:.3g}"
+    return f"load {step.factor:.3g}" if isinstance(step, LoadStep) else f"step {number + 1}"
+
+
+def _prepare(path: Path) -> None:
+    """Look, before the run, whether its film can be drawn and written."""
+    try:
+        from matplotlib.animation import FFMpegWriter
+    except ImportError as missing:
+        raise MissingBackendError(f"the film {path} needs matplotlib ({missing}): install it, or leave the film out") from missing
+    if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        raise MissingBackendError(f"the film {path} needs ffmpeg, which is not there: install it, or write a .gif")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab"):
+        pass
+    if not path.stat().st_size:
+        path.unlink()
+
+
+def _write(path: Path, drawing: Drawing, frames: list[Frame | None], rate: float, size: tuple[float, float]) -> None:
+    """Draw the frames and write the film, on rank 0."""
+    taken = [frame for frame in frames if frame is not None]
+    if not taken:
+        return
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    canvas = Figure(figsize=size, constrained_layout=True)
+    FigureCanvasAgg(canvas)
+    drawn = drawing.over(taken)
+    writer = (PillowWriter if path.suffix == ".gif" else FFMpegWriter)(fps=rate)
+    with writer.saving(canvas, str(path), 100):
+        for frame in taken:
+            canvas.clear()
+            ax = canvas.subplots()
+            drawn.draw(ax, frame)
+            ax.set_title(frame.title)
+            writer.grab_frame()

@@ -1,0 +1,189 @@
+"""What a drawing needs of a scene, gathered to rank 0 for drawing alone: vertices, facets, a field and contact forces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.geometry.tags import Part, as_tag
+from uem_dolfinx.solve.problem import UnitedProblem
+
+#: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
+TRIANGLES = {"triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]]}
+#: Vertices in their order around a facet or a 2D cell, by their number.
+AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What is coloured, on rank 0: triangles of a 2D scene, or facets of a 3D one.
+
+    Attributes:
+        faces: vertices of each ``(n, 3)``, in 3D also ``(n, 4)``, in the order of a frame's.
+        edges: vertices around each cell of a 2D scene, closed ``(n_cells, 4 or 5)``; empty in 3D.
+    """
+
+    faces: Ints
+    edges: Ints
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A state of the scene, on rank 0.
+
+    Attributes:
+        x: displaced vertices ``(n, gdim)``.
+        values: of the field there ``(n,)``.
+        forces: positions, forces and pressures of the contactors, one for each contact.
+        title: which state it is.
+    """
+
+    x: Array
+    values: Array
+    forces: list[tuple[Array, Array, Array]]
+    title: str
+
+
+class Gathering:
+    """Takes frames of a scene (making one is collective).
+
+    Args:
+        problem: the scene.
+        field: what colours it, see ``vertex_values``.
+        scale: magnification of the displacement.
+        arrows: whether contact forces are wanted.
+        surface: facets of a 3D scene that are wanted; None takes the whole outside.
+    """
+
+    def __init__(self, problem: UnitedProblem, field: Any, scale: float, arrows: bool, surface: Part | None):
+        self.problem, self.field, self.scale, self.arrows = problem, field, scale, arrows
+        mesh = problem.config.mesh
+        faces, edges = boundary(mesh, surface) if problem.config.gdim == 3 else None, np.zeros((0, 4), np.int64)
+        if faces is None:
+            faces, edges = _vertex_cells(mesh)
+        #: Vertices of this rank that are drawn.
+        self._used = np.unique(faces)
+        parts = problem.comm.gather((len(self._used), np.searchsorted(self._used, faces), np.searchsorted(self._used, edges)))
+        #: On rank 0.
+        self.pieces: Pieces | None = None
+        if parts is not None:
+            starts = np.cumsum([0, *(n for n, _, _ in parts)])
+            self.pieces = Pieces(*(np.concatenate([p[k] + start for p, start in zip(parts, starts)]) for k in (1, 2)))
+
+    def take(self, title: str = "") -> Frame | None:
+        """The present state on rank 0, None elsewhere (collective)."""
+        comm, used = self.problem.comm, self._used
+        x, values = vertex_positions(self.problem, self.scale)[used], vertex_values(self.problem, self.field)[used]
+        parts = comm.gather((x, values))
+        forces = [gather_contactors(contact, self.scale) for contact in self.problem.contacts] if self.arrows else []
+        if parts is None:
+            return None
+        x, values = (np.concatenate(part) for part in zip(*parts))
+        return Frame(x, values, forces, title)
+
+
+def vertex_values(problem: UnitedProblem, field: Any) -> Array:
+    """A field at the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts,)`` (collective).
+
+    Args:
+        problem: the scene.
+        field: None for the size of the displacement; a contact or several for their pressure; a scalar Lagrange Function; or any other
+            scalar UFL expression, which is averaged over the cells around a vertex.
+    """
+    mesh = problem.config.mesh
+    if field is None:
+        moved = vertex_positions(problem, 1.0) - vertex_positions(problem, 0.0)
+        return np.asarray(np.linalg.norm(moved, axis=1))
+    if isinstance(field, Sequence):
+        return np.asarray(sum(vertex_values(problem, contact) for contact in field))
+    if isinstance(field, Contact):
+        field = field.pressure
+    if isinstance(field, fem.Function) and compat.lagrange_degree(field.function_space):
+        linear = fem.Function(compat.function_space(mesh, 1))
+        linear.interpolate(field)
+        linear.x.scatter_forward()
+        return np.array(linear.x.array)
+    return nodal_average(field, mesh)
+
+
+def nodal_average(expression: Any, mesh: Any) -> Array:
+    """Scalar UFL expression averaged over the cells around each d.o.f. of the mesh's P1 space ``(n_local incl. ghosts,)`` (collective)."""
+    S = compat.function_space(mesh, 1)
+    v, total = ufl.TestFunction(S), fem.Function(S)
+    cells = fem.Function(compat.function_space(mesh, ("DG", 0)))
+    compat.interpolate_expression(cells, expression)
+    sums = []
+    for weight in (cells, fem.Constant(mesh, 1.0)):
+        own = forms.assemble_array(S, forms.form(weight * v * ufl.dx))
+        total.x.array[: len(own)] = own
+        total.x.scatter_forward()
+        sums.append(np.array(total.x.array))
+    return np.divide(sums[0], sums[1], out=np.zeros_like(sums[0]), where=sums[1] != 0)
+
+
+def vertex_positions(problem: UnitedProblem, scale: float) -> Array:
+    """Displaced positions of the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, gdim)``."""
+    config = problem.config
+    u = fem.Function(compat.function_space(config.mesh, 1, (config.gdim,)))
+    u.interpolate(problem.u)
+    u.x.scatter_forward()
+    moved = u.x.array.reshape(-1, config.gdim)
+    return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
+
+
+def _vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
+    """Owned cells by d.o.f. of the P1 space: their triangles ``(n, 3)`` and outlines ``(n_cells, n_nodes + 1)``."""
+    name, owned = compat.cell_name(mesh), mesh.topology.index_map(2).size_local
+    dofs = compat.cell_dofs(compat.function_space(mesh, 1))[:owned].astype(np.int64)
+    around = AROUND[dofs.shape[1]]
+    return np.concatenate([dofs[:, t] for t in TRIANGLES[name]]), dofs[:, [*around, around[0]]]
+
+
+def boundary(mesh: Any, surface: Part | None = None) -> Ints:
+    """Owned facets on the outside, or those of a part that lie there, by d.o.f. of the P1 space (collective).
+
+    Returns:
+        Vertices in their order around each facet ``(n, n_vertices)``.
+    """
+    topology, tdim = mesh.topology, mesh.topology.dim
+    topology.create_connectivity(tdim - 1, tdim)
+    topology.create_connectivity(tdim, tdim - 1)
+    facets = np.asarray(exterior_facet_indices(topology))
+    if surface is not None:
+        facets = np.intersect1d(facets, as_tag(surface, mesh, (tdim - 1,), "surface").entities)
+    corners = np.array(forms.reference_topology(compat.cell_name(mesh))[tdim - 1])
+    facet_cells = topology.connectivity(tdim - 1, tdim)
+    cells = np.asarray(facet_cells.array)[np.asarray(facet_cells.offsets)[facets]]
+    sides = (compat.cell_table(topology.connectivity(tdim, tdim - 1), len(corners))[cells] == facets[:, None]).argmax(axis=1)
+    dofs = compat.cell_dofs(compat.function_space(mesh, 1)).astype(np.int64)
+    return np.asarray(dofs[cells[:, None], corners[sides][:, AROUND[corners.shape[1]]]])
+
+
+def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:
+    """Where the bodies of a 2D scene end now: segments ``(n, 2, 2)`` on rank 0, None elsewhere (collective).
+
+    Args:
+        problem: the scene.
+        scale: magnification of the displacement.
+    """
+    parts = problem.comm.gather(vertex_positions(problem, scale)[boundary(problem.config.mesh)])
+    return None if parts is None else np.concatenate(parts)
+
+
+def gather_contactors(contact: Contact, scale: float) -> tuple[Array, Array, Array]:
+    """Positions, displaced by ``scale`` times the displacement, forces and pressures of all contactors on rank 0 (collective)."""
+    config, nodes = contact.config, contact.pair.nodes
+    at = config.X[nodes] + scale * config.displacement[nodes]
+    # points have no area; their forces stand for themselves
+    size = contact.pressures if contact.contactor.dim else contact.pair.trial.nodal
+    parts = config.comm.gather((at, contact.pair.trial.force, size)) or [(at[:0], at[:0], np.zeros(0))]
+    return tuple(np.concatenate(columns) for columns in zip(*parts))  # type: ignore[return-value]

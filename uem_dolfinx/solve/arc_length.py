@@ -1,0 +1,219 @@
+"""Load steps of given arc length: the load factor is an unknown more, so that a path is followed past limit points under dead load.
+
+    Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    t . (u + du - u0) = s,    F_lam = dF/dlam
+
+with t the direction in which the last step went: Riks' method, the constraint a plane, solved with the one united matrix and two
+right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
+from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.load_step import LoadStep
+from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.system import BodyState, BodySystem
+
+#: Difference of load factors over which the residual's derivative is taken; exact where the load is proportional to the factor.
+#: [convention; load factor; test_arc_length.py::test_loads_that_are_not_proportional]
+DIFFERENCE = 1e-4
+#: The arc has its length to this part of it.
+#: [convention; arc length; test_arc_length.py::test_length_of_the_arc]
+ON_THE_PLANE = 1e-8
+#: A path that has not come to the full load after so many times the nominal number of steps is given up.
+#: [bound; nominal number of steps; test_arc_length.py::test_path_without_end]
+MOST_STEPS = 100
+
+
+class ArcLength:
+    """``newton.UnitedSystem`` of a problem's bodies with the load factor as an unknown more.
+
+    Args:
+        problem: whose system and load are taken.
+
+    Attributes:
+        factor: the load factor now.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        self._problem, self._system = problem, problem.system
+        self.factor = 0.0
+        self._direction, self._length = np.zeros(problem.config.n_owned * problem.config.gdim), 0.0
+        #: Displacement at the beginning of the step, and load factor at that of the iteration.
+        self._start, self._from = self._system.displacement(), 0.0
+        #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
+        self._change, self._slope = 0.0, problem.forces.vector()
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is the system's."""
+        return getattr(self._system, name)
+
+    def begin(self, factor: float, direction: Array, length: float) -> None:
+        """Begin a step.
+
+        Args:
+            factor: committed load factor.
+            direction: of unit length over all ranks, at the owned components.
+            length: how far the displacement goes along it.
+        """
+        self._direction, self._length = direction, length
+        self._start = self._system.displacement()
+        self._change = 0.0
+        self._set(factor)
+
+    def _set(self, factor: float) -> None:
+        self.factor = factor
+        self._problem.set_load(factor)
+
+    def _along(self, way: Array) -> float:
+        """How far a way ``(n_owned * gdim,)`` goes in the step's direction (collective)."""
+        return float(self._problem.comm.allreduce(self._direction @ way))
+
+    @property
+    def _missing(self) -> float:
+        """How much further the displacement has to go (collective)."""
+        return self._length - self._along(self._system.displacement().array_r - self._start.array_r)
+
+    def unite(self, settled: Settled) -> IterationState:
+        """Where the contactors belong; the state is closed if the arc has its length, too."""
+        state = self._system.unite(settled)
+        there = abs(self._missing) <= ON_THE_PLANE * self._length
+        return replace(state, closed=state.closed and there)
+
+    def differentiate(self, first: bool) -> None:
+        """Tangents with respect to displacement and load factor."""
+        self._system.differentiate(first)
+        forces, factor = self._problem.forces, self.factor
+        before = forces.residual
+        self._problem.set_load(factor + DIFFERENCE)
+        forces.assemble()
+        self._slope = forces.residual
+        self._slope.axpy(-1.0, before)
+        self._slope.scale(1.0 / DIFFERENCE)
+        self._problem.set_load(factor)
+        forces.assemble()
+
+    def linearise(self, state: IterationState) -> PETSc.Vec:
+        """United matrix of a state, and the right-hand side without load increment."""
+        self._state = state
+        return self._system.linearise(state)
+
+    @property
+    def inexact(self) -> bool:
+        """The load increment is as accurate as the unknowns: there are no loose solves."""
+        return False
+
+    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
+        """Unknowns with the load increment that takes them to the plane, which ``rhs`` gets, too."""
+        system, state = self._system, self._state
+        load = state.test.transpose(self._slope)
+        load.scale(-1.0)
+        dq, iterations = system.solve(rhs, accuracy)
+        by_load, more = system.solve(load, accuracy)
+        still = rhs.duplicate()
+        still.set(0.0)
+        rest = system.move(state, still)
+        du = system.move(state, by_load)
+        du.axpy(-1.0, rest)
+        along = self._along(du.array_r)
+        if along == 0.0:
+            raise ConvergenceError("the load does not move the bodies in the direction they went: take smaller steps")
+        self._change = (self._missing - self._along(system.move(state, dq).array_r)) / along
+        dq.axpy(self._change, by_load)
+        rhs.axpy(self._change, load)
+        return dq, iterations + more
+
+    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
+        """The state in which wrong contactors have changed sides, as they are foreseen under the new load."""
+        assert isinstance(state, BodyState)
+        held = self._slope.copy()
+        held.scale(self._change)
+        if state.held is not None:
+            held.axpy(1.0, state.held)
+        return self._system.exchange(replace(state, held=held), du, driving, accuracy)
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the displacement from which the next step of the loop starts, as does the load factor."""
+        self._from = self.factor
+        return self._system.displacement()
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set the displacement to ``start + length du``, and the load factor likewise."""
+        self._system.displace(start, du, length)
+        self._set(self._from + length * self._change)
+
+
+def arc_length_steps(problem: UnitedProblem, steps: int) -> Iterator[LoadStep]:
+    """The steps of ``load_steps`` of given arc length."""
+    progress, config = problem.progress, problem.config
+    if not isinstance(problem.system, BodySystem):
+        raise InputError("arc_length needs contact by elimination: leave out the problem's method")
+    if not progress.begin_ramp(problem.u.x.array, steps):
+        return
+    control, owned, arc = progress.control, config.n_owned * config.gdim, ArcLength(problem)
+    if progress.factor != 0.0:
+        problem.set_load(progress.factor)
+    while progress.factor < 1.0:
+        if control.number >= MOST_STEPS * steps:
+            raise ConvergenceError(
+                f"the load factor is {progress.factor:.3g} after {control.number} steps of the arc, and has not come to 1: the path does "
+                "not lead there; look at the states that were yielded, or take longer steps"
+            )
+        done, share, committed = progress.factor, control.length, problem.committed[:owned]
+        way = committed - progress.start[:owned]
+        try:
+            if control.number == 0:
+                factor = share
+                problem.set_load(factor)
+                _check_values(problem)
+                iterations = problem.attempt()
+            else:
+                length = float(np.sqrt(problem.comm.allreduce(way @ way)))
+                arc.begin(done, way / length, progress.reach * share)
+                iterations = problem.attempt(along=arc)
+                factor = arc.factor
+                _check_values(problem)
+                if factor > 1.0:
+                    # the end is a load, which this state is near
+                    factor = 1.0
+                    problem.set_load(factor)
+                    iterations = iterations[:-1] + problem.attempt()
+        except UEMError as error:
+            if control.shorten(share, error):
+                continue
+            problem.set_load(done)
+            problem.restore()
+            raise
+        before = np.array(problem.committed)
+        problem.commit()
+        if control.number == 0:
+            way = problem.committed[:owned] - before[:owned]
+            progress.reach = float(np.sqrt(problem.comm.allreduce(way @ way))) / share
+            if progress.reach == 0.0:
+                raise InputError("arc_length needs a load that moves the bodies: expected a load that F depends on")
+        progress.start, progress.factor = before, factor
+        number, cuts = control.done(iterations)
+        yield LoadStep(number, factor, iterations, cuts)
+
+
+def _check_values(problem: UnitedProblem) -> None:
+    """Refuse Dirichlet values that change with the load factor (collective)."""
+    wanted = np.array(problem.committed)
+    compat.set_bc_values(wanted, problem.forces.bcs)
+    with agreed(problem.comm):
+        if not np.array_equal(wanted, problem.committed):
+            at = problem.config.X[int(np.flatnonzero(wanted != problem.committed)[0]) // problem.config.gdim]
+            raise InputError(
+                f"arc_length leads loads, and the Dirichlet values at {at} are not those of the committed displacement: expected values "
+                "that do not change with the load factor; bring them there by load_steps of its own, with arc_length=False"
+            )
