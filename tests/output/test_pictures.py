@@ -5,6 +5,8 @@ Worth reading first: ``test_outside_of_the_bodies`` and ``test_run_that_breaks``
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import sys
 import traceback
 import types
@@ -34,8 +36,8 @@ def drawn(monkeypatch):
     """What PyVista would draw on rank 0, as keyword arguments; nothing is drawn."""
     calls = []
 
-    def images(points, faces, values, colours, box, window, view, edges):
-        calls.append(dict(x=points[0], faces=faces, values=values[0], box=box, window=window, view=view))
+    def images(points, faces, values, arrows, colours, box, window, view, edges):
+        calls.append(dict(x=points[0], faces=faces, values=values[0], box=box, window=window, view=view, arrows=arrows[0]))
         return [np.zeros((2, 3, 4), np.uint8) for _ in points]
 
     monkeypatch.setattr(pictures3d, "images", images)
@@ -58,7 +60,7 @@ def test_outside_of_the_bodies(cell, drawn, folder):
     for _ in uem.load_steps(problem):
         pass
     uem.plot_scene(problem, folder / "end.png", levels=[0.0, 0.05, 0.1], view=(0.0, 0.0, 2.0))
-    uem.plot_scene(problem, folder / "pressure.png", field=contact, surface=contact.contactor, levels=[0.0, 1.0])
+    uem.plot_scene(problem, folder / "pressure.png", field=contact, surface=contact.contactor, levels=[0.0, 1.0], arrows=True)
     uem.plot_scene(problem, folder / "part.png", window=(0.0, 0.5, 0.0, 1.0, 0.0, 1.0))
     force = contact.resultant().force[2]
     if COMM.rank:
@@ -77,6 +79,10 @@ def test_outside_of_the_bodies(cell, drawn, folder):
     np.testing.assert_allclose(end["view"], [0, 0, 1])
     assert area(pressure["x"], pressure["faces"]).sum() == pytest.approx(1.0)
     np.testing.assert_allclose(pressure["values"], force, rtol=1e-9)
+    # of even pressure: an eighth of the side, upwards like the force on the upper cube
+    at, arrows = pressure["arrows"]
+    assert len(at) == len(arrows) > 0 and not len(end["arrows"][0])
+    np.testing.assert_allclose(arrows, np.tile([0.0, 0.0, 0.125], (len(at), 1)), atol=1e-9)
 
 
 def test_pictures_of_bodies(folder):
@@ -98,7 +104,7 @@ def test_arguments_of_other_dimensions(monkeypatch, folder):
     monkeypatch.setattr(pictures3d, "require", lambda comm: None)
     flat, solid = pressed(COMM, "triangle"), pressed(COMM, "tetrahedron")
     given = {
-        "mirror": True, "arrows": True, "window": (0, 1, 0, 1), "view": (0, 0, 0), "field": solid.u, "levels": [1.0, 0.0],
+        "mirror": True, "window": (0, 1, 0, 1), "view": (0, 0, 0), "field": solid.u, "levels": [1.0, 0.0],
     }  # fmt: skip
     for name, value in given.items():
         refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(solid, folder / "a.png", **{name: value}))
@@ -225,6 +231,20 @@ def test_loop_that_is_left(folder):
     uem.animate(folder / "c.gif", problem, uem.load_steps(problem, 4)).close()
     COMM.barrier()
     assert not (folder / "c.gif").exists()
+
+
+def test_films_by_ffmpeg(folder):
+    """As many frames as steps were drawn."""
+    pytest.importorskip("matplotlib")
+    if COMM.bcast(shutil.which("ffprobe")) is None:
+        pytest.skip("needs ffmpeg")
+    problem = pressed(COMM, "triangle")
+    for _ in uem.animate(folder / "a.mp4", problem, uem.load_steps(problem, 4), frames_per_second=5):
+        pass
+    if COMM.rank == 0:
+        asked = ["-v", "error", "-count_frames", "-show_entries", "stream=nb_read_frames,r_frame_rate", "-of", "csv=p=0"]
+        told = subprocess.run(["ffprobe", *asked, str(folder / "a.mp4")], check=True, capture_output=True, text=True).stdout
+        assert told.split() == ["5/1,4"]
 
 
 def test_films_that_are_refused(folder, monkeypatch):

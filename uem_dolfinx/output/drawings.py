@@ -18,8 +18,9 @@ from uem_dolfinx.output.frames import Frame, Gathering, Pieces
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
-#: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it.
-#: [convention; the field's largest value, the window's size; test_pictures.py::test_a_field_that_is_the_same_everywhere]
+#: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it; forces that
+#: are less have no arrow.
+#: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
 
@@ -35,7 +36,7 @@ class Drawing:
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         gdim, pressed = problem.config.gdim, isinstance(field, Contact)
         with agreed(problem.comm):
-            refused = {"mirror": mirror, "arrows": arrows} if gdim == 3 else {"view": view, "surface": surface}
+            refused = {"mirror": mirror} if gdim == 3 else {"view": view, "surface": surface}
             for name, value in refused.items():
                 if value is not None and value is not False:
                     raise InputError(
@@ -99,6 +100,21 @@ class Drawn(ABC):
         """Which points are in the window."""
         return np.asarray(((x >= self.box[:, 0]) & (x <= self.box[:, 1])).all(axis=1))
 
+    def _arrows(self, frame: Frame) -> tuple[Array, Array]:
+        """Contact forces per tributary area: where they act and the arrows ``(n, gdim)``, the longest of all an eighth of the picture."""
+        longest = max((float(p.max(initial=0.0)) for f in self.frames for _, _, p in f.forces), default=0.0)
+        # of its second largest side: a surface alone may be flat
+        unit = 0.125 * np.sort(np.ravel(np.diff(self.box, axis=1)))[-2] / (longest or 1.0)
+        none = np.zeros((0, frame.x.shape[1]))
+        found = [(none, none)]
+        for at, force, pressure in frame.forces:
+            size = np.linalg.norm(force, axis=1)
+            # vertices of quadratic triangles get a pressure, and forces of rounding
+            pressed = size > EVEN * size.max(initial=0.0)
+            found.append((at[pressed], unit * force[pressed] / size[pressed, None] * pressure[pressed, None]))
+        where, arrows = (np.concatenate(part) for part in zip(*found))
+        return where, arrows
+
     @abstractmethod
     def draw(self, ax: Any, frame: Frame) -> None:
         """Draw a frame into a panel."""
@@ -144,19 +160,12 @@ class Drawn2D(Drawn):
                 ax.add_collection(LineCollection(x[self.pieces.edges], colors="k", linewidths=0.25, alpha=0.35))
         ax.figure.colorbar(coloured, ax=ax, label=how.label, shrink=0.85)
         ax.set(xlim=self.box[0], ylim=self.box[1], aspect="equal", xlabel="x", ylabel="y")
-        longest = max((float(p.max(initial=0.0)) for f in self.frames for _, _, p in f.forces), default=0.0)
-        for at, force, pressure in frame.forces:
-            size = np.linalg.norm(force, axis=1)
-            pressed = size > 0
-            if pressed.any():
-                arrows = force[pressed] / size[pressed, None] * pressure[pressed, None]
-                # the longest is an eighth of the picture
-                unit = longest / (0.125 * np.diff(self.box, axis=1).min())
-                for side in self.sides:
-                    ax.quiver(
-                        *(at[pressed] * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=unit,
-                        color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
-                    )  # fmt: skip
+        at, arrows = self._arrows(frame)
+        for side in self.sides if len(at) else ():
+            ax.quiver(
+                *(at * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=1.0,
+                color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
+            )  # fmt: skip
 
 
 class Drawn3D(Drawn):
@@ -172,7 +181,10 @@ class Drawn3D(Drawn):
         self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
         between = [np.interp(f.values, self.bounds, np.arange(n + 1.0)) for f in frames]
         box = None if how.window is None else self.box
-        images = pictures3d.images([f.x for f in frames], pieces.faces, between, colours, self.box, box, how.view, how.cells)
+        arrows = [self._arrows(f) for f in frames]
+        images = pictures3d.images(
+            [f.x for f in frames], pieces.faces, between, arrows, colours, self.box, box, how.view, how.cells
+        )
         self.images = {id(f): image for f, image in zip(frames, images)}
 
     def draw(self, ax: Any, frame: Frame) -> None:

@@ -105,7 +105,8 @@ def plot_scene(
         window: ``(x_min, x_max, y_min, y_max)`` to show, in 3D with ``z_min, z_max``; None shows everything.
         mirror: draw the reflection at ``x = 0`` too, for half models; 2D only.
         cells: draw the edges of the cells.
-        arrows: draw the contact forces per tributary area, on the contactors; 2D only, where it is the default.
+        arrows: draw the contact forces per tributary area, on the contactors; the default in 2D. In 3D they are seen with the contactor
+            alone, as ``surface``.
         cmap: colour map.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
         surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or what a contact takes; 3D only.

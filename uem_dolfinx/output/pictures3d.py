@@ -42,6 +42,7 @@ def images(
     points: Sequence[Array],
     faces: Ints,
     values: Sequence[Array],
+    arrows: Sequence[tuple[Array, Array]],
     colours: Any,
     box: Array,
     window: Array | None,
@@ -54,6 +55,7 @@ def images(
         points: vertices in each state ``(n, 3)``.
         faces: vertices in their order around each facet ``(m, 3 or 4)``.
         values: at the vertices in each state ``(n,)``, from 0 to the number of colours.
+        arrows: in each state where they begin, and from there to their tips ``(k, 3)``.
         colours: matplotlib's colour map, with its number of colours.
         box: bounds of what is looked at ``(3, 2)``.
         window: the same where the surface is cut off at them; None draws it whole.
@@ -72,7 +74,7 @@ def images(
     size = (1600, 1200) if len(points) == 1 else (800, 600)
     table = np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel()
     found = []
-    for x, v in zip(points, values):
+    for x, v, (at, to) in zip(points, values, arrows):
         surface = pyvista.PolyData(x, table)
         surface["values"] = v
         for axis, (low, high) in enumerate(() if window is None else window):
@@ -86,6 +88,11 @@ def images(
                 surface, scalars="values", cmap=colours, n_colors=colours.N, clim=(0, colours.N), show_scalar_bar=False, show_edges=edges,
                 edge_color="black", edge_opacity=0.35, line_width=size[0] / 1600, ambient=0.7, diffuse=0.3, specular=0.0,
             )  # fmt: skip
+            shown = ((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)
+            if shown.any():
+                plotter.add_arrows(
+                    at[shown], to[shown], color="white", show_edges=True, edge_color="gray", line_width=size[0] / 1600
+                )
             up = (0.0, 0.0, 1.0) if np.hypot(*view[:2]) > 0 else (0.0, 1.0, 0.0)
             plotter.view_vector(view, up)
             plotter.reset_camera(bounds=box.ravel())

@@ -8,7 +8,6 @@ right-hand sides [Riks, International Journal of Solids and Structures 15 (1979)
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,10 +16,9 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
+from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.load_step import LoadStep
-from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.newton import Iteration, IterationState, Settled
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodyState, BodySystem
 
@@ -153,57 +151,61 @@ class ArcLength:
         self._set(self._from + length * self._change)
 
 
-def arc_length_steps(problem: UnitedProblem, steps: int) -> Iterator[LoadStep]:
-    """The steps of ``load_steps`` of given arc length."""
-    progress, config = problem.progress, problem.config
-    if not isinstance(problem.system, BodySystem):
-        raise InputError("arc_length needs contact by elimination: leave out the problem's method")
-    if not progress.begin_ramp(problem.u.x.array, steps):
-        return
-    control, owned, arc = progress.control, config.n_owned * config.gdim, ArcLength(problem)
-    if progress.factor != 0.0:
-        problem.set_load(progress.factor)
-    while progress.factor < 1.0:
-        if control.number >= MOST_STEPS * steps:
-            raise ConvergenceError(
-                f"the load factor is {progress.factor:.3g} after {control.number} steps of the arc, and has not come to 1: the path does "
-                "not lead there; look at the states that were yielded, or take longer steps"
-            )
-        done, share, committed = progress.factor, control.length, problem.committed[:owned]
-        way = committed - progress.start[:owned]
-        try:
-            if control.number == 0:
-                factor = share
-                problem.set_load(factor)
-                _check_values(problem)
-                iterations = problem.attempt()
-            else:
-                length = float(np.sqrt(problem.comm.allreduce(way @ way)))
-                arc.begin(done, way / length, progress.reach * share)
-                iterations = problem.attempt(along=arc)
-                factor = arc.factor
-                _check_values(problem)
-                if factor > 1.0:
-                    # the end is a load, which this state is near
-                    factor = 1.0
-                    problem.set_load(factor)
-                    iterations = iterations[:-1] + problem.attempt()
-        except UEMError as error:
-            if control.shorten(share, error):
-                continue
-            problem.set_load(done)
-            problem.restore()
-            raise
-        before = np.array(problem.committed)
+class AlongArc:
+    """Advances a problem by steps of given arc length; the first step of all tells the length, by its load.
+
+    Args:
+        problem: what is loaded.
+
+    Attributes:
+        tried: part of the arc of all nominal steps that the last step was meant to take.
+        most: number of steps, over the nominal one, after which the path is given up.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        if not isinstance(problem.system, BodySystem):
+            raise InputError("arc_length needs contact by elimination: leave out the problem's method")
+        self._problem, self._arc, self._owned = problem, ArcLength(problem), problem.config.n_owned * problem.config.gdim
+        self.tried, self.most = 0.0, MOST_STEPS
+
+    def advance(self, done: float) -> tuple[float, list[Iteration]]:
+        """Take a step from the committed load factor ``done`` and commit it (collective).
+
+        Returns:
+            The load factor and the history of the Newton loop.
+        """
+        problem, progress, owned = self._problem, self._problem.progress, self._owned
+        number = progress.control.number
+        before, self.tried = np.array(problem.committed), progress.control.length
+        if number == 0:
+            factor, iterations = self.tried, self._by_load(self.tried)
+        else:
+            way = before[:owned] - progress.start[:owned]
+            self._arc.begin(done, way / self._size(way), progress.reach * self.tried)
+            iterations = problem.attempt(along=self._arc)
+            factor = self._arc.factor
+            _check_values(problem)
+            if factor > 1.0:
+                # the end is a load, which this state is near
+                factor = 1.0
+                iterations = iterations[:-1] + self._by_load(factor)
         problem.commit()
-        if control.number == 0:
-            way = problem.committed[:owned] - before[:owned]
-            progress.reach = float(np.sqrt(problem.comm.allreduce(way @ way))) / share
+        if number == 0:
+            progress.reach = self._size(problem.committed[:owned] - before[:owned]) / self.tried
             if progress.reach == 0.0:
                 raise InputError("arc_length needs a load that moves the bodies: expected a load that F depends on")
-        progress.start, progress.factor = before, factor
-        number, cuts = control.done(iterations)
-        yield LoadStep(number, factor, iterations, cuts)
+        progress.start = before
+        return factor, iterations
+
+    def _by_load(self, factor: float) -> list[Iteration]:
+        """Equilibrium under a load that is given."""
+        self._problem.set_load(factor)
+        _check_values(self._problem)
+        return self._problem.attempt()
+
+    def _size(self, way: Array) -> float:
+        """Length of a way ``(n_owned * gdim,)`` (collective)."""
+        return float(np.sqrt(self._problem.comm.allreduce(way @ way)))
 
 
 def _check_values(problem: UnitedProblem) -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.errors import UEMError
+from uem_dolfinx.errors import ConvergenceError, UEMError, UserFunctionError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
-from uem_dolfinx.solve.arc_length import arc_length_steps
+from uem_dolfinx.solve.arc_length import AlongArc
 from uem_dolfinx.solve.load_step import LoadStep
+from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
 from uem_dolfinx.solve.stepping import between_steps
@@ -48,36 +50,67 @@ def load_steps(
     given.alike(problem.comm, "load_steps", steps=steps, arc_length=arc_length)
     if checkpoint is not None and not checkpoint.begun:
         checkpoint.begin(problem.state())
-    made = arc_length_steps(problem, steps) if arc_length else _load_steps(problem, steps)
+    made = _load_steps(problem, steps, AlongArc(problem) if arc_length else ByLoad(problem))
     return between_steps(problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint)
 
 
-def _load_steps(problem: UnitedProblem, steps: int) -> Iterator[LoadStep]:
+def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> Iterator[LoadStep]:
     """The steps of ``load_steps``."""
     progress = problem.progress
     if not progress.begin_ramp(problem.u.x.array, steps):
         return
-    control = progress.control
-    ramped = not callable(problem.load)
-    if progress.factor > 0.0:
+    if progress.factor != 0.0:
         problem.set_load(progress.factor)
     while progress.factor < 1.0:
         done = progress.factor
-        factor = _next_factor(done, control)
-        problem.set_load(factor)
+        if progress.control.number >= way.most * steps:
+            raise ConvergenceError(
+                f"the load factor is {done:.3g} after {progress.control.number} steps of the arc, and has not come to 1: the path does "
+                "not lead there; look at the states that were yielded, or take longer steps"
+            )
         try:
-            iterations = problem.solve(start=progress.start, fraction=factor if ramped else 1.0)
+            factor, iterations = way.advance(done)
         except UEMError as error:
-            # the last step may have been shorter than was meant
-            if control.shorten(factor - done, error):
+            if progress.control.shorten(way.tried, error):
                 continue
-            problem.set_load(done)
+            # where it is the load's function that fails, it may fail here, too
+            with suppress(UserFunctionError):
+                problem.set_load(done)
             # the targets that the load moves are back, too
             problem.restore()
             raise
         progress.factor = factor
-        number, cuts = control.done(iterations)
+        number, cuts = progress.control.done(iterations)
         yield LoadStep(number, factor, iterations, cuts)
+
+
+class ByLoad:
+    """Advances a problem by steps of given load.
+
+    Args:
+        problem: what is loaded.
+
+    Attributes:
+        tried: part of the load that the last step was meant to add.
+        most: number of steps, over the nominal one, after which the path is given up: this one ends.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        self._problem, self.tried, self.most = problem, 0.0, np.inf
+        self._ramped = not callable(problem.load)
+
+    def advance(self, done: float) -> tuple[float, list[Iteration]]:
+        """Take a step from the committed load factor ``done`` and commit it (collective).
+
+        Returns:
+            The load factor and the history of the Newton loop.
+        """
+        progress = self._problem.progress
+        factor = _next_factor(done, progress.control)
+        # it may be shorter than was meant
+        self.tried = factor - done
+        self._problem.set_load(factor)
+        return factor, self._problem.solve(start=progress.start, fraction=factor if self._ramped else 1.0)
 
 
 def _next_factor(done: float, control: StepControl) -> float:
