@@ -190,7 +190,7 @@ def iterations(scene: Hertz, stiffness: float) -> dict[str, object]:
         # the one before looks for the contact
         found[name] = solves[1] if contact else solves[0]
         common.free_memory()
-    return {"dofs": scene.dofs, "stiffness": stiffness} | found
+    return {"coupling": args.coupling, "multigrid": args.amg, "dofs": scene.dofs, "stiffness": stiffness} | found
 
 
 # %%

@@ -38,7 +38,7 @@ import uem_dolfinx as uem
 flags = argparse.ArgumentParser(add_help=False)
 flags.add_argument("--quick", action="store_true")
 flag, sys.argv[1:] = flags.parse_known_args()
-args = common.arguments(__doc__, methods="all", cases="all")
+args = common.arguments(__doc__, methods="all", cases="all", known="")
 asked, picked = args.methods.split(","), args.cases.split(",")
 COLUMN_NAMES = [column.name for column in COLUMNS]
 columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.method in asked]
@@ -53,6 +53,10 @@ every = [
 rows = [c for c in every if (args.cases == "all" and (c.quick or not flag.quick)) or c.name in picked]
 if not columns or not rows:
     sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in every)}")
+# what other runs have found, by case and method, and their condition numbers: files of theirs are --known
+known = [json.loads(Path(file).read_text(encoding="utf-8")) for file in args.known.split(",") if file]
+known_cells = {(cell["case"], cell["method"]): cell for run in known for cell in run["cells"]}
+known_curves = [curve for run in known for curve in run.get("condition", ())]
 
 # %% [markdown]
 # ## The table
@@ -85,7 +89,7 @@ def keep(results: dict) -> None:
 start, cells = time.perf_counter(), []
 say("case", [column.name for column in columns])
 for row in rows:
-    cells += [judge(row, column) for column in columns]
+    cells += [known_cells.get((row.name, column.name)) or judge(row, column) for column in columns]
     say(row.name, [MARK[cell["verdict"]] + figure_of(cell) for cell in cells[-len(columns) :]])
     keep({"cells": cells})
 seconds = time.perf_counter() - start
@@ -122,6 +126,10 @@ LADDER = {"ratio": [10.0**k for k in range(-9, 10, 3)], "n": [2, 4, 8, 16], "fac
 curves = []
 if comm.size == 1 and args.cases == "all" and not flag.quick:
     for column in (c for c in columns if methods.available(c.method)):
+        found = [curve for curve in known_curves if curve["method"] == column.name]
+        curves += found
+        if found:
+            continue
         for against, values in LADDER.items():
             if against == "factor" and column.stiffer:
                 # the same curve again

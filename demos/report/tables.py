@@ -3,7 +3,8 @@
 python3 demos/report/tables.py
 
 Every JSON file is what a demo wrote with --json; a table is a list of rows in it, as in `<!-- table work_precision glance -->`.
-Columns may be chosen and named: `<!-- table stability cells: case, method -->`.
+Columns may be chosen and named: `<!-- table stability cells: case, method -->`; rows of several files follow each other where their names
+are joined by +.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-MARK = re.compile(r"(<!-- table (\w+) (\w+)(?:: ([^>]*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
+MARK = re.compile(r"(<!-- table ([\w+]+) (\w+)(?:: ([^>]*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def show(value: Any) -> str:
@@ -39,10 +40,11 @@ def table(rows: list[dict[str, Any]], columns: list[str]) -> str:
 
 def fill(match: re.Match[str]) -> str:
     """A table with its marks."""
-    start, name, key, chosen, end = match.groups()
-    rows = json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))[key]
-    if isinstance(rows, dict):
-        rows = [{"what": k, "value": v} for k, v in rows.items()]
+    start, names, key, chosen, end = match.groups()
+    rows: list[dict[str, Any]] = []
+    for name in names.split("+"):
+        found = json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))[key]
+        rows += found if isinstance(found, list) else [{"what": k, "value": v} for k, v in found.items()]
     columns = [c.strip() for c in chosen.split(",")] if chosen else list(rows[0])
     return start + table(rows, columns) + end
 
