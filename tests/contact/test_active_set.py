@@ -124,14 +124,28 @@ def test_circles_are_told():
 
 
 @pytest.mark.parametrize("radius", [1e-6, 1.0, 1e6])
-def test_first_touch_of_a_paraboloid(radius):
-    """Hertz: pressed in by d, a ball touches within sqrt(R d) and overlaps within sqrt(2 R d); those inside enter, to 2 %."""
-    d = 1e-4 * radius
-    r = np.linspace(0.0, 2.0, 201) * np.sqrt(radius * d)
+@pytest.mark.parametrize(("gdim", "slender"), [(3, 50.0), (2, 10.0), (2, 100.0), (2, 1000.0)])
+@pytest.mark.parametrize("sides", [1, 2])
+def test_first_touch_of_a_paraboloid(radius, gdim, slender, sides):
+    """Hertz: a ball or cylinder touches within a, and would overlap within more; those inside a enter, to 2 % or 10 % in the plane.
+
+    Pressed in by d, a is ``sqrt(R d)`` in space; in the plane ``d = a^2 / (2 R) (log(4 L / a) - 1/2)`` for bodies of radius L, of
+    which the model holds the whole or one side of a plane of symmetry.
+    """
+    a = 1e-2 * radius
+    d = a**2 / radius * (1.0 if gdim == 3 else (np.log(4 * slender) - 0.5) / 2)
+    r = np.linspace(0.0, 4.0, 401) * a
     gap = r**2 / (2 * radius) - d
     wrong = wrong_ones(state([False] * len(r)), gap / radius)
-    enter = wrong.on_first_touch(gap, d).enter
-    assert r[enter].max() == pytest.approx(np.sqrt(radius * d), rel=0.02)
+    span = sides * r[wrong.enter].max() / (4 * slender * a)
+    enter = wrong.on_first_touch(gap, active_set.deep_enough(span, gdim) * d).enter
+    assert r[enter].max() == pytest.approx(a, rel=0.02 if gdim == 3 else 0.1)
+
+
+@pytest.mark.parametrize("span", [0.0, 1.0, 1e3])
+def test_first_touch_of_one_contactor_and_of_all(span):
+    """In the plane no less than in space, nor where a single contactor overlaps."""
+    assert active_set.deep_enough(span, 2) == active_set.DEEP_ENOUGH
 
 
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])

@@ -23,8 +23,8 @@ TOUCHING = 1e-9
 #: Gaps below this part of the model's size are zero.
 #: [convention; the model's size; test_active_set.py::test_gaps_below_rounding_do_not_activate]
 GAP_ROUNDING = 1e-13
-#: Where more contactors enter than touch, only those deeper than this part of the deepest do: a paraboloid that comes down on
-#: something elastic touches where it would overlap by more than half of the most (Hertz).
+#: Where more contactors enter than touch, only those deeper than this part of the deepest do, or deeper still in the plane: a
+#: paraboloid that comes down on something elastic touches where it would overlap by more than half of the most (Hertz).
 #: [derived; the deepest overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 DEEP_ENOUGH = 0.5
 #: Contactors as wrong as the worst, but for this part, are exchanged with it: rounding does not choose between equals.
@@ -64,14 +64,26 @@ class Wrong:
         kept = self.violation >= (1.0 - TIED) * worst
         return Wrong(self.enter & kept, self.release & kept, self.violation)
 
-    def on_first_touch(self, gap: Array, deepest: float) -> Wrong:
-        """Those alone that enter deep enough, besides all that are released.
+    def on_first_touch(self, gap: Array, depth: float) -> Wrong:
+        """Those alone that enter by so much at least, a length, besides all that are released; ``gap (n,)`` decides on contact."""
+        return Wrong(self.enter & (gap <= -depth), self.release, self.violation)
 
-        Args:
-            gap: that decides on contact ``(n,)``.
-            deepest: largest overlap of all that enter, a length.
-        """
-        return Wrong(self.enter & (gap <= -DEEP_ENOUGH * deepest), self.release, self.violation)
+
+def deep_enough(span: float, gdim: int) -> float:
+    """Part of the deepest overlap from which contactors touch at first, of those that would overlap if nothing gave way.
+
+    In the plane a cylinder touches within a half width ``a`` where bodies of size L have given way by
+    ``a^2 / (2 R) (log(4 L / a) - 1/2)`` (Johnson, Contact Mechanics, 1985, 5.6): the smaller the contact, the less of the overlap.
+    The overlap is some twice as wide. Taken are a quarter of the model's size for L, which is a body's radius, and for a a third of
+    the width of the overlap: a quarter would be right for whole bodies, a half for those cut at a plane of symmetry.
+
+    Args:
+        span: width of the overlap over the model's size; zero where a single contactor overlaps.
+        gdim: dimension of space.
+    """
+    if gdim == 3 or span == 0.0:
+        return DEEP_ENOUGH
+    return max(DEEP_ENOUGH, 1.0 - 1.0 / (np.log(3.0 / min(span, 1.0)) - 0.5))
 
 
 def find_wrong(

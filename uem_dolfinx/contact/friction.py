@@ -54,9 +54,9 @@ class FrictionWrong(Wrong):
         kept = self.violation >= (1.0 - TIED) * worst
         return FrictionWrong(self.enter & kept, self.release & kept, self.violation, self.slide & kept, self.hold & kept)
 
-    def on_first_touch(self, gap: Array, deepest: float) -> FrictionWrong:
+    def on_first_touch(self, gap: Array, depth: float) -> FrictionWrong:
         """As that of ``Wrong``; friction changes with what is there."""
-        first = super().on_first_touch(gap, deepest)
+        first = super().on_first_touch(gap, depth)
         return FrictionWrong(first.enter, first.release, self.violation, self.slide, self.hold)
 
 

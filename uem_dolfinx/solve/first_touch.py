@@ -8,6 +8,9 @@ from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact import active_set
+from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
@@ -33,13 +36,30 @@ def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], place: Callabl
     rigid = RigidMotions(config, free, not forces.tangent.linear)
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(comm.allreduce(np.abs(du).max(initial=0.0), op=MPI.MAX))
-    entering, deepest = [], 0.0
-    for pair in pairs:
-        gap, none = pair.foreseen(du), np.zeros(len(pair.nodes))
-        wrong = pair.wrong(gap, none, none, none, near, False, du)
-        entering.append((pair, gap, wrong))
-        deepest = max(deepest, -float(gap[wrong.enter].min(initial=0.0)))
-    deepest = comm.allreduce(deepest, op=MPI.MAX)
-    if deepest > 0.0:
-        for pair, gap, wrong in entering:
-            pair.exchange(wrong.on_first_touch(gap, deepest), False)
+    gaps = [pair.foreseen(du) for pair in pairs]
+    wrong = []
+    for pair, gap in zip(pairs, gaps):
+        none = np.zeros(len(pair.nodes))
+        wrong.append(pair.wrong(gap, none, none, none, near, False, du))
+    if comm.allreduce(any(w.enter.any() for w in wrong), op=MPI.LOR):
+        for pair, first in zip(pairs, deepest_of(pairs, gaps, wrong)):
+            pair.exchange(first, False)
+
+
+def deepest_of(pairs: Sequence[ContactPair], gaps: Sequence[Array], wrong: Sequence[Wrong]) -> list[Wrong]:
+    """Of contactors that would all enter at once, those deep enough to touch at first, besides all that are released (collective).
+
+    Args:
+        pairs: of all contacts.
+        gaps: that decide on contact, of every pair ``(n,)``.
+        wrong: who is to change sides, of every pair; some contactor enters.
+    """
+    config = pairs[0].config
+    g, entering = config.gdim, [w.enter for w in wrong]
+    points = np.concatenate([pair.points[enter] for pair, enter in zip(pairs, entering)])
+    overlap = -np.concatenate([gap[enter] for gap, enter in zip(gaps, entering)])
+    reach = np.array([*points.max(axis=0, initial=-np.inf), *(-points).max(axis=0, initial=-np.inf), overlap.max(initial=0.0)])
+    config.comm.Allreduce(MPI.IN_PLACE, reach, op=MPI.MAX)
+    span = float(np.linalg.norm(reach[:g] + reach[g : 2 * g])) / config.size
+    depth = active_set.deep_enough(span, g) * float(reach[-1])
+    return [w.on_first_touch(gap, depth) for w, gap in zip(wrong, gaps)]

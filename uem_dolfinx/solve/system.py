@@ -25,7 +25,7 @@ from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.first_touch import touch_ahead
+from uem_dolfinx.solve.first_touch import deepest_of, touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
@@ -274,16 +274,15 @@ class BodySystem:
     def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
         """Which of the wrong contactors are exchanged now (collective)."""
         touching = sum(pair.n_active for pair in self.pairs)
-        deepest = -min(float(gap[w.enter].min(initial=0.0)) for gap, w in zip(gaps, wrong))
-        deepest, worst = (self.comm.allreduce(value, op=MPI.MAX) for value in (deepest, max(w.worst for w in wrong)))
         if not self._pivoting.all_at_once(count):
             pattern, told = zlib.crc32(b"".join(pair.pattern for pair in self.pairs)), self._curvature is None and not self.rough
             if self._pivoting.repeats(self.comm.allgather(pattern), told) and self._curvature is not None:
                 # with curvature the problem may have no solution, or several; without there is one
                 self._curvature, self._pivoting = None, Pivoting()
+            worst = self.comm.allreduce(max(w.worst for w in wrong), op=MPI.MAX)
             return [w.among_the_worst(worst) for w in wrong]
         if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
-            return [w.on_first_touch(gap, deepest) for gap, w in zip(gaps, wrong)]
+            return deepest_of(self.pairs, gaps, wrong)
         return wrong
 
     def _count(self, wrong: list[Wrong]) -> int:
