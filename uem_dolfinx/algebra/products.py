@@ -68,7 +68,8 @@ class UnitedMatrix:
         if self.A is None or self._begins or not self._fit(keys):
             wanted = np.union1d(*keys)
             if self.reserving:
-                more = _product(self._near(csr, P.nodes, K, curvature)[1], P.reserved, Q.reserved)
+                reserved = P.reserved
+                more = _product(self._near(csr, P.nodes, K, curvature)[1], reserved, reserved if Q is P else Q.reserved)
                 wanted = np.union1d(wanted, self._keys(*more.getValuesCSR()[:2]))
             begins = self.A is None or self._begins
             same = begins and self._made_from is not None and np.array_equal(self._made_from, wanted)

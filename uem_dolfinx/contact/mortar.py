@@ -94,7 +94,7 @@ class Mortar(NodeToSurface):
     def place(self, points: Array, state: PairState) -> Placement:
         """Project contactors and find the segments of their facets (collective); see ``Coupling``."""
         if self.sliding == "finite":
-            nearest, locked = self._nearest(points), state.changes >= MOST_CHANGES
+            nearest, locked = self._on_target(points), state.changes >= MOST_CHANGES
             same = self._united is not None and self._united[0] is nearest and np.array_equal(self._united[1], locked)
             if self._united is None or not self.config.comm.allreduce(same, op=MPI.LAND):
                 placed = with_averaged_normals(nearest, locked, points) if self.target.faceted else nearest
@@ -105,7 +105,7 @@ class Mortar(NodeToSurface):
             rows = self._kept = self._unite(nearest, points)
             self._kept_at = self.target.motion
         else:
-            nearest = self.target.follow(points, self._anchor)
+            nearest = self._on_target(points, self._anchor)
             rows = self._follow(self._kept, nearest)
         eq = rows.equations
         seen: Any = replace(nearest, gap=eq.gap, normal=eq.direction)  # type: ignore[type-var]

@@ -83,8 +83,8 @@ class NodeToSurface:
         self._valleys = create_valleys(config, target, self.free) if sliding == "finite" else None
         #: Projection whose feet, normals and weights a contact with small or fixed sliding keeps.
         self._anchor: Projection | None = None
-        #: Positions of contactors and target of the last search, and what it found.
-        self._searched: tuple[Array, Array, Projection] | None = None
+        #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
+        self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
 
     def with_nodal_gaps(self) -> NodeToSurface:
         """The same contactors and target, with nodal gaps."""
@@ -114,14 +114,14 @@ class NodeToSurface:
         """Project contactors (collective); see ``Coupling``."""
         corners = None
         if self.sliding == "finite":
-            nearest = projection = self._stuck(self._continued_at_end(self._nearest(points), state), points, state)
+            nearest = projection = self._stuck(self._continued_at_end(self._on_target(points), state), points, state)
             if self._valleys is not None:
                 projection, corners = self._valleys.place(nearest, points, state)
         else:
             if self._anchor is None:
                 nearest = projection = self._anchor = self.target.project(points)
             else:
-                nearest = projection = self.target.follow(points, self._anchor)
+                nearest = projection = self._on_target(points, self._anchor)
         moves = self._target_moves(projection) if self.prescribed else None
         return self._measured(projection, moves, Feet(nearest, corners, np.zeros(len(points), bool)), state)
 
@@ -148,15 +148,16 @@ class NodeToSurface:
         """The placement with the gaps that decide on contact (collective)."""
         return Placement(projection, projection.gap, moves, feet)
 
-    def _nearest(self, points: Array) -> Projection:
-        """The contactors on the nearest places of the target; a mesh that has not moved is not searched again (collective)."""
+    def _on_target(self, points: Array, anchor: Projection | None = None) -> Projection:
+        """The contactors on the nearest places of the target, or with the feet of ``anchor``; as before if nothing moved (collective)."""
         if not self.target.n_nodes:
-            return self.target.project(points)
-        x = self.config.x[self.target.dofs]
-        same = self._searched is not None and np.array_equal(points, self._searched[0]) and np.array_equal(x, self._searched[1])
-        if self._searched is None or not self.config.comm.allreduce(same, op=MPI.LAND):
-            self._searched = points, x, self.target.project(points)
-        return self._searched[2]
+            return self.target.project(points) if anchor is None else self.target.follow(points, anchor)
+        x, last = self.config.x[self.target.dofs], self._projected
+        same = last is not None and last[2] is anchor and np.array_equal(points, last[0]) and np.array_equal(x, last[1])
+        if last is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+            found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
+            self._projected = last = points, x, anchor, found
+        return last[3]
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""

@@ -47,9 +47,17 @@ class TargetFacets:
         mesh.topology.create_connectivity(fdim, tdim)
         mesh.topology.create_connectivity(tdim, fdim)
         f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
-        n_cells = mesh.topology.index_map(tdim).size_local
-        sides = [(c, int(np.flatnonzero(c2f.links(c) == f)[0])) for f in tag.entities for c in f2c.links(f) if c < n_cells]
-        self.cells, self.sides = np.array(sides, dtype=np.int32).reshape(-1, 2).T
+        entities = np.asarray(tag.entities, dtype=np.int32)
+        starts, of_cells = (
+            f2c.offsets[entities],
+            compat.cell_table(c2f, len(forms.reference_topology(compat.cell_name(mesh))[fdim])),
+        )
+        counts = f2c.offsets[entities + 1] - starts
+        at = np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
+        cells, facets = f2c.array[at], np.repeat(entities, counts)
+        own = cells < mesh.topology.index_map(tdim).size_local
+        self.cells: Indices = cells[own]
+        self.sides: Indices = (of_cells[self.cells] == facets[own, None]).argmax(axis=1).astype(np.int32)
         self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
         cell_dofs = compat.cell_dofs(config.V)
         self.dofs = cell_dofs[self.cells[:, None], _facet_closure(config, self.shape)[self.sides]]

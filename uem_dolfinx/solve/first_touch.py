@@ -16,7 +16,7 @@ from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 
 
-def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], place: Callable[[], None]) -> None:
+def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
     It saves the solve that would find them; who is wrong among them is released before anything moves. Contactors with friction are left
@@ -25,15 +25,15 @@ def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], place: Callabl
     Args:
         forces: of bodies that their conditions hold.
         pairs: of all contacts.
+        rigid: motions of the bodies; None without contacts.
         place: projects all contactors.
     """
     config, comm = forces.config, forces.comm
     known = comm.allreduce(any(pair.rough or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
-    if known or not pairs:
+    if known or rigid is None:
         return
     place()
     free, prescribed = forces.free[: config.n_owned], forces.prescribed
-    rigid = RigidMotions(config, free, not forces.tangent.linear)
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(comm.allreduce(np.abs(du).max(initial=0.0), op=MPI.MAX))
     gaps = [pair.foreseen(du) for pair in pairs]

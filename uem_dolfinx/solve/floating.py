@@ -18,7 +18,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.log import logger
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions, find_open_motions
+from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 
 #: Until contact has developed, motions that it resists with less than this part are held as well: a body that has touched ground
 #: with one or two nodes would else swing about them.
@@ -45,20 +45,26 @@ class FloatingBodies:
     Args:
         forces: of the bodies.
         pairs: of all contacts; without any, nothing is done about bodies that float.
+
+    Attributes:
+        rigid: rigid motions of the bodies; None without contacts.
+        motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
     def __init__(self, forces: BodyForces, pairs: Sequence[ContactPair]):
         self._forces, self._pairs = forces, pairs
         config, dynamics = forces.config, forces.dynamics
+        self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
         if pairs:
             free, finite = forces.free[: config.n_owned], not forces.tangent.linear
-            self._at_rest = find_open_motions(config, free, finite)
+            self.rigid = RigidMotions(config, free, finite)
+            self._at_rest = self.rigid if self.rigid.any_open() else None
             if dynamics is not None:
                 # in a step in time, inertia holds what has mass
-                self._in_motion = find_open_motions(config, free & ~dynamics.massy, finite)
-        #: Motions of the present step, None if conditions and inertia hold all bodies.
+                moving = RigidMotions(config, free & ~dynamics.massy, finite)
+                self._in_motion = moving if moving.any_open() else None
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))

@@ -113,6 +113,10 @@ class RigidMotions:
         values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
         return vectors[:, values < resistance**2]
 
+    def any_open(self) -> bool:
+        """Whether the conditions leave any motion open (collective)."""
+        return bool(self.open_motions(None).shape[1])
+
     def _held(self) -> Array:
         """How each motion moves the components with a Dirichlet condition ``(n, n_motions)``."""
         i, c = np.nonzero(~self.free)
@@ -125,6 +129,8 @@ class RigidMotions:
         Args:
             prescribed: increments of the owned nodes, those of free components aside ``(n_owned, gdim)``.
         """
+        if self.finite:
+            self.middle = self._middles()
         held = self._held()
         gram, along = self.comm.allreduce(held.T @ held), self.comm.allreduce(held.T @ prescribed[~self.free])
         return np.asarray(np.linalg.pinv(gram, OPEN**2, hermitian=True) @ along)
@@ -240,12 +246,6 @@ class RigidMotions:
             f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
             "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on"
         )
-
-
-def find_open_motions(config: Configuration, free: Bools, finite: bool) -> RigidMotions | None:
-    """Rigid motions of the bodies, None if the conditions leave none open (collective); arguments as of ``RigidMotions``."""
-    motions = RigidMotions(config, free, finite)
-    return motions if motions.open_motions(None).shape[1] else None
 
 
 def _turn(angles: Array) -> Array:

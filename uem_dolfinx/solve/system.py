@@ -120,7 +120,7 @@ class BodySystem:
         self._doubtful, place = None, partial(self.place, returning=False)
         self.floating.begin_step(place)
         if self.forces.dynamics is None and self.floating.motions is None:
-            touch_ahead(self.forces, self.pairs, place)
+            touch_ahead(self.forces, self.pairs, self.floating.rigid, place)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
