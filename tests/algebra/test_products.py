@@ -13,6 +13,7 @@ from equation_scenes import CASES, Case
 from helpers import gathered_matrix
 from petsc4py import PETSc
 
+from uem_dolfinx.algebra.entries import Entries
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 
@@ -88,3 +89,20 @@ def test_matrix_stays_while_its_places_do():
     second = united.update(P, P, K, None)
     assert second.handle == first.handle and second.getBlockSize() == K.getBlockSize()
     assert np.abs(gathered_matrix(second) - product(K, P, P)).max() <= EXACT * np.abs(gathered_matrix(K)).max()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_entries_are_found_where_they_are(name):
+    """Of a matrix's places and others, those that it has are found, with their values, on any number of ranks."""
+    K = CASES[name]().stiffness()
+    entries, (first, last) = Entries.as_in(K), K.getOwnershipRange()
+    K.copy(entries.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    indptr, columns, values = K.getValuesCSR()
+    known = np.zeros((last - first, K.getSize()[0]), dtype=bool)
+    expected = np.zeros(known.shape)
+    rows = np.repeat(np.arange(last - first), np.diff(indptr))
+    known[rows, columns], expected[rows, columns] = True, values
+    row, column = (a.ravel() for a in np.indices(known.shape))
+    places, there = entries.find(np.where((column >= first) & (column < last), row, row + last - first), column)
+    assert np.array_equal(there.reshape(known.shape), known)
+    assert np.array_equal(entries.values[places[there]], expected[known])

@@ -1,0 +1,79 @@
+"""Sparse matrices whose entries NumPy sees where PETSc keeps them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.arrays import Bools, Ints
+
+
+class Entries:
+    """Entries of the owned rows of a square matrix, shared with PETSc.
+
+    Those in own columns come first, row by row; on several ranks those in other ranks' columns follow, of row ``i`` in line ``n + i``.
+
+    Args:
+        indptr: first entry of every line, and the number of entries ``(lines + 1,)``; lines are the n owned rows, or twice as many.
+        columns: global numbers, sorted in every line ``(k,)``.
+        like: a matrix of the same layout and block size.
+
+    Attributes:
+        values: of the entries ``(k,)``, zero at first.
+        mat: the matrix that has them; to be assembled after changes.
+    """
+
+    def __init__(self, indptr: Ints, columns: Ints, like: PETSc.Mat):
+        self.indptr, self.columns = indptr, columns
+        self.values = np.zeros(len(columns))
+        sizes, (first, last) = like.getSizes(), like.getOwnershipRange()
+        n = last - first
+        arrays: Any = indptr, columns, self.values
+        if len(indptr) > n + 1:
+            k = indptr[n]
+            inside, outside = (indptr[: n + 1], columns[:k] - first), (indptr[n:] - k, columns[k:].copy())
+            arrays = (*inside, self.values[:k]), (*outside, self.values[k:])
+        self.mat = PETSc.Mat().createAIJWithArrays(sizes, arrays, bsize=like.getBlockSize(), comm=like.comm)
+        # multigrid looks for it, and petsc4py 3.18 forgets it
+        self.mat.setBlockSize(like.getBlockSize())
+
+    @staticmethod
+    def as_in(K: PETSc.Mat) -> Entries:
+        """Zeros in the places of the entries of ``K``."""
+        if K.comm.size == 1:
+            indptr, columns = K.getRowIJ()
+            return Entries(indptr, columns, K)
+        first, last = K.getOwnershipRange()
+        indptr, columns, _ = K.getValuesCSR()
+        own = (columns >= first) & (columns < last)
+        inside = np.append(0, np.cumsum(own))[indptr]
+        lines = np.append(inside, inside[-1] + (indptr - inside)[1:]).astype(indptr.dtype)
+        return Entries(lines, np.append(columns[own], columns[~own]), K)
+
+    def of(self, lines: Bools) -> tuple[Ints, Ints]:
+        """Places of the entries in some of the lines, and the lines that they are in."""
+        return entries_of(lines, self.indptr)
+
+    def find(self, lines: Ints, columns: Ints) -> tuple[Ints, Bools]:
+        """Places where entries of these lines and columns are or would be put, and whether they are there, ``(m,)`` each."""
+        low, high = self.indptr[lines], self.indptr[lines + 1]
+        end = high
+        # all lines are bisected at once
+        while (low < high).any():
+            middle = (low + high) // 2
+            before = (low < high) & (self.columns[np.minimum(middle, len(self.columns) - 1)] < columns)
+            low, high = np.where(before, middle + 1, low), np.where(before, high, np.minimum(middle, high))
+        there = low < end
+        there[there] = self.columns[low[there]] == columns[there]
+        return low, there
+
+
+def entries_of(lines: Bools, indptr: Ints) -> tuple[Ints, Ints]:
+    """Places of the entries in some of the lines, and the lines that they are in."""
+    which = np.flatnonzero(lines).astype(indptr.dtype)
+    lengths = indptr[which + 1] - indptr[which]
+    ends = np.cumsum(lengths, dtype=indptr.dtype)
+    places = np.arange(ends[-1] if len(ends) else 0, dtype=indptr.dtype)
+    return places + np.repeat(indptr[which] - ends + lengths, lengths), np.repeat(which, lengths)
