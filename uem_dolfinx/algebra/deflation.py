@@ -6,6 +6,9 @@ are taken out of multigrid's hands: with W, whose columns are the unknowns of th
 the stiff bodies, and B a multigrid cycle,
 
     M^-1 = C + (1 - C A) B (1 - A C),    C = W (W'AW)^-1 W'
+
+B does not see the nodes that are pressed on at all: the largest eigenvalues that their pieces have would set the bounds of Chebyshev's
+smoother for the whole of both bodies.
 """
 
 from __future__ import annotations
@@ -79,6 +82,16 @@ def pressed_hard(config: Configuration, A: PETSc.Mat, K: PETSc.Mat, P: Restricti
     pressed = P.used & (stiffness > MUCH_STIFFER * own)
     pressed[P.nodes] = False
     return np.asarray(pressed.any(axis=1))
+
+
+def without(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
+    """A copy of A with nodes ``pressed (n_owned,)`` by much stiffer contactors crossed out (collective)."""
+    rest = A.copy()
+    first = config.gdim * int(config.index_map.local_range[0])
+    rest.zeroRowsColumns((np.flatnonzero(P.used & pressed[:, None]) + first).astype(PETSc.IntType))
+    rest.setBlockSize(config.gdim)
+    rest.setNearNullSpace(A.getNearNullSpace())
+    return rest
 
 
 def deflated(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:

@@ -14,7 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard
+from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard, without
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.options import OFTEN_USED, check_options, default_options
 from uem_dolfinx.algebra.products import UnitedMatrix
@@ -203,6 +203,7 @@ class UnitedSolver:
             if not self.config.comm.allreduce(int(pressed.any())):
                 self.ksp.setPC(self.pc)
                 return
+            self.pc.setOperators(without(self.config, self.A, restriction, pressed))
             deflation = Deflation(self.pc)
             deflation.update(self.A, deflated(self.config, self.A, restriction, pressed))
             self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.config.comm))
