@@ -142,7 +142,8 @@ class UnitedMatrix:
         comm = self.config.comm
         wanted = self._missing(lines, columns)
         if self.reserving:
-            more = _product(self._near(P.nodes, curvature)[1], P.reserved, Q.reserved)
+            reserved = P.reserved
+            more = _product(self._near(P.nodes, curvature)[1], reserved, reserved if Q is P else Q.reserved)
             wanted = np.union1d(wanted, self._missing(*self._entries(more)[:2]))
         self._begins = False
         if begins:
