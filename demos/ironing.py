@@ -147,7 +147,7 @@ results = {
     "moment_imbalance": None if rigid else float(worst_moment),
     "force": float(mean[-1]),
     "mean_drag_ratio": float(abs(mean[0] / mean[-1])),
-    # each contactor's friction along the surface over its force normal to it, none where a valley holds one; the drag is another ratio:
+    # each contactor's friction along the surface over its force normal to it; the drag is another ratio:
     # the slab's surface is shorter under the tool, so that less is slid, and less work done, than the tool goes
     "local_drag_ratio": float(np.divide(*np.array(local)[inside].sum(axis=0))),
     "largest_drag_ratio": float(np.abs(force[inside][:, 0] / force[inside][:, -1]).max()),

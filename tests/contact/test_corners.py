@@ -7,7 +7,7 @@ import pytest
 from helpers import blocks, clamp, linear
 
 import uem_dolfinx as uem
-from uem_dolfinx.contact.corners import find_corners
+from uem_dolfinx.contact.corners import Corners, find_corners
 
 COMM = MPI.COMM_WORLD
 
@@ -47,3 +47,47 @@ def test_a_corner_is_held_along_both_normals(slope):
     assert np.allclose(c.pulls(force), [a, b])
     assert np.allclose(c.gaps(c.foot), 0.0)
     assert on_rank_0(c.rising) == pytest.approx(np.sin(np.arctan(slope)), rel=1e-9)
+
+
+def vertex_of_three_facets(rise):
+    """Three facets that rise from a vertex alike, a third of a turn apart."""
+    angle = np.arange(3) * 2 * np.pi / 3
+    out = np.column_stack([np.cos(angle), np.sin(angle)])
+    away = np.column_stack([out, np.full(3, rise)]) / np.hypot(1.0, rise)
+    normals = np.column_stack([-rise * out, np.ones(3)]) / np.hypot(1.0, rise)
+    some, nowhere = np.ones(1, bool), np.zeros((1, 3, 0))
+    return Corners(
+        np.zeros(1, int), np.full(1, 3), some, ~some, np.full(1, rise), normals[None], away[None], np.eye(3)[None], np.zeros((1, 3), int),
+        np.ones((1, 3)) / 3, np.zeros((1, 3)), np.zeros((1, 3, 3)), nowhere, np.zeros((1, 3, 0, 0)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("slope", [0.1, 0.7])
+def test_friction_in_an_edge(slope):
+    """The facet that a contactor came over bears what its cone holds; beyond it friction is at its limit on both."""
+    c, mu = corner_of_two_facets(slope), np.array([0.3] * (COMM.rank == 0))
+    first = np.zeros(len(mu), np.int64)
+    (a, b), (t, s) = c.normals.transpose(1, 0, 2)[:2], c.away.transpose(1, 0, 2)[:2]
+    for push in (-0.3, -0.1, 0.2, 0.3):
+        assert np.allclose(c.friction(2 * a + 2 * push * t, mu, first), 2 * push * t, atol=1e-14)
+    # driven over the first facet, which leads away from the corner to the rear
+    tau = 0.3 * (2 * t - 3 * s)
+    assert np.allclose(c.friction(2 * a + 3 * b + tau, mu, first), tau)
+    # and over the other one
+    assert np.allclose(c.friction(2 * b + 0.6 * s, mu, first + 1), 0.6 * s)
+
+
+def test_friction_in_a_vertex():
+    """Of three facets those bear that must: the first alone within its cone, two or all beyond it."""
+    c, mu, first = vertex_of_three_facets(0.2), np.array([0.3]), np.array([0])
+    n, away = c.normals[0], c.away[0]
+    leaning = 0.3 * np.array([[0.0, 1.0, 0.0]])
+    assert np.allclose(c.friction(n[:1] + leaning, mu, first), leaning)
+    for second, third in ((1.0, 0.0), (1.0, 0.7)):
+        force = 2 * n[0] + 0.6 * away[0] + second * (n[1] - 0.3 * away[1]) + third * (n[2] - 0.3 * away[2])
+        tau = c.friction(force[None], mu, first)[0]
+        pressed = np.linalg.solve(n.T, force - tau)
+        assert (pressed >= -1e-12).all() and tau @ away[0] > 0
+        # what the others have none of is in the first facet's plane, and at its limit
+        rest = tau + 0.3 * (pressed[1] * away[1] + pressed[2] * away[2])
+        assert np.linalg.norm(rest) == pytest.approx(0.3 * pressed[0]) and abs(rest @ n[0]) <= 1e-14

@@ -13,6 +13,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import gap_hessians
 from uem_dolfinx.geometry.search import IN_PLANE, MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
@@ -94,6 +95,44 @@ class Corners:
         shares[np.arange(shares.shape[1])[None, :] >= self.count[:, None]] = np.inf
         return shares
 
+    def friction(self, force: Array, mu: Array, first: Ints) -> Array:
+        """Friction's part in the forces on contactors that came over one facet, until the others stopped them.
+
+        A force is a sum of what the facets push with, each along its normal, and of friction, each in its own cone. Contactors have
+        slid over the ``first`` facet: where its cone holds the force, that facet bears it alone. Else friction there is at its limit and
+        leans as the force does, and the others bear the rest, with friction at its limit against leaving over them. So the others
+        push with no more than they must, and as much of the work over the way into the corner is friction's as the cones allow.
+
+        Args:
+            force: on the contactors ``(k, gdim)``.
+            mu: coefficients of friction ``(k,)``.
+            first: which facet each came over ``(k,)``.
+
+        Returns:
+            Friction ``(k, gdim)``; along the edge that two facets share all of the force is friction.
+        """
+        k, gdim, _ = self.axes.shape
+        here, place = np.arange(gdim)[None, :] < self.count[:, None], np.arange(gdim)[None, :] == first[:, None]
+        axes = np.where(here[:, :, None], self.axes, 0.0)
+        across = np.einsum("krg,kr->kg", axes, np.einsum("krg,kg->kr", axes, force))
+        own = self.normals[np.arange(k), first]
+        push = np.maximum(np.einsum("kg,kg->k", own, across), 0.0)
+        lean = across - push[:, None] * own
+        size = np.linalg.norm(lean, axis=1)
+        limit = own + (mu / np.where(size > 0, size, 1.0))[:, None] * lean
+        along = np.where(place[:, :, None], limit[:, None], self.normals - mu[:, None, None] * self.away)
+        others = here & ~place & (size > mu * push)[:, None]
+        shares = np.where(place, push[:, None], 0.0)
+        for _ in range(gdim):
+            i = np.flatnonzero(others.any(axis=1))
+            bearing = np.where((others | place)[i, :, None], along[i], 0.0)
+            shares[i] = np.einsum("kgr,kg->kr", np.linalg.pinv(bearing), across[i])
+            # a facet that would have to pull bears nothing
+            others &= shares > 0
+            alone = i[~others[i].any(axis=1)]
+            shares[alone] = np.where(place[alone], push[alone, None], 0.0)
+        return np.asarray(force - np.einsum("kr,krg->kg", np.maximum(shares, 0.0), np.where(here[:, :, None], self.normals, 0.0)))
+
     def hessians(self, force: Array) -> Array:
         """Second derivatives of the gaps times their forces: it is the direction of the force that stays on an edge."""
         size = np.linalg.norm(force, axis=1)
@@ -107,6 +146,23 @@ class Corners:
                 n[i], np.zeros(len(i)), self.weights[i], self.dN[i], self.ddN[i], self.x[i], np.zeros((len(i), d, n.shape[1]))
             )
         return size[:, None, None] * H
+
+
+def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Array) -> Array:
+    """Friction's part in the forces on contactors that corners hold ``(n, gdim)``; zero for others.
+
+    Args:
+        corners: that hold contactors.
+        state: of the pair.
+        before: facets that the contactors were on at the start of the step ``(n,)``, which they came over.
+        mu: coefficients of friction ``(n,)``.
+    """
+    tau = np.zeros(state.force.shape)
+    if corners is not None:
+        i = corners.which
+        first = np.argmax(np.column_stack([state.facet[i], state.held[i]]) == before[i, None], axis=1)
+        tau[i] = corners.friction(state.force[i], mu[i], first)
+    return tau
 
 
 def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints, facets: Ints) -> Corners | None:

@@ -160,3 +160,18 @@ def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
     """
     a = np.clip(bound / np.where(size > 0, size, np.inf), 0.0, LEAST_TURN)
     return c * a / (1.0 - a), a / (1.0 - a)
+
+
+def work(before: Array, now: Array, way: Array, cornered: Bools) -> Array:
+    """What friction takes from the bodies over a step ``(n,)``: the mean of its forces over the way along the target.
+
+    Into a corner a contactor slides before the corner holds it; force that would push it on there is none of the way's friction.
+
+    Args:
+        before: friction at the start of the step ``(n, gdim)``.
+        now: at its end ``(n, gdim)``.
+        way: relative motion in the step ``(n, gdim)``.
+        cornered: contactors that a corner holds at the end ``(n,)``.
+    """
+    start, end = (-0.5 * np.einsum("ng,ng->n", tau, way) for tau in (before, now))
+    return np.asarray(start + np.where(cornered, np.maximum(end, 0.0), end))

@@ -15,7 +15,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact import friction
 from uem_dolfinx.contact.active_set import Wrong
-from uem_dolfinx.contact.corners import Corners
+from uem_dolfinx.contact.corners import Corners, friction_in
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.slip_front import Front
@@ -430,13 +430,17 @@ class FrictionalPair(ContactPair):
 
     def commit(self) -> None:
         """Make the trial state the committed one, with new anchors for those that do not stick; see ``ContactPair``."""
-        slip = np.where((self.trial.active | self.committed.active)[:, None], self.slip, 0.0)
         assert self.committed.friction is not None
-        share = self._shares[:, None]
-        f = self._anchored()
-        mean = 0.5 * self.tangential(self.committed.friction.tau + f.tau) / share
-        slipped = f.slipped + np.where(self.slipping[:, None], slip / share, 0.0)
-        f = replace(f, direction=self.directions, slipped=slipped, work=f.work - np.einsum("ng,ng->n", mean, slip))
+        share, f, held = self._shares[:, None], self._anchored(), self._cornered
+        f = replace(
+            f, tau=np.where(held[:, None], friction_in(self._corners, self.trial, self.committed.facet, self.mu) * share, f.tau)
+        )
+        # a contactor that changes facets slides over both
+        whole = np.where(held[:, None] | self.coupling.nodal, self._off_anchor, self.slip)
+        way, slip = (np.where((self.trial.active | self.committed.active)[:, None], x, 0.0) / share for x in (whole, self.slip))
+        slipped = f.slipped + np.where(held[:, None], way, np.where(self.slipping[:, None], slip, 0.0))
+        taken = friction.work(self.committed.friction.tau, f.tau, way, held)
+        f = replace(f, direction=self.directions, slipped=slipped, work=f.work + taken)
         self.trial, self._kept = replace(self.trial, friction=f), None
         super().commit()
 
