@@ -14,6 +14,7 @@ from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, linear
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.solve.tangent import contact_curvature
 
 
 def slow(*values):
@@ -140,9 +141,10 @@ def test_what_slides_away():
 
 
 @pytest.mark.parametrize("cell, law", [("quadrilateral", st_venant), ("tetrahedron", st_venant)])
-def test_slip_converges_quadratically(cell, law):
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_slip_converges_quadratically(cell, law, coupling):
     """Finite sliding and finite strains over a base that bends: the tangent of the tilted rows is exact."""
-    scene = driven(cell, 0.4, law=law, n=(2, 3), options={"rtol": 1e-11})
+    scene = driven(cell, 0.4, law=law, n=(2, 3), how={"coupling": coupling}, options={"rtol": 1e-11})
     g = scene.problem.config.gdim
     side = [0.03] * (g - 2)
     scene.to(*[0.0] * (g - 1), -0.05)
@@ -186,6 +188,42 @@ def test_tangent_by_differences(cell):
     difference = residual(smooth + 1e-5 * way, s) - residual(smooth - 1e-5 * way, s)
     difference.scale(0.5e5)
     assert (difference - full).norm() <= 1e-7 * (difference - plain).norm()
+
+
+@pytest.mark.parametrize(("cell", "rigid"), [("quadrilateral", False), ("tetrahedron", False), ("tetrahedron", True)])
+def test_friction_of_mortar_by_differences(cell, rigid):
+    """Derivatives of the forces of friction of weighted gaps, over bodies that bend, all contactors slipping."""
+    mu, h = 0.4, 1e-6
+    scene = driven(cell, mu, rigid=rigid, n=(3, 4) if cell == "quadrilateral" else (2, 3), how={"coupling": "mortar"})
+    problem, pair = scene.problem, scene.contact.pair
+    x, g, n = problem.config.X, problem.config.gdim, len(pair.nodes)
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    pressure = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+
+    def friction(u, direction):
+        """Nodal forces of friction; the multipliers of the weighted gaps stay."""
+        state = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
+        pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=state)
+        problem.u.x.array[:] = u.ravel()
+        problem.system.place(returning=False)
+        lam = pressure * pair.placement.details.area
+        pair.trial = replace(pair.trial, lam=lam)
+        forces = []
+        for tau in (-mu * lam[:, None] * pair.directions, np.zeros((n, g))):
+            pair.trial = replace(pair.trial, friction=replace(state, tau=tau))
+            forces.append(problem.forces.vector(scene.contact.force.x.array.reshape(-1, g)[: problem.config.n_owned].copy()))
+        return forces[0] - forces[1]
+
+    friction(smooth, np.tile([1.0, *[0.5] * (g - 1)], (n, 1)))
+    s = pair.directions
+    friction(smooth, s)
+    du = problem.forces.vector(way[: problem.config.n_owned])
+    tau = -mu * (pair.trial.lam / pair.coupling.shares(pair.placement, pair.trial))[:, None] * pair.directions
+    made = contact_curvature(pair.coupling.turning(pair.placement, pair.trial, np.arange(n), tau), du) * du
+    difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
+    difference.scale(0.5 / h)
+    assert (difference - made).norm() <= 1e-8 * difference.norm()
 
 
 def test_mirror_image():

@@ -171,6 +171,19 @@ class Coupling(Protocol):
     def curvature(self, placement: Placement, state: PairState) -> tuple[Ints, Array]:
         """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)``, values ``(k, (1 + nn) gdim, (1 + nn) gdim)``."""
 
+    def turning(self, placement: Placement, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+        """Derivatives of the forces of friction of contactors that slip (collective).
+
+        Args:
+            placement: of the contactors.
+            state: of the pair.
+            which: contactors that slip and push, ascending ``(k,)``.
+            tau: their friction, as multipliers of rows along the target ``(k, gdim)``.
+
+        Returns:
+            Lists of global nodes, negative where there is none, and blocks, as of ``curvature``.
+        """
+
     def areas(self, placement: Placement, areas: Array) -> Array:
         """What ``lam`` is an integral of the pressure over, from the integrals of the shape functions ``(n,)`` (collective)."""
 

@@ -395,15 +395,15 @@ class FrictionalPair(ContactPair):
         nodes[row[order], column + 1], share[row[order], column + 1] = followed[order], -weight[order]
         return nodes[which], share[which]
 
-    def curvature(self) -> tuple[Ints, Array]:
-        """Blocks of ``-sum lambda d(row)/du``, the rows of contactors that slip tilted; see ``ContactPair``."""
-        nodes, blocks = super().curvature()
-        if not self.coupling.at_feet:
-            return nodes, blocks
-        i, p = np.flatnonzero(self.slipping & (self.trial.lam > 0) & ~self._cornered), self.projection
-        tau = self.tangential(self.trial.force)[i]
-        own = np.column_stack([self.config.to_global(self.nodes[i]), p.nodes[i]])
-        return np.concatenate([nodes, own]), np.concatenate([blocks, -p.turnings(i, tau)])
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda d(row)/du``, the rows of contactors that slip tilted; see ``ContactPair`` (collective)."""
+        parts = super().curvature()
+        which = np.flatnonzero(self.slipping & (self.trial.lam > 0))
+        if not self.config.comm.allreduce(len(which)):
+            return parts
+        tau = -(self.mu * self._multipliers)[which, None] * self.directions[which]
+        turned = self.coupling.turning(self.placement, self.trial, which, tau)
+        return parts + [(nodes, -blocks) for nodes, blocks in turned]
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 

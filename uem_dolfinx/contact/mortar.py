@@ -22,6 +22,7 @@ from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Basis, Covered, basis_of, dual_functions
 from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, terms_of, with_terms
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
+from uem_dolfinx.contact.mortar_turning import Slips, turning
 from uem_dolfinx.contact.node_to_surface import NEAR, NodeToSurface
 from uem_dolfinx.contact.segment_motions import slopes
 from uem_dolfinx.contact.state import PairState
@@ -277,17 +278,18 @@ class Mortar(NodeToSurface):
             beside = self._elimination.beside(at, scale, direction)
             equations = with_terms(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
-        weights = None
+        weights = whole = None
         if self._rubs:
             whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
             means = [
                 terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
                 terms_of(own[e], at.opposite, followed),
             ]
-            r, t, w = self._elimination.at_owners(means, np.where(is_covered, whole, 1.0))
+            whole = np.where(is_covered, whole, 1.0)
+            r, t, w = self._elimination.at_owners(means, whole)
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
             weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
-        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share, weights)
+        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share, weights, whole)
 
     def rub(self, mu: Array) -> None:
         """Keep the weights that friction needs; see ``Coupling``."""
@@ -386,6 +388,15 @@ class Mortar(NodeToSurface):
         dofs = self.surface.dofs[rows.facets]
         at_nodes = self.config.from_owners(self.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
         return rows.points.curvature(at_nodes)
+
+    def turning(self, placement: Placement, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+        """Of those that the target covers: traction turns, grows with its surface and is handed to what is opposite (collective)."""
+        rows: WeightedRows = placement.details
+        kept = rows.covered[which]
+        i, tau = which[kept], tau[kept]
+        push = state.lam / self.shares(placement, state)
+        slips = Slips(i, push[i], state.lam[i] / rows.area[i], self.normals(placement, state)[i], tau)
+        return turning(self._elimination, rows, self.surface.dofs[rows.facets], slips, self.weights(placement))
 
     def areas(self, placement: Placement, areas: Array) -> Array:
         """Integrals of the dual functions over what is covered."""

@@ -41,6 +41,8 @@ class WeightedRows:
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
         weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
+        whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
+            without friction.
     """
 
     equations: UnitingEquations
@@ -53,6 +55,7 @@ class WeightedRows:
     area: Array
     share: Array
     weights: Terms | None = None
+    whole: Array | None = None
 
 
 class Elimination:

@@ -335,6 +335,12 @@ class NodeToSurface:
             blocks = np.concatenate([blocks, -c.hessians(state.force[c.which])])
         return np.column_stack([self.config.to_global(own), followed]), blocks
 
+    def turning(self, placement: Placement, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+        """Derivatives of the rows along forces of friction, of contactors that no corner holds."""
+        plain = ~state.in_corner[which]
+        i, p = which[plain], placement.projection
+        return [(np.column_stack([self.config.to_global(self.nodes[i]), p.nodes[i]]), p.turnings(i, tau[plain]))]
+
     def areas(self, placement: Placement, areas: Array) -> Array:
         """A nodal force is the integral of the pressure over the node's shape function."""
         return areas

@@ -321,9 +321,9 @@ class ContactPair:
         state = self.with_forces(lam, nodal, force)
         self.trial = state if active is None else replace(state, active=active)
 
-    def curvature(self) -> tuple[Ints, Array]:
-        """Blocks of ``-sum lambda grad^2 g``: global nodes ``(k, 1 + nn)`` and values ``(k, (1 + nn) g, (1 + nn) g)``."""
-        return self.coupling.curvature(self.placement, self.trial)
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda grad^2 g``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
+        return [self.coupling.curvature(self.placement, self.trial)]
 
     def check(self) -> None:
         """Refuse an equilibrium that the pair cannot stand for (collective)."""

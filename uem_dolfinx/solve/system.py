@@ -390,7 +390,7 @@ class BodySystem:
 
     def curvature(self) -> PETSc.Mat | None:
         """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
-        parts = [pair.curvature() for pair in self.pairs if pair.sliding == "finite"]
+        parts = [part for pair in self.pairs if pair.sliding == "finite" for part in pair.curvature()]
         if not self._apart:
             parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
         # a plane has none

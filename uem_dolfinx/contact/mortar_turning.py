@@ -1,0 +1,138 @@
+"""How mortar's forces of friction change with the displacement: with the traction's direction and size, and with what it is handed to.
+
+The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes
+get other shares. The traction turns with the normal of the contactor's equation, and grows with its size; these are the second
+derivatives of the weighted gap of this contactor alone. How dual functions change where the target ends is left out, as in the
+second derivatives of gaps in space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.contact.duals import basis_of
+from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
+from uem_dolfinx.contact.mortar_tangent import SegmentPoints
+from uem_dolfinx.contact.segment_motions import Motions, dual_tangents, sum_of_products
+from uem_dolfinx.geometry.shapes import tangents
+
+
+@dataclass(frozen=True)
+class Slips:
+    """Contactors that slip, covered by the target.
+
+    Attributes:
+        which: places among the contactors, ascending ``(k,)``.
+        push: multipliers of their equations along ``normal``, positive ``(k,)``.
+        pressure: multipliers of their weighted gaps ``(k,)``.
+        normal: directions of their equations ``(k, gdim)``.
+        tau: friction, handed on by the weights that they follow other nodes with ``(k, gdim)``.
+    """
+
+    which: Ints
+    push: Array
+    pressure: Array
+    normal: Array
+    tau: Array
+
+
+def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
+    """Derivatives of the nodal forces of a traction whose values at the contactors stay, on both sides.
+
+    Args:
+        at: points of the segments.
+        traction: at the contactor facets' nodes, a force per area ``(m, nc, gdim)``.
+
+    Returns:
+        Global nodes of the pairs under traction ``(p, nc + nt)``, and blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+    """
+    s, g = at.segments, at.to_gap.shape[1]
+    some = np.bincount(s.pair, minlength=len(at.facet)) > 0
+    which = np.flatnonzero(traction[at.facet].any(axis=(1, 2)) & some)
+    e, k = at.facet[which], len(which)
+    place = np.full(len(at.facet), -1, dtype=np.int64)
+    place[which] = np.arange(k)
+    q = np.flatnonzero(place[s.pair] >= 0)
+    pair = place[s.pair[q]]
+    amount = np.einsum("pjb,pjg->pbg", at.duals.A[e], traction[e])
+    force = s.weight[q, None] * np.einsum("qb,qbg->qg", at.b[q], amount[pair])
+    n, size = at.planes.normal[e], at.planes.size[e]
+    motions = Motions(at.phi[q], at.N[q], s.gap[q] / size[pair], at.turning[e][pair])
+    share, one = np.concatenate([at.phi[q], -at.N[q]], axis=1), np.ones(len(q))
+    # all grow with the facet
+    blocks = sum_of_products(pair, one, share[:, :, None] * force[:, None], motions.of_area((n / size[:, None])[pair]), k)
+    if at.other is not None:
+        tab = at.other.tabulate(s.eta[q])
+        over = dual_tangents(tangents(tab, at.y[which][pair]), n[pair])
+        for f in range(at.other.dim):
+            moved = np.zeros((len(q), share.shape[1], g))
+            moved[:, motions.nc :] = -tab.dN[:, :, f, None] * force[:, None]
+            blocks += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
+    return np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks
+
+
+def turning(
+    elimination: Elimination, rows: WeightedRows, dofs: Indices, slips: Slips, weights: Terms
+) -> list[tuple[Ints, Array]]:
+    """Derivatives of the forces of friction of contactors that slip, their coefficients of friction being kept (collective).
+
+    Args:
+        elimination: of the contactors.
+        rows: equations of all contactors, where they were made.
+        dofs: local nodes of the contactor facets ``(m, nc)``.
+        slips: the contactors that slip.
+        weights: by what all contactors follow other nodes.
+
+    Returns:
+        Twice, global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
+    """
+    at, config, (which, normal, tau) = rows.points, elimination.config, (slips.which, slips.normal, slips.tau)
+    n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
+    assert rows.whole is not None
+    whole = rows.whole[which, None]
+    mine = np.zeros((n, 1 + g))
+    mine[which] = np.column_stack([slips.pressure, tau / whole])
+    there = config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(m, nc, 1 + g)
+    # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
+    unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
+    grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * unit[:, None]
+    parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g)), grown], axis=3))]
+    for j in range(nc):
+        alone = np.zeros((m, nc))
+        alone[:, j] = there[:, j, 0]
+        nodes, blocks = at.curvature(alone)
+        p, width = nodes.shape
+        own = -blocks[:, j * g : (j + 1) * g].reshape(p, g, width, g).swapaxes(1, 2).reshape(p, 1, width, g * g)
+        parts.append(terms_of(nodes[:, j : j + 1], nodes, np.concatenate([own, np.zeros((p, 1, width, g))], axis=3)))
+    row, term, value = elimination.at_owners(parts, np.ones(n))
+    values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + g))
+    values[: len(row), 1:] = value
+    values[len(row) :, 0] = np.concatenate([-weights[2], np.ones(len(which))])
+    who, terms = (
+        np.concatenate(part)
+        for part in ((row, weights[0], which), (term, weights[1], config.to_global(elimination.nodes[which])))
+    )
+    nodes, values = _table(add_up_terms((who, terms, values)), which, n)
+    k, c = nodes.shape
+    gradient, of_whole = values[:, :, 1 : 1 + g * g].reshape(k, c, g, g), values[:, :, 1 + g * g :] / whole[:, None]
+    along, across = (np.einsum("kg,kcgh->kch", v, gradient) / slips.push[:, None, None] for v in (normal, tau))
+    change = np.einsum("kg,kch->kgch", tau, along - of_whole) - np.einsum("kg,kch->kgch", normal, across)
+    blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
+    return [handing_on(at, there[:, :, 1:]), (nodes, blocks)]
+
+
+def _table(terms: Terms, which: Ints, n: int) -> tuple[Ints, Array]:
+    """Terms of rows ``which (k,)`` of ``n``, one row each: followed nodes, -1 for none ``(k, c)``, and values ``(k, c, ...)``."""
+    row, term, value = terms
+    place = np.full(n, -1, dtype=np.int64)
+    place[which] = np.arange(len(which))
+    kept = place[row] >= 0
+    row, term, value = place[row[kept]], term[kept], value[kept]
+    column = np.arange(len(row)) - np.searchsorted(row, np.arange(len(which)))[row]
+    nodes = np.full((len(which), int(column.max(initial=-1)) + 1), -1, dtype=np.int64)
+    values = np.zeros((*nodes.shape, value.shape[1]))
+    nodes[row, column], values[row, column] = term, value
+    return nodes, values
