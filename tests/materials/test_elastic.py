@@ -175,7 +175,10 @@ def test_degrees_that_are_asked_for(law, degree):
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("cell,degree", [("quadrilateral", 1), ("quadrilateral", 2), ("triangle", 2), ("hexahedron", 1)])
+@pytest.mark.parametrize(
+    "cell,degree",
+    [("quadrilateral", 1), ("quadrilateral", 2), ("triangle", 2), pytest.param("hexahedron", 1, marks=pytest.mark.slow)],
+)
 def test_forms_of_fewer_points(law, cell, degree):
     """Forces are derivatives of the energy, and the tangent those of the forces: rules of one and of several points meet."""
     if cell == "hexahedron" and law is not uem.NeoHooke:
