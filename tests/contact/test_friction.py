@@ -10,7 +10,16 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import RADIUS, cylinder, driven, history, loose
-from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, linear, lowest, refused, rotation, st_venant
+from helpers import (
+    NU,
+    factors,
+    gathered_matrix,
+    highest,
+    lowest,
+    refused,
+    rotation,
+    st_venant,
+)
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -396,17 +405,3 @@ def test_cattaneo_and_mindlin(degree, coupling, n):
         assert highest(scene.problem.comm, place[sticks]) <= stick + 1.5 * facet(stick)
         assert lowest(scene.problem.comm, place[pair.slipping]) >= stick - 1.5 * facet(stick)
     assert most <= 5
-
-
-def test_contactors_that_are_driven():
-    """A contactor whose motion along the target is prescribed feels no friction, so it may not be driven over it."""
-    plane = uem.RigidPlane([0.0, 0.0], [0.0, 1.0])
-    for way, fits in ((1e-12, True), (1e-3, False)):
-        b = blocks(MPI.COMM_WORLD, "quadrilateral", 2, 2, overhang=0.5)
-        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.high, 0, value=way), *clamp(b.V, b.top, 1, value=-0.01)]
-        contact = uem.Contact(b.high, plane, friction=0.3)
-        problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact])
-        if fits:
-            problem.solve()
-        else:
-            refused(uem.FrictionError, "prescribed component", problem.solve)

@@ -14,7 +14,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.pair import ContactPair
-from uem_dolfinx.errors import ConflictError, PenetrationError
+from uem_dolfinx.errors import ConflictError, FrictionError, PenetrationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
@@ -25,6 +25,9 @@ from uem_dolfinx.parallel import agree
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 #: [heuristic; the model's size; -]
 LEFT_OUT = 1e-6
+#: A contactor is driven over the target if its prescribed components move by more than this part of the model's size in a step.
+#: [convention; the model's size; test_friction_prescribed.py::test_contactors_that_are_driven]
+DRIVEN = 1e-9
 #: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
 #: [convention; slope; test_warnings.py::test_corners_are_no_curves]
 CORNER = 0.5
@@ -79,6 +82,29 @@ def check_prescribed(pair: ContactPair) -> None:
             f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
             f"{-pair.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
+        )
+    agree(pair.config.comm, error)
+
+
+def check_driven(pair: ContactPair, way: Array, pressed: Bools) -> None:
+    """Refuse contactors that are driven over the target by Dirichlet conditions, which friction cannot act on (collective).
+
+    Args:
+        pair: with friction.
+        way: of prescribed components along the target in this step ``(n, gdim)``.
+        pressed: contactors that friction would act on ``(n,)``.
+
+    Raises:
+        FrictionError: naming the first such contactor of the first rank that has one.
+    """
+    driven = np.linalg.norm(way, axis=1) > DRIVEN * pair.config.size
+    i = np.flatnonzero(driven & pressed)
+    error = None
+    if len(i):
+        error = FrictionError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i[0]]))} is driven over the target by a Dirichlet "
+            "condition, and friction cannot act on a prescribed component: drive other nodes of the body, or make the other surface "
+            "the contactor"
         )
     agree(pair.config.comm, error)
 

@@ -130,6 +130,9 @@ class Coupling(Protocol):
     def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
         """By what contactors follow other nodes: places of contactors, global nodes and weights, ``(k,)`` each (collective)."""
 
+    def driven(self, placement: Placement, way: Array) -> Array:
+        """How far an increment ``(n_owned, gdim)`` takes prescribed components over the target ``(n, gdim)``; free ones 0 (collective)."""
+
     def shares(self, placement: Placement, state: PairState) -> Array:
         """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)`` (collective)."""
 

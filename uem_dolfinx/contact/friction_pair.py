@@ -15,19 +15,14 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact import friction
 from uem_dolfinx.contact.active_set import Wrong
+from uem_dolfinx.contact.checks import check_driven
 from uem_dolfinx.contact.corners import Corners, friction_in
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations
 from uem_dolfinx.contact.pair import ContactPair
 from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import FrictionState, PairState
-from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.parallel import agree
-
-#: A contactor is driven over the target if its prescribed components move by more than this part of the model's size in a step.
-#: [convention; the model's size; test_friction.py::test_contactors_that_are_driven]
-DRIVEN = 1e-9
 
 
 class FrictionalPair(ContactPair):
@@ -74,22 +69,23 @@ class FrictionalPair(ContactPair):
         if not self.coupling.nodal:
             if self._kept is None:
                 self._kept = self.coupling.weights(self.placement), self.config.x[: self.config.n_owned].copy(), target.motion
-            self._moved = self._move_since(*self._kept)
+            weights, before, motion = self._kept
+            self._moved = self._relative(self._way_since(before, motion), weights)
             return
         if target.n_nodes:
             self._anchors = cast("MeshTarget", target).places(f.facet, f.xi) + f.anchor
         else:
             self._anchors = f.anchor if target.motion is None else target.motion.carry(f.anchor)
 
-    def _move_since(self, weights: tuple[Ints, Ints, Array], before: Array, motion: Motion | None) -> Array:
-        """Motion of the contactors relative to the target since the nodes were at ``before (n_owned, gdim)``, with weights of then."""
+    def _way_since(self, before: Array, motion: Motion | None) -> Array:
+        """Way of the owned nodes ``(n_owned, gdim)`` since they were at ``before``; of contactors less that of a rigid target."""
         way = self.config.x[: self.config.n_owned] - before
         now = self.target.motion
         if now is not motion:
             still = Motion.none(self.config.gdim)
             start = before[self.nodes]
             way[self.nodes] -= (now or still).carry((motion or still).back(start)) - start
-        return self._relative(way, weights)
+        return way
 
     def _relative(self, du: Array, weights: tuple[Ints, Ints, Array]) -> Array:
         """How an increment ``(n_owned, gdim)`` moves contactors relative to what they follow ``(n, gdim)`` (collective)."""
@@ -263,18 +259,13 @@ class FrictionalPair(ContactPair):
         Raises:
             FrictionError: naming the first such contactor of the first rank that has one.
         """
-        normal, off = self.coupling.normals(self.placement, self.trial), self._off_anchor
-        whole = friction.along(friction.tangents(normal[:, None], np.ones_like(self.free)), off)
-        driven = np.linalg.norm(whole - self.slip, axis=1) > DRIVEN * self.config.size
-        i = np.flatnonzero(driven & self.rubbing & (self.trial.lam > 0) & ~self._cornered & ~self.free.all(axis=1))
-        error = None
-        if len(i):
-            error = FrictionError(
-                f"{self.name}: the contactor at {self.config.describe(int(self.nodes[i[0]]))} is driven over the target by a Dirichlet "
-                "condition, and friction cannot act on a prescribed component: drive other nodes of the body, or make the other surface "
-                "the contactor"
-            )
-        agree(self.config.comm, error)
+        if self._kept is None:
+            way = np.where(self.free, 0.0, self._off_anchor)
+        else:
+            way = self.coupling.driven(self.placement, self._way_since(*self._kept[1:]))
+        normal = self.coupling.normals(self.placement, self.trial)
+        along = friction.along(friction.tangents(normal[:, None], np.ones_like(self.free)), way)
+        check_driven(self, along, self.rubbing & (self.trial.lam > 0) & ~self._cornered)
 
     # -- what the united system gets -------------------------------------------------------------------------------------
 

@@ -196,9 +196,29 @@ class NodeToSurface:
 
     def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
         """The shape functions at the feet; see ``Coupling``."""
+        return self._beneath(placement)
+
+    def _beneath(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+        """The shape functions at the feet: places of contactors, global nodes and weights."""
         p = placement.projection
         row, a = np.nonzero(p.nodes >= 0)
         return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
+
+    def driven(self, placement: Placement, way: Array) -> Array:
+        """How far prescribed components go over the feet; see ``Coupling``.
+
+        Where most of what is there is prescribed as well, as on a plane of symmetry, it counts alone: with mortar the feet are a little off
+        the plane, where nodes move.
+        """
+        row, followed, weight = self._beneath(placement)
+        held = weight[:, None] * (1.0 - self.config.ask_owners(followed, self._free_of_owned.astype(float)))
+        moved = self.config.ask_owners(followed, way)
+        share, by_held, by_all = np.zeros((3, len(self.nodes), self.config.gdim))
+        for total, part in ((share, held), (by_held, held * moved), (by_all, weight[:, None] * moved)):
+            np.add.at(total, row, part)
+        most = share > 0.5
+        over = np.where(most, by_held / np.where(most, share, 1.0), by_all)
+        return np.asarray(np.where(self.free, 0.0, way[self.nodes] - over))
 
     def shares(self, placement: Placement, state: PairState) -> Array:
         """The whole multiplier."""
