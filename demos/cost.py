@@ -234,7 +234,7 @@ with uem.figure(args.plot, comm, panels=2) as panels:
             panel.loglog(n, [r[name] for r in own], style, label=name.replace("_seconds", ", all"))
         panel.set(xlabel="degrees of freedom", ylabel="time [s]", title=f"{dim}D, linear bodies, one step from scratch")
         panel.grid(alpha=0.25, which="both")
-        panel.legend(fontsize=7)
+        panel.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.01, 1.0))
 
 # %% [markdown]
 # ## What must hold on any machine
