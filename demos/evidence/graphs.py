@@ -20,7 +20,7 @@ AXES = {"seconds": "time [s]", "dofs": "degrees of freedom", "dt": "time step", 
 ERRORS = {
     "error_energy": "error in energy norm",
     "error_l2": "error of the displacement in $L_2$",
-    "error_pressure": "error of the contact pressure in $L_2$",
+    "error_pressure": "error of the contact pressure or friction in $L_2$",
 }
 
 
