@@ -16,6 +16,9 @@ from uem_dolfinx.geometry.rigid import rotation_matrix
 #: A motion is open if conditions and contacts resist it with less than this part of its size.
 #: [convention; size of the motion; test_rigid_motions.py::test_what_counts_as_open]
 OPEN = 1e-5
+#: Coordinates that differ by less are the same: nodes are put in order by their places on any number of ranks.
+#: [bound; the model's size; -]
+SAME_PLACE = 1e-9
 #: A motion is loaded if the forces along it exceed this part of all forces; supports may be left with less.
 #: [convention; sum of all forces; test_rigid_motions.py::test_what_counts_as_loaded]
 LOADED = 1e-6
@@ -207,13 +210,15 @@ class RigidMotions:
         allowed = np.array(self.free)
         allowed[equations.node] = False
         i, c = np.nonzero(allowed)
+        # last bits of places differ from partition to partition
+        places = np.round(config.X[: config.n_owned] / (SAME_PLACE * config.size))
         rows = self._spread(self._modes(self._places, own)[i, :, c], own[i]) @ motions
         for _ in range(motions.shape[1]):
             size = np.linalg.norm(rows, axis=1)
             largest = self.comm.allreduce(float(size.max(initial=0.0)), op=MPI.MAX)
             # of equally good ones the first by its place in the drawing, whichever rank has it
             good = np.flatnonzero(size >= (1.0 - OPEN) * largest)
-            keys = [(*config.X[i[k]], c[k]) for k in good]
+            keys = [(*places[i[k]], c[k]) for k in good]
             best, offers = int(good[keys.index(min(keys))]) if keys else -1, self.comm.allgather(min(keys, default=None))
             winner = offers.index(min(offer for offer in offers if offer is not None))
             if winner == self.comm.rank:
