@@ -70,7 +70,7 @@ def test_supports_are_the_same_on_every_number_of_ranks():
         problem = uem.UnitedProblem(linear(u, 1.0), u)
         config = problem.config
         # last bits that another partition would have
-        config.X[:] += 1e-16 * np.random.default_rng(seed).integers(-1, 2, config.X.shape)
+        config.X[:] += 4e-16 * np.random.default_rng(seed).integers(-1, 2, config.X.shape)
         motions = RigidMotions(config, problem.forces.free[: config.n_owned], False)
         i, c = np.nonzero(motions.supports(motions.open_motions(None), UnitingEquations.join([], 2)))
         return sorted(sum(comm.allgather([(*np.round(config.X[k], 6), d) for k, d in zip(i, c)]), []))
