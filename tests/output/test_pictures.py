@@ -63,6 +63,8 @@ def test_outside_of_the_bodies(cell, drawn, folder):
     uem.plot_scene(problem, folder / "pressure.png", field=contact, surface=contact.contactor, levels=[0.0, 1.0], arrows=True)
     uem.plot_scene(problem, folder / "part.png", window=(0.0, 0.5, 0.0, 1.0, 0.0, 1.0))
     force = contact.resultant().force[2]
+    X = problem.config.X[contact.nodes]
+    np.testing.assert_allclose(contact.points - X, problem.u.x.array.reshape(-1, 3)[contact.nodes], atol=1e-14)
     if COMM.rank:
         assert not drawn
         return

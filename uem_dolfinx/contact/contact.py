@@ -233,7 +233,7 @@ class Contact:
 
     @property
     def points(self) -> Array:
-        """Reference places of this rank's contactors ``(n_contactors, gdim)``, a length."""
+        """Current positions of this rank's contactors ``(n_contactors, gdim)``, a length."""
         return self.pair.points
 
     @property
