@@ -54,6 +54,21 @@ def vertex_nodes(domain: Any) -> Indices:
     return nodes
 
 
+def cells_of_facets(domain: Any, facets: npt.ArrayLike) -> tuple[Indices, Indices]:
+    """Cells of facets, ghosts included, and which of its cell's facets each is ``(k,)``; one that lies between two comes twice."""
+    topology, entities = domain.topology, np.asarray(facets, dtype=np.int32)
+    tdim = topology.dim
+    topology.create_connectivity(tdim - 1, tdim)
+    topology.create_connectivity(tdim, tdim - 1)
+    f2c, width = topology.connectivity(tdim - 1, tdim), len(reference_topology(compat.cell_name(domain))[tdim - 1])
+    starts, ends = np.asarray(f2c.offsets)[entities], np.asarray(f2c.offsets)[entities + 1]
+    counts = ends - starts
+    which = np.repeat(entities, counts)
+    cells = np.asarray(f2c.array)[np.arange(counts.sum()) + np.repeat(ends - np.cumsum(counts), counts)]
+    sides = (compat.cell_table(topology.connectivity(tdim, tdim - 1), width)[cells] == which[:, None]).argmax(axis=1)
+    return cells, sides.astype(np.int32)
+
+
 def mesh_tags(domain: Any, dim: int, entities: npt.ArrayLike, values: npt.ArrayLike) -> Any:
     """MeshTags of local entities in any order ``(n,)``, of equal ones the first, with one integer for all or for each ``(n,)``."""
     indices = np.asarray(entities, dtype=np.int32).reshape(-1)

@@ -165,16 +165,22 @@ def test_slip_converges_quadratically(cell, law, coupling):
     assert len(found) >= 3 and max(found if g == 2 else [b for b in found if b < 1e3]) <= 50.0
 
 
+def fields(problem, pair):
+    """Smooth displacement and way of all nodes, and numbers of the contactors, about which friction is differentiated."""
+    x, g = problem.config.X, problem.config.gdim
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    return smooth, way, 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+
+
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_tangent_by_differences(cell):
     """K and the curvature of tilted rows are the derivative of ``F - sum lambda (n - mu s)``, all contactors slipping."""
     mu = 0.4
     scene = driven(cell, mu)
     problem, pair = scene.problem, scene.contact.pair
-    x, g, n = problem.config.X, problem.config.gdim, len(pair.nodes)
-    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
-    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
-    lam = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+    g, n = problem.config.gdim, len(pair.nodes)
+    smooth, way, lam = fields(problem, pair)
 
     def residual(u, direction):
         friction = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
@@ -205,10 +211,8 @@ def test_friction_of_mortar_by_differences(cell, rigid):
     mu, h = 0.4, 1e-6
     scene = driven(cell, mu, rigid=rigid, n=(3, 4) if cell == "quadrilateral" else (2, 3), how={"coupling": "mortar"})
     problem, pair = scene.problem, scene.contact.pair
-    x, g, n = problem.config.X, problem.config.gdim, len(pair.nodes)
-    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
-    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
-    pressure = 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
+    g, n = problem.config.gdim, len(pair.nodes)
+    smooth, way, pressure = fields(problem, pair)
 
     def friction(u, direction):
         """Nodal forces of friction; the multipliers of the weighted gaps stay."""

@@ -43,21 +43,11 @@ class TargetFacets:
 
     def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
         self.config, self.tag, self.role = config, tag, role
-        mesh, tdim, fdim = config.mesh, config.tdim, config.tdim - 1
-        mesh.topology.create_connectivity(fdim, tdim)
-        mesh.topology.create_connectivity(tdim, fdim)
-        f2c, c2f = mesh.topology.connectivity(fdim, tdim), mesh.topology.connectivity(tdim, fdim)
-        entities = np.asarray(tag.entities, dtype=np.int32)
-        starts, of_cells = (
-            f2c.offsets[entities],
-            compat.cell_table(c2f, len(forms.reference_topology(compat.cell_name(mesh))[fdim])),
-        )
-        counts = f2c.offsets[entities + 1] - starts
-        at = np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
-        cells, facets = f2c.array[at], np.repeat(entities, counts)
-        own = cells < mesh.topology.index_map(tdim).size_local
+        mesh = config.mesh
+        cells, sides = forms.cells_of_facets(mesh, tag.entities)
+        own = cells < mesh.topology.index_map(config.tdim).size_local
         self.cells: Indices = cells[own]
-        self.sides: Indices = (of_cells[self.cells] == facets[own, None]).argmax(axis=1).astype(np.int32)
+        self.sides: Indices = sides[own]
         self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
         cell_dofs = compat.cell_dofs(config.V)
         self.dofs = cell_dofs[self.cells[:, None], _facet_closure(config, self.shape)[self.sides]]

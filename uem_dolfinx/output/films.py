@@ -12,7 +12,7 @@ from uem_dolfinx.files import REMEDY, on_rank_0
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.drawings import Drawing
 from uem_dolfinx.output.frames import Frame
-from uem_dolfinx.output.pictures import plot_scene
+from uem_dolfinx.output.pictures import new_canvas, plot_scene
 from uem_dolfinx.output.tables import given_path
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_step import LoadStep
@@ -105,10 +105,9 @@ def _title(number: int, step: object) -> str:
 
 def _prepare(path: Path) -> None:
     """Look, before the run, whether its film can be drawn and written."""
-    try:
-        from matplotlib.animation import FFMpegWriter
-    except ImportError as missing:
-        raise MissingBackendError(f"the film {path} needs matplotlib ({missing}): install it, or leave the film out") from missing
+    new_canvas(f"the film {path}", (1.0, 1.0))
+    from matplotlib.animation import FFMpegWriter
+
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise MissingBackendError(f"the film {path} needs ffmpeg, which is not there: install it, or write a .gif")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,11 +123,8 @@ def _write(path: Path, drawing: Drawing, frames: list[Frame | None], rate: float
     if not taken:
         return
     from matplotlib.animation import FFMpegWriter, PillowWriter
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=size, constrained_layout=True)
-    FigureCanvasAgg(canvas)
+    canvas = new_canvas(f"the film {path}", size)
     drawn = drawing.over(taken)
     writer = (PillowWriter if path.suffix == ".gif" else FFMpegWriter)(fps=rate)
     with writer.saving(canvas, str(path), 100):

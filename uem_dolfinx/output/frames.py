@@ -156,14 +156,11 @@ def boundary(mesh: Any, surface: Part | None = None) -> Ints:
     """
     topology, tdim = mesh.topology, mesh.topology.dim
     topology.create_connectivity(tdim - 1, tdim)
-    topology.create_connectivity(tdim, tdim - 1)
     facets = np.asarray(exterior_facet_indices(topology))
     if surface is not None:
         facets = np.intersect1d(facets, as_tag(surface, mesh, (tdim - 1,), "surface").entities)
     corners = np.array(forms.reference_topology(compat.cell_name(mesh))[tdim - 1])
-    facet_cells = topology.connectivity(tdim - 1, tdim)
-    cells = np.asarray(facet_cells.array)[np.asarray(facet_cells.offsets)[facets]]
-    sides = (compat.cell_table(topology.connectivity(tdim, tdim - 1), len(corners))[cells] == facets[:, None]).argmax(axis=1)
+    cells, sides = forms.cells_of_facets(mesh, facets)
     dofs = compat.cell_dofs(compat.function_space(mesh, 1)).astype(np.int64)
     return np.asarray(dofs[cells[:, None], corners[sides][:, AROUND[corners.shape[1]]]])
 

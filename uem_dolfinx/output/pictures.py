@@ -18,8 +18,20 @@ from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output.drawings import Drawing
 from uem_dolfinx.output.frames import gather_contactors
-from uem_dolfinx.parallel import agree, agreed
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
+
+
+def new_canvas(what: str, size: tuple[float, float]) -> Any:
+    """Figure of this size in inches, without a window; a MissingBackendError that names ``what`` if matplotlib cannot be imported."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as missing:
+        raise MissingBackendError(f"{what} needs matplotlib ({missing}): install it, or leave it out") from missing
+    canvas = Figure(figsize=size, constrained_layout=True)
+    FigureCanvasAgg(canvas)
+    return canvas
 
 
 @contextmanager
@@ -42,21 +54,13 @@ def figure(
         OutputError: if the picture cannot be written.
         Exception: what rank 0 raises in drawing, on all ranks.
     """
-    if path is None or comm.rank != 0:
-        agree(comm, None)
-        with agreed(comm):
-            yield [None] * panels
-        return
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as missing:
-        agree(comm, MissingBackendError(f"the picture {path} needs matplotlib ({missing}): install it, or leave the picture out"))
-        raise
-    agree(comm, None)
     with agreed(comm):
-        canvas = Figure(figsize=(panels * size[0], size[1]), constrained_layout=True)
-        FigureCanvasAgg(canvas)
+        drawn = path is not None and comm.rank == 0
+        canvas = new_canvas(f"the picture {path}", (panels * size[0], size[1])) if drawn else None
+    with agreed(comm):
+        if path is None or canvas is None:
+            yield [None] * panels
+            return
         yield list(np.atleast_1d(canvas.subplots(1, panels)))
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
