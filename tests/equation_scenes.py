@@ -10,7 +10,7 @@ from dolfinx import fem
 from helpers import blocks, linear
 from petsc4py import PETSc
 
-from uem_dolfinx import forms
+from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
@@ -183,3 +183,25 @@ CASES = {
     "chain to a rigid surface 3D": lambda: rigid_chain_case("tetrahedron"),
     "no equation": lambda: Case("triangle", [], [(0, 0, 0.1), (0, 1, 0.0), (3, 1, -0.2)]),
 }
+
+
+def triangles(n, away=0.0):
+    """Configuration of so many bodies of one triangle with legs of length 1, far away on the x axis, on this rank alone."""
+    x = np.concatenate([np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) + [away, 2.0 * i] for i in range(n)])
+    mesh = compat.create_mesh(MPI.COMM_SELF, np.arange(3 * n).reshape(n, 3), x, "triangle", 1)
+    return Configuration(fem.Function(compat.function_space(mesh, 1, (2,))))
+
+
+def united(config, rows, fixed=(), coefficient=1.0):
+    """Restriction of equations ``(node, direction, node followed)`` of global nodes, with ``fixed`` local components."""
+    first, g = config.index_map.local_range[0], config.gdim
+    mine = [row for row in rows if first <= row[0] < first + config.n_owned]
+    d = np.array([row[1] for row in mine], dtype=float).reshape(-1, g)
+    equations = UnitingEquations(
+        np.array([row[0] - first for row in mine], np.int32), d, np.zeros(len(mine)), np.ones(len(mine), bool),
+        np.arange(len(mine)), np.array([row[2] for row in mine], np.int64), coefficient * d,
+    )  # fmt: skip
+    free = np.ones((config.n_owned, g), bool)
+    for node, component in fixed:
+        free[node, component] = False
+    return Restriction(config, equations, free, np.zeros(free.shape))

@@ -152,6 +152,11 @@ class PushedSystem(ABC):
         return self.forces.linear
 
     @property
+    def curved(self) -> bool:
+        """Who is pushed, and where to, changes with the displacement."""
+        return True
+
+    @property
     def in_contact(self) -> bool:
         """Whether there are contacts at all."""
         return bool(self.pairs)

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
+from equation_scenes import triangles, united
 from helpers import blocks, gathered_matrix, gathered_vector
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 from uem_dolfinx.algebra import options
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver, is_symmetric
 from uem_dolfinx.algebra.options import FEW_ITERATIONS, default_options, has_hypre, has_mumps
-from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
 
 ITERATIVE = {"ksp_type": "cg", "pc_type": "jacobi"}
-
-
-def triangles(n, away=0.0):
-    """Configuration of so many bodies of one triangle with legs of length 1, far away on the x axis, on this rank alone."""
-    x = np.concatenate([np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) + [away, 2.0 * i] for i in range(n)])
-    mesh = compat.create_mesh(MPI.COMM_SELF, np.arange(3 * n).reshape(n, 3), x, "triangle", 1)
-    return Configuration(fem.Function(compat.function_space(mesh, 1, (2,))))
 
 
 def mass(config):
@@ -35,21 +25,6 @@ def mass(config):
     K = forms.create_matrix(a)
     forms.assemble_matrix(K, a)
     return K
-
-
-def united(config, rows, fixed=(), coefficient=1.0):
-    """Restriction of equations ``(node, direction, node followed)`` of global nodes, with ``fixed`` local components."""
-    first, g = config.index_map.local_range[0], config.gdim
-    mine = [row for row in rows if first <= row[0] < first + config.n_owned]
-    d = np.array([row[1] for row in mine], dtype=float).reshape(-1, g)
-    equations = UnitingEquations(
-        np.array([row[0] - first for row in mine], np.int32), d, np.zeros(len(mine)), np.ones(len(mine), bool),
-        np.arange(len(mine)), np.array([row[2] for row in mine], np.int64), coefficient * d,
-    )  # fmt: skip
-    free = np.ones((config.n_owned, g), bool)
-    for node, component in fixed:
-        free[node, component] = False
-    return Restriction(config, equations, free, np.zeros(free.shape))
 
 
 @pytest.mark.parametrize("part, enough", [(3e-7, False), (3e-6, True)])

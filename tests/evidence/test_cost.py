@@ -88,7 +88,7 @@ def test_solves_are_as_accurate_as_they_need_be(law):
 
 
 def test_preconditioner_is_kept():
-    """It is made for the first active set that is nearly right, and kept; a factorisation is not."""
+    """It is made for the first active set that is nearly right, and kept; so is a factorisation while bodies are hardly strained."""
     s, contact, problem = sunk(st_venant, CG)
     with counted() as calls:
         history = problem.solve()
@@ -96,7 +96,7 @@ def test_preconditioner_is_kept():
     s, contact, problem = sunk(st_venant)
     with counted() as calls:
         history = problem.solve()
-    assert calls[FACTORISATION] == len(history) - 1 + sum(i.exchanges for i in history)
+    assert 1 <= calls[FACTORISATION] < len(history) - 1
     # who touches first is told by how the bodies would move rigidly
     assert history[0].exchanges == 0 and history[0].active > 0
 

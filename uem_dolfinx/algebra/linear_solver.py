@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard, without
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.options import OFTEN_USED, check_options, default_options
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
@@ -43,6 +44,8 @@ KEPT_SLOWER = 2.0
 SYMMETRIC = 1e-11
 #: Types of PC that cannot see contactors much stiffer than their targets.
 MULTIGRID = ("hypre", "gamg", "ml")
+#: Types of PC that solve exactly.
+FACTORISATIONS = ("cholesky", "lu")
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)
 
@@ -77,6 +80,11 @@ class UnitedSolver:
         #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
         self._united, self._unsymmetric = (UnitedMatrix(config, not self.iterative) for _ in range(2))
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
+        #: The last factorisation, and the united matrix that it serves to solve with, if it does.
+        self._kept = KeptFactor(config)
+        self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
+        #: P and K of the present united matrix, if it is symmetric and factorised.
+        self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
         #: Iterations per digit that the preconditioner took at first and takes now.
         self._first_pace = self._pace = 0.0
         #: Whether Q is not P, and whether a step begins.
@@ -111,7 +119,8 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self.A = self._crossed = None
+        self.A = self._crossed = self._served = self._factor_of = None
+        self._kept.drop()
         self.ksp.destroy()
         self._use(self._first)
         self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
@@ -119,6 +128,7 @@ class UnitedSolver:
     def begin_step(self) -> None:
         """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
         self._begins = True
+        self._kept.drop()
         self._united.begin_step()
         self._unsymmetric.begin_step()
 
@@ -159,6 +169,11 @@ class UnitedSolver:
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
+        self._served = (restriction, K, curvature) if not self._apart and self._kept.serves(restriction, K) else None
+        if self._served is not None:
+            return
+        self._factor_of = None
+        self._kept.drop()
         if self._apart:
             if self._instead and self.iterative:
                 # it tells the sign of the determinant as well
@@ -193,6 +208,8 @@ class UnitedSolver:
         self.pc.setOperators(self.A)
         self._deflate(restriction, K)
         self.ksp.setOperators(self.A)
+        if symmetric and not self.iterative and self.pc.getType() in FACTORISATIONS:
+            self._factor_of = restriction, K
 
     def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
         """Put multigrid into a deflation where contactors are much stiffer than what they press on (collective)."""
@@ -287,6 +304,7 @@ class UnitedSolver:
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
+        self._kept.drop()
         self.set_operator(restriction, K, curvature)
         with self._in_database(mat_mumps_icntl_33=1):
             self.ksp.setUp()
@@ -297,6 +315,11 @@ class UnitedSolver:
         """Whether solves are as accurate as asked, and no more."""
         return self.iterative and not self._fixed_accuracy
 
+    @property
+    def exact(self) -> bool:
+        """Whether solves with the present matrix leave no more than rounding."""
+        return not self.iterative and self._served is None
+
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and the number of linear iterations (collective).
 
@@ -306,6 +329,12 @@ class UnitedSolver:
         Raises:
             LinearSolveError: with PETSc's reason.
         """
+        if self._served is not None:
+            found = self._kept.solve(*self._served, rhs, accuracy)
+            if found is not None:
+                return found
+            self._kept.drop()
+            self.set_operator(*self._served)
         dq = rhs.duplicate()
         # a factorisation has no use for a guess
         near = near if self.iterative else None
@@ -349,6 +378,8 @@ class UnitedSolver:
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
         self._keep_pace(iterations)
+        if self._factor_of is not None:
+            self._kept.keep(self.pc, *self._factor_of)
         return dq, iterations
 
     def _keep_pace(self, iterations: int) -> None:

@@ -127,6 +127,10 @@ class UnitedSystem(Protocol):
         """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
 
     @property
+    def curved(self) -> bool:
+        """Whether the united tangent changes with the displacement, so that Newton's method leaves something at best."""
+
+    @property
     def in_contact(self) -> bool:
         """Whether there are contacts at all."""
 
@@ -249,7 +253,14 @@ def solve_united(
             break
         system.differentiate(first=k == 0)
         passing = not system.linear or state.changed or (k == 0 and system.in_contact)
-        step = _solve_linearised(system, state, rtol * forces, passing)
+        if system.inexact:
+            wanted, left_anyway = rtol * forces, ACCURACY_ON_THE_WAY if passing else 0.0
+        elif system.curved:
+            # no solve makes the next residual smaller than about the square of this one
+            wanted, left_anyway = rtol * forces, _ratio(norm, forces) if k > 0 else ACCURACY_ON_THE_WAY
+        else:
+            wanted = left_anyway = 0.0
+        step = _solve_linearised(system, state, wanted, left_anyway)
         residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
         changed = state.changed or step.exchanges > 0
         history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
@@ -302,21 +313,21 @@ class _Step:
     exchanges: int
 
 
-def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float, passing: bool) -> _Step:
+def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float) -> _Step:
     """Solve the linearised problem together with the conditions of contact; nothing moves.
 
     Args:
         system: the problem.
         state: to begin with.
-        wanted: norm of the residual that convergence asks for.
-        passing: whether another iteration follows in any case.
+        wanted: norm of the residual that convergence asks for; zero if the solution may be exact at no price.
+        left_anyway: part of the right-hand side that another iteration, which follows in any case, finds even after an exact solve.
     """
     iterations, du = 0, None
     for exchanges in range(MOST_EXCHANGES + 1):
         rhs = system.linearise(state)
         driving = rhs.norm()
         needed = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
-        needed = min(max(needed, ACCURACY_ON_THE_WAY if passing else 0.0), ACCURACY_AT_THE_END)
+        needed = min(max(needed, left_anyway), ACCURACY_AT_THE_END)
         # who is wrong by far is told long before the solution is accurate
         first = ACCURACY_OF_EXCHANGES if system.inexact and system.in_contact else needed
         near = None if du is None else state.trial.reduce(du)

@@ -195,12 +195,13 @@ class BodySystem:
         contested = self.meetings.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
         self._apart = apart is not None or rows.test is not rows.upright
+        trial = rows.upright
+        if apart is not None:
+            trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)
         added, held = slip_terms(self.pairs, self.forces.vector())
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
-            trial=rows.upright
-            if apart is None
-            else self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)[0],
+            trial=trial,
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
@@ -225,27 +226,20 @@ class BodySystem:
         if not self.pairs:
             return None
         assert isinstance(state, BodyState)
-        config, rows = self.config, state.rows
+        rows = state.rows
         with timed("uniting equations"):
-            F = self.forces.tangent.K * du
-            for more in (self._curvature, state.added):
-                if more is not None:
-                    F.axpy(1.0, more * du)
-            F.axpy(1.0, self.forces.residual)
-            if state.held is not None:
-                F.axpy(1.0, state.held)
-            increment = du.array_r.reshape(-1, config.gdim)
+            F = self._foreseen_forces(state, du)
+            increment = du.array_r.reshape(-1, self.config.gdim)
             forces = self._read_forces(rows, rows.test.pass_on(F), increment)
-            left = accuracy if self.solver.iterative else 0.0
+            left = 0.0 if self.solver.exact else accuracy
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
             foreseen = [pair.foreseen(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
             wrong = []
             for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
-                along = self._along(pair)
-                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept, moved))
+                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * self._along(pair), left * driving))
+                wrong.append(pair.wrong(gap, lam, self._along(pair), least, near, self._swept, moved))
             count = self._count(wrong)
             if not count and sliding is not None:
                 raise FrictionError(
@@ -264,6 +258,17 @@ class BodySystem:
             self._adrift = self.floating.adrift
             residual = rows.test.transpose(self.forces.residual)
         return self._state(rows, residual, state.rounding, state.changed, False)
+
+    def _foreseen_forces(self, state: BodyState, du: PETSc.Vec) -> PETSc.Vec:
+        """``F + K du`` with what contact and friction add (collective)."""
+        F = self.forces.tangent.K * du
+        for more in (self._curvature, state.added):
+            if more is not None:
+                F.axpy(1.0, more * du)
+        F.axpy(1.0, self.forces.residual)
+        if state.held is not None:
+            F.axpy(1.0, state.held)
+        return F
 
     def _sliding(self, F: PETSc.Vec, forces: list[tuple[Array, Array, Array]]) -> Array | None:
         """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
@@ -371,22 +376,13 @@ class BodySystem:
         curvature = together(self._curvature, state.added)
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
-        active = zlib.crc32(P.equations.active.tobytes())
-        made_of = self.comm.allgather((self.forces.tangent.number, exact, P.fingerprint(values=False), active))
+        parts = self.forces.tangent.number, exact, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
+        made_of = self.comm.allgather(parts)
         moving = (curvature is not None or Q is not P) and self.newton == "full"
         if moving or made_of != self._factored:
             self.solver.set_operator(P, K, curvature, Q)
         self._factored = made_of
-        c = P.c
-        load = K * c
-        if curvature is not None:
-            load.axpy(1.0, curvature * c)
-        load.axpy(1.0, self.forces.residual)
-        if state.held is not None:
-            load.axpy(1.0, state.held)
-        rhs = Q.transpose(load)
-        rhs.scale(-1.0)
-        return rhs
+        return -Q.transpose(self._foreseen_forces(state, P.c))
 
     def curvature(self) -> PETSc.Mat | None:
         """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
@@ -437,6 +433,11 @@ class BodySystem:
     def linear(self) -> bool:
         """Whether the bodies' forces are linear in the displacement."""
         return self.forces.linear
+
+    @property
+    def curved(self) -> bool:
+        """Whether the united tangent changes with the displacement, so that Newton's method leaves something at best."""
+        return not self.linear or self._curvature is not None
 
     @property
     def rough(self) -> bool:

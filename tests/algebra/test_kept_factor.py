@@ -1,0 +1,138 @@
+"""Where contact slides between linear bodies, one factorisation serves all Newton iterations of a step."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from counting import FACTORISATION, PRODUCT, counted
+from dolfinx import fem
+from equation_scenes import triangles, united
+from helpers import at, box, clamp, linear, modulus, scene, st_venant
+from petsc4py import PETSc
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.algebra import kept_factor
+from uem_dolfinx.algebra.kept_factor import KeptFactor
+
+COMM, COMM_SELF = MPI.COMM_WORLD, MPI.COMM_SELF
+#: A direct solver by name, for any size and dimension.
+DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+
+
+def pressed(law=linear, ratio=1.0, way=0.02, dim=2, friction=0.0, options=DIRECT):
+    """A block with a round bottom, pressed into a wider one and pushed aside."""
+    side, n = dim - 1, (16, 12) if dim == 2 else (6, 5)
+    cell = "triangle" if dim == 2 else "tetrahedron"
+    low = box(cell, [-0.5] * side + [-1.0], [1.5] * side + [0.0], [n[0]] * side + [8 // side])
+    high = box(cell, [0.0] * dim, [1.0] * dim, [n[1]] * side + [6 // side])
+
+    def pose(x):
+        y = x.copy()
+        bent = np.arange(len(x)) >= len(low.x)
+        y[bent, side] += 0.2 * (1 - x[bent, side]) * ((x[bent, :side] - 0.5) ** 2).sum(axis=1)
+        return y
+
+    s = scene(COMM, cell, [low, high], pose=pose)
+    V = compat.function_space(s.mesh, 1, (dim,))
+    u = fem.Function(V)
+    push = [way / 2, *[0.0] * (dim - 2), -way]
+    bcs = [*clamp(V, s.tag("bottom", 0, at(side, -1.0))), *clamp(V, s.tag("top", 1, at(side, 1.0)), value=push)]
+    contact = uem.Contact(s.tag("high", 1, at(side, 0.0)), s.tag("low", 0, at(side, 0.0)), sliding="finite", friction=friction)
+    problem = uem.UnitedProblem(law(u, modulus(s, 1.0, ratio)), u, bcs=bcs, contacts=[contact], petsc_options=options)
+    return s, contact, problem
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_one_factorisation_serves_all_iterations(dim, monkeypatch):
+    """The state is that of factorisations in every iteration, to the tolerance; active contactors are the same."""
+    s, contact, problem = pressed(dim=dim)
+    with counted() as calls:
+        history = problem.solve()
+    assert len(history) > 3 and contact.n_active > 2
+    assert sum(i.exchanges for i in history) <= 1 and calls[FACTORISATION] == calls[PRODUCT] == 1
+    assert sum(i.linear_iterations for i in history) > len(history) - 1
+    monkeypatch.setattr(kept_factor, "FEW_CHANGES", -1)
+    t, other, again = pressed(dim=dim)
+    with counted() as calls:
+        iterations = again.solve()
+    assert calls[FACTORISATION] == len(iterations) - 1 + sum(i.exchanges for i in iterations)
+    u, v = s.gather(problem.u), t.gather(again.u)
+    assert np.abs(u - v).max() <= 1e-8 * np.abs(v).max()
+    assert np.array_equal(s.gather(contact.active), t.gather(other.active))
+    assert np.abs(contact.resultant().force - other.resultant().force).max() <= 1e-7 * np.abs(other.resultant().force).max()
+
+
+def test_every_step_factorises_once():
+    """No step depends on the ones before it."""
+    _, _, problem = pressed(way=0.01)
+    problem.solve()
+    with counted() as calls:
+        again = problem.solve()
+    assert len(again) == 1 and calls[FACTORISATION] == 0
+    with counted() as calls:
+        back = problem.solve(start=np.zeros_like(problem.u.x.array), fraction=0.98)
+    assert len(back) > 2 and not any(i.exchanges for i in back) and calls[FACTORISATION] == 1
+
+
+def test_friction_is_factorised():
+    """The matrix of contactors that slip tells the sign of its determinant."""
+    _, _, problem = pressed(friction=0.1)
+    with counted() as calls:
+        history = problem.solve()
+    assert calls[FACTORISATION] >= len(history) - 1
+
+
+def test_strained_bodies():
+    """One that is strained by a little keeps its factorisation, one that is strained by more and more does not."""
+    counts = []
+    for way in (0.001, 0.2):
+        _, _, problem = pressed(law=st_venant, way=way)
+        with counted() as calls:
+            history = problem.solve()
+        counts.append((calls[FACTORISATION], len(history) - 1))
+    (few, iterations), (many, _) = counts
+    assert few == 1 < iterations and many > 2
+
+
+def identity(n):
+    """Configuration of some triangles on this rank alone, and a unit matrix with what solves with it."""
+    config = triangles(n)
+    K = PETSc.Mat().createAIJ(2 * config.n_owned, nnz=1, comm=COMM_SELF)
+    K.setDiagonal(K.createVecLeft().duplicate())
+    K.shift(1.0)
+    pc = PETSc.PC().create(COMM_SELF)
+    pc.setType("none")
+    pc.setOperators(K)
+    return config, K, pc
+
+
+@pytest.mark.parametrize("changed, serves", [(0, True), (4, True), (5, False)])
+def test_a_factor_serves_few_changes(changed, serves):
+    """Of what is used; and none of K's values."""
+    config, K, pc = identity(4)
+    kept = KeptFactor(config)
+    kept.keep(pc, united(config, []), K)
+    now = united(config, [], fixed=[(node, 0) for node in range(changed)])
+    assert kept.serves(now, K) == serves
+    K.shift(1.0)
+    assert not kept.serves(now, K)
+
+
+@pytest.mark.parametrize("values, solves", [(1, 1), (6, 6), (12, None)])
+def test_a_factor_that_does_not_serve(values, solves):
+    """A Krylov method takes as many solves as there are different eigenvalues; too many are no gain."""
+    config, K, pc = identity(8)
+    kept = KeptFactor(config)
+    kept.keep(pc, united(config, []), K)
+    diagonal = K.getDiagonal()
+    diagonal.array[:] = 1.0 + np.arange(len(diagonal.array)) % values
+    K.setDiagonal(diagonal)
+    rhs = diagonal.duplicate()
+    rhs.set(1.0)
+    found = kept.solve(united(config, []), K, None, rhs, 1e-10)
+    assert (None if found is None else found[1]) == solves
+    if found is not None:
+        assert np.abs(found[0].array * diagonal.array - 1.0).max() < 1e-9
