@@ -152,7 +152,7 @@ class PushedSystem(ABC):
         return self.forces.linear
 
     @property
-    def curved(self) -> bool:
+    def tolerant(self) -> bool:
         """Who is pushed, and where to, changes with the displacement."""
         return True
 

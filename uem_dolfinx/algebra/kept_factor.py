@@ -26,9 +26,6 @@ FEW_CHANGES = 4
 #: A factorisation serves for bodies whose stiffness has changed by no more than this part anywhere.
 #: [convention; diagonal of K; test_kept_factor.py::test_a_factor_serves_few_changes]
 ALIKE = 0.02
-#: Solves leave this part of their right-hand side where they are to be exact: what is below is rounding.
-#: [heuristic; right-hand side; -]
-EXACT = 1e-13
 #: Solves leave no more than this part of their right-hand side, however little is asked for: another digit is cheap.
 #: [heuristic; right-hand side; -]
 LEAST_ACCURATE = 1e-3
@@ -76,7 +73,7 @@ class KeptFactor:
         ksp.setOperators(A)
         ksp.setType("fgmres")
         ksp.setGMRESRestart(MOST_SOLVES)
-        ksp.setTolerances(rtol=min(max(accuracy, EXACT), LEAST_ACCURATE), max_it=MOST_SOLVES)
+        ksp.setTolerances(rtol=min(accuracy, LEAST_ACCURATE), max_it=MOST_SOLVES)
         pc = ksp.getPC()
         pc.setType("python")
         pc.setPythonContext(_Solves(self._pc, ~P.used.ravel()))

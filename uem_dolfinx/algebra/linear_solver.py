@@ -330,7 +330,7 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         if self._served is not None:
-            found = self._kept.solve(*self._served, rhs, accuracy)
+            found = self._kept.solve(*self._served, rhs, accuracy) if accuracy > 0 else None
             if found is not None:
                 return found
             self._kept.drop()

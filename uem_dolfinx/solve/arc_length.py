@@ -111,11 +111,19 @@ class ArcLength:
         """The load increment is as accurate as the unknowns: there are no loose solves."""
         return False
 
+    @property
+    def tolerant(self) -> bool:
+        """The load increment changes with the tangent."""
+        return True
+
     def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns with the load increment that takes them to the plane, which ``rhs`` gets, too."""
         system, state = self._system, self._state
         load = state.test.transpose(self._slope)
         load.scale(-1.0)
+        if not system.inexact:
+            # near limit points little is left by solutions that are far off
+            accuracy = 0.0
         dq, iterations = system.solve(rhs, accuracy)
         by_load, more = system.solve(load, accuracy)
         still = rhs.duplicate()

@@ -33,6 +33,9 @@ ACCURACY_ON_THE_WAY = 1e-4
 #: One that asks which contactors are wrong leaves this part of its right-hand side, and goes on where it sees none.
 #: [heuristic; right-hand side; -]
 ACCURACY_OF_EXCHANGES = 1e-3
+#: Newton's method leaves this part of the residual times the relative residual; where bodies are linear, and iterations cheap, up to all.
+#: [heuristic; relative residual; -]
+NEWTON_LEAVES = 1e-2
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 #: [heuristic; right-hand side; -]
 ACCURACY_AT_THE_END = 0.1
@@ -127,8 +130,8 @@ class UnitedSystem(Protocol):
         """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
 
     @property
-    def curved(self) -> bool:
-        """Whether the united tangent changes with the displacement, so that Newton's method leaves something at best."""
+    def tolerant(self) -> bool:
+        """Whether an iteration follows that makes up for what a solve leaves, so that none need be exact."""
 
     @property
     def in_contact(self) -> bool:
@@ -255,9 +258,9 @@ def solve_united(
         passing = not system.linear or state.changed or (k == 0 and system.in_contact)
         if system.inexact:
             wanted, left_anyway = rtol * forces, ACCURACY_ON_THE_WAY if passing else 0.0
-        elif system.curved:
-            # no solve makes the next residual smaller than about the square of this one
-            wanted, left_anyway = rtol * forces, _ratio(norm, forces) if k > 0 else ACCURACY_ON_THE_WAY
+        elif system.tolerant:
+            newton = _ratio(norm, forces) * (1.0 if system.linear else NEWTON_LEAVES)
+            wanted, left_anyway = rtol * forces, newton if k > 0 else ACCURACY_ON_THE_WAY
         else:
             wanted = left_anyway = 0.0
         step = _solve_linearised(system, state, wanted, left_anyway)

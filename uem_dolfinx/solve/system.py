@@ -435,8 +435,8 @@ class BodySystem:
         return self.forces.linear
 
     @property
-    def curved(self) -> bool:
-        """Whether the united tangent changes with the displacement, so that Newton's method leaves something at best."""
+    def tolerant(self) -> bool:
+        """Whether the united tangent changes with the displacement, so that an iteration follows in any case."""
         return not self.linear or self._curvature is not None
 
     @property
