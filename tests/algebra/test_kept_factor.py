@@ -109,16 +109,19 @@ def identity(n):
     return config, K, pc
 
 
-@pytest.mark.parametrize("changed, serves", [(0, True), (4, True), (5, False)])
-def test_a_factor_serves_few_changes(changed, serves):
-    """Of what is used; and none of K's values."""
-    config, K, pc = identity(4)
+@pytest.mark.parametrize(
+    "changed, stiffer, serves",
+    [(0, 0.0, True), (4, 0.0, True), (5, 0.0, False), (40, 0.0, False), (0, 0.01, True), (0, 0.1, False)],
+)
+def test_a_factor_serves_few_changes(changed, stiffer, serves):
+    """Of what is used, and of the bodies' stiffness."""
+    config, K, pc = identity(16)
     kept = KeptFactor(config)
     kept.keep(pc, united(config, []), K)
-    now = united(config, [], fixed=[(node, 0) for node in range(changed)])
-    assert kept.serves(now, K) == serves
-    K.shift(1.0)
-    assert not kept.serves(now, K)
+    K.shift(stiffer)
+    assert kept.serves(united(config, [], fixed=[(node, 0) for node in range(changed)]), K) == serves
+    kept.drop()
+    assert not kept.serves(united(config, []), K)
 
 
 @pytest.mark.parametrize("values, solves", [(1, 1), (6, 6), (12, None)])

@@ -21,7 +21,7 @@ from uem_dolfinx.log import timed
 #: [convention; solves; test_kept_factor.py::test_a_factor_that_does_not_serve]
 MOST_SOLVES = 8
 #: Solves with a factorisation in which so many unknowns more, or fewer, are used than in the matrix it serves take some more.
-#: [convention; unknowns; test_kept_factor.py::test_a_factor_that_does_not_serve]
+#: [convention; unknowns; test_kept_factor.py::test_a_factor_serves_few_changes]
 FEW_CHANGES = 4
 #: A factorisation serves for bodies whose stiffness has changed by no more than this part anywhere.
 #: [convention; diagonal of K; test_kept_factor.py::test_a_factor_serves_few_changes]

@@ -322,8 +322,8 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
     Args:
         system: the problem.
         state: to begin with.
-        wanted: norm of the residual that convergence asks for; zero if the solution may be exact at no price.
-        left_anyway: part of the right-hand side that another iteration, which follows in any case, finds even after an exact solve.
+        wanted: norm of the residual that convergence asks for; zero where solves are to be exact.
+        left_anyway: part of the right-hand side that solves may leave, since another iteration follows in any case.
     """
     iterations, du = 0, None
     for exchanges in range(MOST_EXCHANGES + 1):
