@@ -153,8 +153,8 @@ class PushedSystem(ABC):
 
     @property
     def tolerant(self) -> bool:
-        """Who is pushed, and where to, changes with the displacement."""
-        return True
+        """Who is pushed changes with the displacement: solutions are exact."""
+        return False
 
     @property
     def in_contact(self) -> bool:

@@ -82,8 +82,10 @@ class KeptFactor:
         with timed("linear solve"):
             ksp.solve(rhs, dq)
         found = (dq, int(ksp.getIterationNumber())) if ksp.getConvergedReason() > 0 else None
-        for made in (ksp, A):
-            made.destroy()
+        # P would live on with them
+        ksp.reset()
+        ksp.destroy()
+        A.destroy()
         return found
 
 
