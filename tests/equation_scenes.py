@@ -168,6 +168,18 @@ def rigid_chain_case(cell):
     return Case(cell, rows)
 
 
+def circle_case(cell):
+    """Contactors that follow each other in circles, by small parts, and their targets by large ones; one has two equations."""
+    x = blocks(MPI.COMM_SELF, cell, 2, 2, gap=0.5).scene.drawing
+    g = x.shape[1]
+    upper = np.flatnonzero(np.abs(x[:, -1] - 0.5) < 1e-9)[:3]
+    lower = np.flatnonzero(np.abs(x[:, -1]) < 1e-9)[:2]
+    rng = np.random.default_rng(6)
+    rows = [(i, rng.normal(size=g), [*upper[upper != i], *lower], [0.02, -0.01, 0.3, 0.69], 0.02) for i in upper]
+    rows.append((upper[1], rng.normal(size=g), [upper[0], lower[1]], [0.03, 0.97], -0.01))
+    return Case(cell, rows, [(lower[0], 0, 0.04)])
+
+
 CASES = {
     "triangles": lambda: flat_case("triangle"),
     "quadrilaterals": lambda: flat_case("quadrilateral"),
@@ -181,6 +193,8 @@ CASES = {
     "chain 3D": lambda: chain_case("hexahedron"),
     "chain to a rigid surface 2D": lambda: rigid_chain_case("quadrilateral"),
     "chain to a rigid surface 3D": lambda: rigid_chain_case("tetrahedron"),
+    "chain in a circle 2D": lambda: circle_case("triangle"),
+    "chain in a circle 3D": lambda: circle_case("hexahedron"),
     "no equation": lambda: Case("triangle", [], [(0, 0, 0.1), (0, 1, 0.0), (3, 1, -0.2)]),
 }
 

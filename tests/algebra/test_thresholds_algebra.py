@@ -1,4 +1,4 @@
-"""Thresholds of the algebra from both sides, and chains of equations, which have none: long ones end, circles never do."""
+"""Thresholds of the algebra from both sides, and chains of equations, which have none: long ones end, full circles never do."""
 
 from __future__ import annotations
 
@@ -42,11 +42,8 @@ def test_what_a_condition_leaves_of_a_normal(part, enough):
 def test_coefficients_that_are_rounding(size, rounding):
     """They neither close a circle of equations nor make a new P."""
     circle = [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)]
-    if rounding:
-        assert united(triangles(2), circle, coefficient=size).chain == 1
-    else:
-        with pytest.raises(uem.ConflictError, match="follows itself"):
-            united(triangles(2), circle, coefficient=size)
+    r = united(triangles(2), circle, coefficient=size)
+    assert r.chain == (1 if rounding else 2) and r.circular != rounding
     prints = {united(triangles(2), circle[:1], coefficient=c).fingerprint(values=True) for c in (0.5, 0.5 + size)}
     assert len(prints) == (1 if rounding else 2)
 
@@ -68,6 +65,26 @@ def test_chains_of_any_length(comm, length):
     assert np.abs(gathered_matrix(r.P) @ gathered_vector(q) - moved.ravel()).max() < 1e-15
     with pytest.raises(uem.ConflictError, match="follows itself"):
         united(config, [*rows, (order[-1], [0.0, 1.0], order[0])])
+
+
+@pytest.mark.parametrize("part, length", [(5e-9, 2), (0.1, 16), (0.32, 32), (0.33, None), (0.5, None), (1.0, None)])
+def test_circles_that_fade(comm, part, length):
+    """Equations that follow each other in a circle by a part each: du = part du + the rest, unless what comes round stays."""
+    config = Configuration(blocks(comm, "triangle", 2, 2, gap=0.5).u)
+    circle = [(0, [0.0, 1.0], 3), (3, [0.6, 0.8], 5), (5, [0.0, 1.0], 0)]
+    if length is None:
+        with pytest.raises(uem.ConflictError, match="follows itself"):
+            united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part)
+        return
+    assert united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part).chain == length
+    r = united(config, circle, coefficient=part)
+    q = r.P.createVecRight()
+    q.array[:] = np.sin(1.0 + np.arange(q.local_size) + q.owner_range[0])
+    moved = r.expand(q)
+    assert ((r.P * q) - moved).norm() <= 1e-15 * moved.norm()
+    du = gathered_vector(moved).reshape(-1, 2)
+    for node, direction, followed in circle:
+        assert np.dot(direction, du[node] - part * du[followed]) == pytest.approx(0.0, abs=4e-16)
 
 
 # -- linear solver ---------------------------------------------------------------------------------------------------------

@@ -10,7 +10,8 @@ Every equation eliminates one component of a node in a frame rotated to its dire
     du = T dq + M du + d    so    P = (1 + M + M^2 + ...) T,    c = (1 + M + M^2 + ...) d
 
 T rotates each node's free components, M lets an eliminated component follow other nodes, d closes gaps and carries prescribed
-increments. The powers of M end after as many terms as bodies are stacked upon each other.
+increments. The powers of M end after as many terms as bodies are stacked upon each other. Where equations follow each other in
+circles, by a small part each, they fade, and end where they are rounding.
 """
 
 from __future__ import annotations
@@ -30,6 +31,13 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
 
+#: Equations may follow each other in circles if what has gone through so many of them is rounding.
+#: [convention; number of equations; test_thresholds_algebra.py::test_circles_that_fade]
+MOST_ROUND = 32
+#: Parts of a unit displacement below it are rounding.
+#: [derived; directions of length one; test_thresholds_algebra.py::test_circles_that_fade]
+FADED = np.finfo(float).eps
+
 
 class Restriction:
     """P and c of one set of uniting equations.
@@ -43,7 +51,7 @@ class Restriction:
         like: restriction of the same equations in other directions, whose components are eliminated and whose unknowns kept.
 
     Raises:
-        ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle.
+        ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle that does not fade.
     """
 
     def __init__(
@@ -74,7 +82,8 @@ class Restriction:
         self.d = self.vector(closure)
         #: Rows of the eliminated nodes, columns of the nodes they follow.
         self.M: Any = self._matrix(*self._coupling_entries(equations.active)) if self._n_rows else None
-        #: Number of terms with M in the series of P and c.
+        #: Whether equations follow each other in circles, and the number of terms with M in the series of P and c.
+        self.circular = False
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
     def vector(self, values: Array) -> PETSc.Vec:
@@ -143,39 +152,59 @@ class Restriction:
         return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
 
     def _longest_chain(self) -> int:
-        """How many equations follow one another from node to node (collective); raises ConflictError if they never end.
+        """How many equations follow one another from node to node, till they end or what is left is rounding (collective).
 
         An equation follows another if its terms have a part in what the other eliminates of a node; what that leaves free ends a chain.
+
+        Raises:
+            ConflictError: if they neither end nor fade.
         """
-        g, eq, comm = self.config.gdim, self.equations, self.comm
+        g, eq = self.config.gdim, self.equations
         m, k = len(eq), np.arange(g)
-        counts = np.array(comm.allgather(m))
-        first, sizes = int(counts[: comm.rank].sum()), (m, int(counts.sum()))
+        counts = np.array(self.comm.allgather(m))
+        first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
         terms = np.broadcast_to(eq.row[:, None], eq.coefficients.shape), eq.followed[:, None] * g + k, eq.coefficients
         own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift
         C = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in terms)), (sizes, self._sizes[1]))
         L = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in own)), (self._sizes[0], sizes))
         path = C.matMult(L)
         indptr, columns, values = path.getValuesCSR()
-        path.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
-        path.assemble()
+        follows = path.duplicate()
+        for matrix, entries in ((path, np.abs(values)), (follows, (np.abs(values) > NEGLIGIBLE).astype(float))):
+            matrix.setValuesCSR(indptr, columns, entries)
+            matrix.assemble()
         at = path.createVecRight()
         at.set(1.0)
         length, left, before = 0, at.sum(), np.inf
         # equations from which a path of so many leads; if none of them drops out, it has no end
         while 0.0 < left < before:
-            at, length, before = path * at, length + 1, left
+            at, length, before = follows * at, length + 1, left
             at.array[:] = at.array_r > 0
             left = at.sum()
-        rows = np.flatnonzero(at.array_r)
-        error = None
+        if left > 0.0:
+            self.circular, length = True, self._fading(path)
+        return length
+
+    def _fading(self, path: PETSc.Mat) -> int:
+        """How many equations of circles follow one another till what is left of a unit displacement is rounding (collective).
+
+        Args:
+            path: parts by which equations follow each other, positive ``(m, m)``.
+        """
+        at = path.createVecRight()
+        at.set(1.0)
+        for length in range(1, MOST_ROUND + 1):
+            at = path * at
+            if at.norm(PETSc.NormType.INFINITY) <= FADED:
+                return length
+        rows, error = np.flatnonzero(at.array_r > FADED), None
         if len(rows):
             error = ConflictError(
-                f"the contactor at {self.config.describe(int(eq.node[rows[0]]))} follows itself through its targets: "
+                f"the contactor at {self.config.describe(int(self.equations.node[rows[0]]))} follows itself through its targets: "
                 "two surfaces are contactor and target of each other; drop one of the two contacts"
             )
-        agree(comm, error)
-        return length
+        agree(self.comm, error)
+        return MOST_ROUND
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
@@ -197,6 +226,15 @@ class Restriction:
             if reach > self.chain:
                 return P
             power = power.matMult(power)
+            if self.circular:
+                power = self._faded(power)
+
+    def _faded(self, power: PETSc.Mat) -> PETSc.Mat:
+        """A power of M without what is rounding, which would fill P in the end."""
+        indptr, columns, values = power.getValuesCSR()
+        kept = np.abs(values) > FADED
+        rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+        return self._matrix(rows[kept], columns[kept], values[kept])
 
     @property
     def reserved(self) -> PETSc.Mat:
