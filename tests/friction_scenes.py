@@ -50,22 +50,27 @@ def driven(
     comm: MPI.Comm = MPI.COMM_WORLD,
     target: Any = None,
     walls: bool = False,
+    flat: bool = False,
+    swap: bool = False,
     how: dict[str, Any] | None = None,
     options: dict[str, Any] | None = None,
     **scene: Any,
 ) -> Driven:
-    """A block on another one that is wider, or on a plane; all of its top is driven. ``walls`` hold it in the second direction."""
+    """A block on another one that is wider, or on a plane; all of its top is driven.
+
+    ``walls`` hold it in the second direction, ``flat`` holds the surface of the other block, ``swap`` makes this the contactor.
+    """
     b = blocks(comm, cell, *n, overhang=0.5, **scene)
     g = b.gdim
     if target is None:
         target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
     rough = {} if mu is None else {"friction": mu}
-    contact = uem.Contact(b.high, target, **rough, **(how or {}))
+    contact = uem.Contact(*((target, b.high) if swap else (b.high, target)), **rough, **(how or {}))
     top = fem.Function(b.V)
     sides = [clamp(b.V, b.scene.tag("side", 1, at(1, end)), 1) for end in (0.0, 1.0) if walls]
     bcs = [
         *sum(sides, []),
-        *clamp(b.V, b.bottom),
+        *clamp(b.V, b.low if flat else b.bottom),
         fem.dirichletbc(top, fem.locate_dofs_topological(b.V, b.top.dim, b.top.entities)),
     ]
     problem = uem.UnitedProblem(law(b.u, modulus(b.scene, E, E)), b.u, bcs=bcs, contacts=[contact], **(options or {}))
@@ -93,11 +98,12 @@ def loose(
     rigid: bool = False,
     E: float = 50.0,
     n: Any = (3, 4),
+    degree: int = 1,
     coupling: str = "node_to_surface",
     **options: Any,
 ) -> Loose:
     """A block of unit volume on another one, or on a plane, that nothing but contact holds."""
-    b = blocks(MPI.COMM_WORLD, cell, *n, overhang=0.5)
+    b = blocks(MPI.COMM_WORLD, cell, *n, overhang=0.5, degree=degree)
     g = b.gdim
     target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
     contact = uem.Contact(b.high, target, friction=mu, coupling=coupling)
@@ -110,6 +116,14 @@ def loose(
 def history(scene: Driven, *places: tuple[float, ...]) -> Array:
     """Displacements after each place that the top is driven to, ``(n_places, n_nodes, gdim)`` in the drawing's order (collective)."""
     return np.array([(scene.to(*place), scene.blocks.scene.gather(scene.problem.u))[1] for place in places])
+
+
+def fields(problem: uem.UnitedProblem, pair: Any) -> tuple[Array, Array, Array]:
+    """Smooth displacement and way of all nodes, and numbers of the contactors, about which friction is differentiated."""
+    x, g = problem.config.X, problem.config.gdim
+    smooth = np.stack([0.05 * np.sin(2 * x[:, i] + i) * np.cos(x[:, (i + 1) % g]) for i in range(g)], axis=1)
+    way = np.stack([np.cos(3 * x[:, i] + 2 * i) + 0.3 * x[:, (i + 1) % g] for i in range(g)], axis=1)
+    return smooth, way, 0.3 + 0.2 * np.sin(5 * x[pair.nodes].sum(axis=1))
 
 
 #: Radius of the cylinder's surface, and how far the bodies reach.
@@ -127,7 +141,9 @@ class Cylinder(Driven):
         return 2 * np.sqrt(REACH * max(x, REACH / self.n**2)) / self.n
 
 
-def cylinder(mu: float, *, n: int, degree: int = 1, coupling: str = "node_to_surface") -> Cylinder:
+def cylinder(
+    mu: float, *, n: int, degree: int = 1, coupling: str = "node_to_surface", comm: MPI.Comm = MPI.COMM_WORLD
+) -> Cylinder:
     """A body with a round lower surface on a flat one, of the same material; its top is driven."""
 
     def graded(body: Body) -> Body:
@@ -139,7 +155,7 @@ def cylinder(mu: float, *, n: int, degree: int = 1, coupling: str = "node_to_sur
         return y
 
     lower, upper = (graded(box("quadrilateral", [-1.0, y], [1.0, y + 1.0], [2 * n, n])) for y in (-1.0, 0.0))
-    s = create_scene(MPI.COMM_WORLD, "quadrilateral", [lower, upper], pose=pose)
+    s = create_scene(comm, "quadrilateral", [lower, upper], pose=pose)
     V = compat.function_space(s.mesh, degree, (2,))
     bottom, low = s.tag("bottom", 0, at(1, -REACH)), s.tag("low", 0, at(1, 0.0))
     high, top = s.tag("high", 1, at(1, 0.0)), s.tag("top", 1, at(1, REACH))

@@ -163,12 +163,6 @@ class Contact:
         else:
             from uem_dolfinx.contact.friction_pair import FrictionalPair
 
-            meshed = target.n_nodes and self.coupling == "mortar" and self.contactor.dim > 0
-            if meshed and config.degree == 2 and self.sliding == "finite":
-                raise InputError(
-                    f"contact '{self.name}': friction does not go with coupling = 'mortar' between surfaces of degree 2 that slide far: "
-                    "take node_to_surface, degree 1, or sliding = 'small'"
-                )
             self._pair = FrictionalPair(config, nodes, coupling, mu=mu, free=free[nodes], **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair

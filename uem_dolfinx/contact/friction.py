@@ -162,7 +162,7 @@ def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
     return c * a / (1.0 - a), a / (1.0 - a)
 
 
-def work(before: Array, now: Array, way: Array, cornered: Bools) -> Array:
+def work(before: Array, now: Array, start: Array, end: Array, cornered: Bools) -> Array:
     """What friction takes from the bodies over a step ``(n,)``: the mean of its forces over the way along the target.
 
     Into a corner a contactor slides before the corner holds it; force that would push it on there is none of the way's friction.
@@ -170,8 +170,9 @@ def work(before: Array, now: Array, way: Array, cornered: Bools) -> Array:
     Args:
         before: friction at the start of the step ``(n, gdim)``.
         now: at its end ``(n, gdim)``.
-        way: relative motion in the step ``(n, gdim)``.
+        start: relative motion in the step, past what friction at its start acts on ``(n, gdim)``.
+        end: past what it acts on at its end ``(n, gdim)``.
         cornered: contactors that a corner holds at the end ``(n,)``.
     """
-    start, end = (-0.5 * np.einsum("ng,ng->n", tau, way) for tau in (before, now))
-    return np.asarray(start + np.where(cornered, np.maximum(end, 0.0), end))
+    first, last = (-0.5 * np.einsum("ng,ng->n", tau, way) for tau, way in ((before, start), (now, end)))
+    return np.asarray(first + np.where(cornered, np.maximum(last, 0.0), last))

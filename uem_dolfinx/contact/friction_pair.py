@@ -45,9 +45,9 @@ class FrictionalPair(ContactPair):
         self._anchors: Array = np.zeros((n, g))
         #: The last normals that directions along the target were made for, and these ``(n, gdim - 1, gdim)``.
         self._tangents: tuple[Array | None, Array] = None, np.zeros((n, g - 1, g))
-        #: What contactors follow in a mean kept since the last step: weights, positions of the owned nodes, motion of a rigid target;
-        #: None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
-        self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None] | None = None
+        #: What contactors follow in a mean kept since the last step: weights, positions of the owned nodes, motion of a rigid target,
+        #: shares; None where they are to be kept next; and how far contactors have moved since ``(n, gdim)``.
+        self._kept: tuple[tuple[Ints, Ints, Array], Array, Motion | None, Array] | None = None
         self._moved: Array = np.zeros((n, g))
         #: In the present linearised problem: contactors that have been let go of, that slip the other way, and that slip ahead of the
         #: last that were to ``(n,)``; where these were and how far others go along.
@@ -68,8 +68,9 @@ class FrictionalPair(ContactPair):
         f, target = self._rub(), self.target
         if not self.coupling.nodal:
             if self._kept is None:
-                self._kept = self.coupling.weights(self.placement), self.config.x[: self.config.n_owned].copy(), target.motion
-            weights, before, motion = self._kept
+                here = self.config.x[: self.config.n_owned].copy()
+                self._kept = self.coupling.weights(self.placement), here, target.motion, self._shares
+            weights, before, motion, _ = self._kept
             self._moved = self._relative(self._way_since(before, motion), weights)
             return
         if target.n_nodes:
@@ -262,7 +263,7 @@ class FrictionalPair(ContactPair):
         if self._kept is None:
             way = np.where(self.free, 0.0, self._off_anchor)
         else:
-            way = self.coupling.driven(self.placement, self._way_since(*self._kept[1:]))
+            way = self.coupling.driven(self.placement, self._way_since(*self._kept[1:3]))
         normal = self.coupling.normals(self.placement, self.trial)
         along = friction.along(friction.tangents(normal[:, None], np.ones_like(self.free)), way)
         check_driven(self, along, self.rubbing & (self.trial.lam > 0) & ~self._cornered)
@@ -419,6 +420,15 @@ class FrictionalPair(ContactPair):
             anchor=np.where(loose[:, None], left, f.anchor),
         )
 
+    def _ways(self) -> tuple[Array, Array]:
+        """Ways past the target since the last step, for a unit of friction at its start and one at its end ``(n, gdim)`` (collective)."""
+        if self._kept is None:
+            way = self._off_anchor / self._shares[:, None]
+            return way, way
+        _, before, motion, share = self._kept
+        now = self._relative(self._way_since(before, motion), self.coupling.weights(self.placement))
+        return self._moved / share[:, None], now / self._shares[:, None]
+
     def commit(self) -> None:
         """Make the trial state the committed one, with new anchors for those that do not stick; see ``ContactPair``."""
         assert self.committed.friction is not None
@@ -426,11 +436,10 @@ class FrictionalPair(ContactPair):
         f = replace(
             f, tau=np.where(held[:, None], friction_in(self._corners, self.trial, self.committed.facet, self.mu) * share, f.tau)
         )
+        start, end = self._ways()
         # a contactor that changes facets slides over both
-        whole = np.where(held[:, None] | self.coupling.nodal, self._off_anchor, self.slip)
-        way, slip = (np.where((self.trial.active | self.committed.active)[:, None], x, 0.0) / share for x in (whole, self.slip))
-        slipped = f.slipped + np.where(held[:, None], way, np.where(self.slipping[:, None], slip, 0.0))
-        taken = friction.work(self.committed.friction.tau, f.tau, way, held)
+        slipped = f.slipped + np.where(held[:, None], end, np.where(self.slipping[:, None], self.slip / share, 0.0))
+        taken = friction.work(self.committed.friction.tau, f.tau, start, end, held)
         f = replace(f, direction=self.directions, slipped=slipped, work=f.work + taken)
         self.trial, self._kept = replace(self.trial, friction=f), None
         super().commit()
