@@ -10,7 +10,9 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import cylinder, driven, fields, loose
+from helpers import st_venant
 
+import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.solve.tangent import contact_curvature
 
@@ -139,3 +141,56 @@ def test_friction_of_mortar_by_differences(cell, rigid):
     difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
     difference.scale(0.5 / h)
     assert (difference - made).norm() <= 1e-8 * difference.norm()
+
+
+@pytest.mark.parametrize(
+    ("cell", "where", "bound"),
+    [
+        ("quadrilateral", "plane", 1e-9),
+        ("tetrahedron", "plane", 1e-9),
+        slow("hexahedron", "plane", 1e-9),
+        ("quadrilateral", "ball", 1e-3),
+        ("tetrahedron", "ball", 1e-3),
+        ("quadrilateral", "mesh", 2e-3),
+        slow("hexahedron", "mesh", 3e-3),
+    ],
+)
+def test_friction_of_degree_2_by_differences(cell, where, bound):
+    """Derivatives of the forces of friction in equilibrium, where weighted gaps are closed: exact on a plane.
+
+    Elsewhere what is left is in proportion to gaps that the weighted ones do not tell.
+    """
+    g, mu, h = (2 if cell == "quadrilateral" else 3), 0.4, 1e-6
+    ball = uem.RigidSphere([0.5] * (g - 1) + [-1.5], 1.5) if where == "ball" else None
+    scene = driven(
+        cell, mu, rigid=where == "plane", target=ball, degree=2, n=(2, 3) if g == 2 else (2, 2), law=st_venant, how=MORTAR,
+        comm=MPI.COMM_SELF,
+    )  # fmt: skip
+    for x in (0.0, 0.1):
+        scene.to(x, *[0.3 * x] * (g - 2), -0.05)
+    problem, pair = scene.problem, scene.contact.pair
+    n, touching, friction = len(pair.nodes), pair.trial.active.copy(), pair.trial.friction
+    start = problem.config.displacement[: problem.config.n_local].copy()
+    _, way, pressure = fields(problem, pair)
+    assert touching.sum() >= 4
+
+    def force(u, direction):
+        """Nodal forces of friction at constant multipliers of the weighted gaps; those of the gaps are left out."""
+        problem.u.x.array[:] = u.ravel()
+        state = replace(friction, stick=np.zeros(n, bool), direction=direction)
+        pair.trial = replace(pair.trial, active=touching, friction=state)
+        problem.system.place(returning=False)
+        lam = np.where(touching, pressure * pair.placement.details.area, 0.0)
+        pair.trial = replace(pair.trial, lam=lam, friction=replace(state, tau=-mu * lam[:, None] * pair.directions))
+        return problem.forces.vector(friction_at_nodes(scene.contact))
+
+    force(start, np.tile([1.0, *[0.3] * (g - 1)], (n, 1)))
+    s = pair.directions
+    force(start, s)
+    which = np.flatnonzero(touching)
+    tau = -mu * (pair.trial.lam / pair.coupling.shares(pair.placement, pair.trial))[which, None] * s[which]
+    du = problem.forces.vector(way[: problem.config.n_owned])
+    made = contact_curvature(pair.coupling.turning(pair.placement, pair.trial, which, tau), du) * du
+    difference = force(start + h * way, s) - force(start - h * way, s)
+    difference.scale(0.5 / h)
+    assert (difference - made).norm() <= bound * difference.norm()

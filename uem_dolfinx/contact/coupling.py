@@ -134,10 +134,13 @@ class Coupling(Protocol):
         """How far an increment ``(n_owned, gdim)`` takes prescribed components over the target ``(n, gdim)``; free ones 0 (collective)."""
 
     def shares(self, placement: Placement, state: PairState) -> Array:
-        """What ``lam`` is of the multiplier of a contactor's equation along the normal ``(n,)`` (collective)."""
+        """What ``lam`` is of the multiplier that friction at its limit is mu times ``(n,)`` (collective)."""
+
+    def tilts(self, placement: Placement, state: PairState) -> Array:
+        """Friction at its limit, over mu times the multiplier of a contactor's equation along the normal ``(n,)`` (collective)."""
 
     def normals(self, placement: Placement, state: PairState) -> Array:
-        """Directions of the contactors' equations, across which friction acts ``(n, gdim)`` (collective)."""
+        """Unit vectors across which friction acts ``(n, gdim)`` (collective)."""
 
     def off(self, placement: Placement, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""

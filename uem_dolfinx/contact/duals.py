@@ -145,6 +145,22 @@ class Duals:
     inverse: Array
     gap: Array
 
+    def spread(self, facet: Ints, b: Array, multipliers: Array) -> tuple[Array, Array]:
+        """What a change of the covered part does to ``sum l_j int psi_j f``, at places of the facets: factors of f and of its projection.
+
+        Args:
+            facet: of the places ``(q,)``.
+            b: functions there ``(q, nn)``.
+            multipliers: l, of the facets' nodes ``(m, nn, c)``.
+
+        Returns:
+            Of f there ``(q, c)``, and of the coefficients of its projection onto the functions b ``(q, nn, c)``.
+        """
+        fore = multipliers[np.arange(len(multipliers)), self.foremost]
+        more = np.where(self.own[:, :, None], multipliers - fore[:, None], 0.0)
+        here = np.einsum("qb,qbc->qc", b, (self.A.transpose(0, 2, 1) @ more)[facet])
+        return fore[facet] + here, b[:, :, None] * (more[facet] - here[:, None])
+
     def at_end(self, facet: Ints, b: Array, gap: Array) -> Array:
         """How weighted gaps grow with what is covered, at places of the covered part's boundary.
 

@@ -291,7 +291,8 @@ class FrictionalPair(ContactPair):
         untilted = tilted = UnitingEquations.join([test, *parts], g)
         trial = untilted if own.trial is test else UnitingEquations.join([own.trial, *parts], g)
         if self.config.comm.allreduce(int(slipping.any())):
-            tilt = np.where(slipping[:, None], -self.mu[who, None] * self.directions[who], 0.0)
+            size = (self.mu * self.coupling.tilts(self.placement, self.trial))[who, None]
+            tilt = np.where(slipping[:, None], -size * self.directions[who], 0.0)
             direction = untilted.direction.copy()
             direction[normal] += tilt
             tilted = replace(
@@ -423,8 +424,7 @@ class FrictionalPair(ContactPair):
     def _ways(self) -> tuple[Array, Array]:
         """Ways past the target since the last step, for a unit of friction at its start and one at its end ``(n, gdim)`` (collective)."""
         if self._kept is None:
-            way = self._off_anchor / self._shares[:, None]
-            return way, way
+            return (self._off_anchor / self._shares[:, None],) * 2
         _, before, motion, share = self._kept
         now = self._relative(self._way_since(before, motion), self.coupling.weights(self.placement))
         return self._moved / share[:, None], now / self._shares[:, None]
@@ -436,8 +436,8 @@ class FrictionalPair(ContactPair):
         f = replace(
             f, tau=np.where(held[:, None], friction_in(self._corners, self.trial, self.committed.facet, self.mu) * share, f.tau)
         )
-        start, end = self._ways()
         # a contactor that changes facets slides over both
+        start, end = self._ways()
         slipped = f.slipped + np.where(held[:, None], end, np.where(self.slipping[:, None], self.slip / share, 0.0))
         taken = friction.work(self.committed.friction.tau, f.tau, start, end, held)
         f = replace(f, direction=self.directions, slipped=slipped, work=f.work + taken)

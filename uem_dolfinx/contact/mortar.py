@@ -152,7 +152,7 @@ class Mortar(NodeToSurface):
             way[self.nodes] = ((nearest.gap - self._anchor.gap) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
             gap = eq.gap + self._along(eq, way)
         moved = replace(eq, gap=gap)
-        return replace(rows, equations=moved, plain=moved)
+        return replace(rows, equations=moved, plain=moved, normal=eq.direction)
 
     def _turned(self, equations: UnitingEquations) -> UnitingEquations:
         """Kept rows, which turn with a rigid target."""
@@ -278,8 +278,11 @@ class Mortar(NodeToSurface):
             beside = self._elimination.beside(at, scale, direction)
             equations = with_terms(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
-        weights = whole = None
+        weights = upright = slope = whole = None
         if self._rubs:
+            along = self._elimination.of_themselves(plain, beside)
+            slope = np.linalg.norm(along, axis=1)
+            upright = along / slope[:, None]
             whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
             means = [
                 terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
@@ -289,7 +292,7 @@ class Mortar(NodeToSurface):
             r, t, w = self._elimination.at_owners(means, whole)
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
             weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
-        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share, weights, whole)
+        return WeightedRows(equations, plain, beside, at, facets, is_covered, ratio, size, share, weights, upright, slope, whole)
 
     def rub(self, mu: Array) -> None:
         """Keep the weights that friction needs; see ``Coupling``."""
@@ -301,13 +304,22 @@ class Mortar(NodeToSurface):
         return weights
 
     def shares(self, placement: Placement, state: PairState) -> Array:
-        """Of the multipliers of equations that are taken apart."""
+        """Of multipliers along the derivatives of the gaps with the contactors' own displacements."""
         rows: WeightedRows = placement.details
-        return np.asarray(rows.share / self._elimination.apart(rows, state.active)[1])
+        assert rows.slope is not None
+        return np.asarray(rows.share / rows.slope)
+
+    def tilts(self, placement: Placement, state: PairState) -> Array:
+        """Of equations that are taken apart, which makes the derivatives longer or shorter."""
+        rows: WeightedRows = placement.details
+        assert rows.slope is not None
+        return np.asarray(rows.slope / self._elimination.apart(rows, state.active)[1])
 
     def normals(self, placement: Placement, state: PairState) -> Array:
-        """The directions of equations that are taken apart."""
-        return self._elimination.apart(placement.details, state.active)[0].direction
+        """Directions of the derivatives of the gaps with the contactors' own displacements."""
+        rows: WeightedRows = placement.details
+        assert rows.normal is not None
+        return rows.normal
 
     # -- what decides on contact -----------------------------------------------------------------------------------------
 
@@ -374,7 +386,7 @@ class Mortar(NodeToSurface):
         nodes, forces = self._handed_on(made, state.lam / rows.share * by)
         if state.friction is None:
             return nodes, forces
-        tau = state.friction.tau / (rows.share / by)[:, None]
+        tau = state.friction.tau / self.shares(placement, state)[:, None]
         row, followed, weight = self.weights(placement)
         return (
             np.concatenate([nodes, self.config.to_global(self.nodes), followed]),

@@ -41,6 +41,9 @@ class WeightedRows:
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
         weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
+        normal: directions of the gaps' derivatives with the contactors' own displacements, across which friction acts ``(n, gdim)``;
+            None without.
+        slope: lengths of these derivatives, over those of the plain rows ``(n,)``; None without friction.
         whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
             without friction.
     """
@@ -55,6 +58,8 @@ class WeightedRows:
     area: Array
     share: Array
     weights: Terms | None = None
+    normal: Array | None = None
+    slope: Array | None = None
     whole: Array | None = None
 
 
@@ -93,6 +98,14 @@ class Elimination:
         kept = (own > MOSTLY_OWN - 1)[row]
         return row[kept], term[kept], value[kept]
 
+    def of_themselves(self, plain: UnitingEquations, beside: Terms) -> Array:
+        """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
+        row, term, value = beside
+        itself, direction = term == self._own[row], plain.direction.copy()
+        # each row has at most one such term
+        direction[row[itself]] -= value[itself]
+        return direction
+
     def apart(self, rows: WeightedRows, active: Bools) -> tuple[UnitingEquations, Array]:
         """The equations without what those of other ``active (n,)`` contactors eliminate, as they would follow in circles (collective).
 
@@ -113,10 +126,7 @@ class Elimination:
         beside, gap, at_nodes = rows.beside, plain.gap.copy(), np.zeros((self.config.n_owned, self.config.gdim + 1))
         while True:
             row, term, value = beside
-            itself = term == own[row]
-            # each row has at most one term of its own contactor, which gets another direction by it
-            direction = plain.direction.copy()
-            direction[row[itself]] -= value[itself]
+            itself, direction = term == own[row], self.of_themselves(plain, beside)
             left = direction * free
             along = np.einsum("ng,ng->n", left, plain.direction)[:, None]
             at_nodes[self.nodes] = np.column_stack([left / np.where(along > 0, along, np.inf), plain.gap])

@@ -7,8 +7,8 @@ minus its product with n, there is ``t . dy/deta = 0`` and ``t . n = -1``, so th
     d gap = t . (dx - dy + gamma da) + gamma n . da.
 
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
-in the second derivatives. The ends of the
-target move too, and dual functions with them; in the second derivatives they are left out.
+in the second derivatives. The ends of the target move too, and dual functions with them; in 3D they are left out. Parts of quadratic
+facets do not all grow as these do, and change dual functions as ends do; second derivatives have what is of first order in them.
 """
 
 from __future__ import annotations
@@ -99,6 +99,18 @@ class SegmentPoints:
         """Part of ``to_gap`` across the contactor's normal: zero where the facets are parallel ``(q, gdim)``."""
         return self.to_gap + self.planes.normal[self.facet[self.segments.pair]]
 
+    @cached_property
+    def stretching(self) -> Array:
+        """How the part of the plane that a point stands for grows with the contactor facet's nodes beside the facet ``(q, nc, gdim)``.
+
+        Of affine facets all parts grow alike.
+        """
+        e = self.facet[self.segments.pair]
+        tab, x, n = self.shape.tabulate(self.segments.xi), self.x[e], self.planes.normal[e]
+        over = dual_tangents(tangents(tab, x), n)
+        turned = (to_gap(area_vectors(tab, x), n) + 2 * n) / self.planes.size[e, None]
+        return np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
+
     # -- first derivatives -----------------------------------------------------------------------------------------------
 
     def gap_derivatives(self) -> tuple[Array, Array]:
@@ -130,6 +142,10 @@ class SegmentPoints:
         on_facet += (vector[:, None] @ self.turning).swapaxes(1, 2).reshape(m, nc, nc * g)
         by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
         by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
+        if self.shape.degree == 2:
+            grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap)
+            stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
+            by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
         if self.other is not None and self.other.dim == 1:
             self._add_ends(self.other, by_node, by_pair)
         return by_node, by_pair
@@ -180,6 +196,9 @@ class SegmentPoints:
             bend = self.bend[np.isin(self.segments.pair, pressing)]
             for row, unit in zip(np.moveaxis(bend, 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
+        if self.shape.degree == 2:
+            gaps = motions.along(t) + motions.of_area(((2 if nt else 1) * gap / size[pair])[:, None] * n[pair])
+            half += self._stretched(pressing, pair, pressure, gaps)
         blocks = half + half.transpose(0, 2, 1)
         # what is not closed, with the second order of the facet's size and direction: once for each facet
         _, first, of_facet = np.unique(e, return_index=True, return_inverse=True)
@@ -194,6 +213,21 @@ class SegmentPoints:
         room = more_nodes.shape[1] - nodes.shape[1]
         nodes = np.concatenate([np.pad(nodes, ((0, 0), (0, room)), constant_values=-1), more_nodes])
         return nodes, -np.concatenate([np.pad(blocks, ((0, 0), (0, room * g), (0, room * g))), more_blocks])
+
+    def _stretched(self, pressing: Ints, pair: Ints, pressure: Array, gaps: Array) -> Array:
+        """Half of the second derivatives with the parts of the plane that points stand for and with their ``gaps (q, nc + nt, gdim)``."""
+        q, e, k = np.isin(self.segments.pair, pressing), self.facet[pressing], len(pressing)
+        weight, b, grown = self.segments.weight[q], self.b[q], self.stretching[q]
+        (m, nc), width = self.nodes.shape, gaps.shape[1] * gaps.shape[2]
+        of_gap, of_mean = self.duals.spread(e[pair], b, pressure[:, :, None])
+        rows = grown.shape[1] * grown.shape[2]
+        out = np.zeros((k, width, width))
+        flat, weighted = gaps.reshape(-1, width), weight[:, None] * grown.reshape(-1, rows)
+        out[:, :rows] = add_up(pair, products(weighted * of_gap, flat), k).reshape(k, rows, width)
+        means = add_up(e[pair], products(weighted, of_mean[:, :, 0]), m).reshape(m, rows, nc)
+        projected = add_up(pair, products(weight[:, None] * b, flat), k).reshape(k, nc, width)
+        out[:, :rows] += (means @ self.duals.inverse)[e] @ projected
+        return out
 
     def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Motions]:
         """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, t, eta and motions.

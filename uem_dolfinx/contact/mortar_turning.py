@@ -1,9 +1,9 @@
 """How mortar's forces of friction change with the displacement: with the traction's direction and size, and with what it is handed to.
 
-The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes
-get other shares. The traction turns with the normal of the contactor's equation, and grows with its size; these are the second
-derivatives of the weighted gap of this contactor alone. How dual functions change where the target ends is left out, as in the
-second derivatives of gaps in space.
+The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes get
+other shares. The traction turns with the derivative of the weighted gap with the contactor's own displacement, and grows with its size;
+these are the second derivatives of the gap of this contactor alone. Parts of quadratic facets do not all grow as these do. How dual
+functions change where the target ends is left out, as in the second derivatives of gaps in space.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.contact.duals import basis_of
+from uem_dolfinx.contact.duals import add_up, basis_of, products
 from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import Motions, dual_tangents, sum_of_products
@@ -64,6 +64,8 @@ def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
     share, one = np.concatenate([at.phi[q], -at.N[q]], axis=1), np.ones(len(q))
     # all grow with the facet
     blocks = sum_of_products(pair, one, share[:, :, None] * force[:, None], motions.of_area((n / size[:, None])[pair]), k)
+    if at.shape.degree == 2:
+        blocks += _stretched(at, traction, which, q, pair)
     if at.other is not None:
         tab = at.other.tabulate(s.eta[q])
         over = dual_tangents(tangents(tab, at.y[which][pair]), n[pair])
@@ -72,6 +74,32 @@ def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
             moved[:, motions.nc :] = -tab.dN[:, :, f, None] * force[:, None]
             blocks += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
     return np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks
+
+
+def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: Ints) -> Array:
+    """What ``handing_on`` has from parts of facets that do not grow as these do.
+
+    Args:
+        at: points of the segments.
+        traction: as for ``handing_on``.
+        which: pairs ``(p,)``.
+        q: their points.
+        pair: of these, among them.
+    """
+    e, k, (m, nc, g), nt = at.facet[which], len(which), traction.shape, at.opposite.shape[1]
+    weight, grown = at.segments.weight[q], at.stretching[q].reshape(len(q), nc * g)
+    of_share, of_mean = at.duals.spread(e[pair], at.b[q], traction)
+    share = np.concatenate([at.phi[q], -at.N[q]], axis=1)
+    left = share[:, :, None] * of_share[:, None]
+    left[:, :nc] += basis_of(at.shape).T.T @ of_mean
+    out = np.zeros((k, nc + nt, g, nc + nt, g))
+    width = (nc + nt) * g
+    out[:, :, :, :nc] = add_up(pair, products(weight[:, None] * left.reshape(-1, width), grown), k).reshape(k, nc + nt, g, nc, g)
+    if nt:
+        means = add_up(e[pair], products(weight[:, None] * of_mean.reshape(len(q), nc * g), grown), m).reshape(m, nc, g, nc, g)
+        projected = at.duals.inverse[e] @ at.covered.N[which]
+        out[:, nc:, :, :nc] -= np.einsum("kbl,kbgah->klgah", projected, means[e])
+    return out.reshape(k, width, width)
 
 
 def turning(
@@ -99,6 +127,11 @@ def turning(
     # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
     unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
     grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * unit[:, None]
+    if at.shape.degree == 2:
+        s = at.segments
+        stretched = products(s.weight[:, None] * at.b, at.stretching.reshape(len(at.b), nc * g))
+        on_facet = add_up(at.facet[s.pair], stretched, m).reshape(m, nc, nc, g)
+        grown += np.einsum("mjb,bj,mbag->mjag", (at.duals.C != 0).astype(float), basis_of(at.shape).T, on_facet)
     parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g)), grown], axis=3))]
     for j in range(nc):
         alone = np.zeros((m, nc))

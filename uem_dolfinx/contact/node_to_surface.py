@@ -224,6 +224,10 @@ class NodeToSurface:
         """The whole multiplier."""
         return np.ones(len(self.nodes))
 
+    def tilts(self, placement: Placement, state: PairState) -> Array:
+        """Friction is mu times the multipliers of the equations."""
+        return np.ones(len(self.nodes))
+
     def normals(self, placement: Placement, state: PairState) -> Array:
         """The normals at the feet."""
         return placement.projection.normal
