@@ -20,6 +20,7 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
+from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
@@ -77,11 +78,14 @@ class Deflation:
 
 
 def pressed_hard(config: Configuration, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
-    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)``."""
-    stiffness, own = (np.array(M.getDiagonal().array_r).reshape(-1, config.gdim) for M in (A, K))
-    pressed = P.used & (stiffness > MUCH_STIFFER * own)
-    pressed[P.nodes] = False
-    return np.asarray(pressed.any(axis=1))
+    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)`` (collective)."""
+    followed, pressed = np.zeros((2, config.n_owned), dtype=bool)
+    followed[config.gather_owned(P.followed(P.equations.active))] = True
+    followed[P.nodes] = False
+    part = Part(config, followed)
+    stiffness, own = (part.of(M).getDiagonal().array_r.reshape(-1, config.gdim) for M in (A, K))
+    pressed[part.nodes] = (P.used[part.nodes] & (stiffness > MUCH_STIFFER * own)).any(axis=1)
+    return pressed
 
 
 def without(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:

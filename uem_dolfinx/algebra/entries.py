@@ -47,14 +47,16 @@ class Entries:
             return Entries(indptr, columns, K)
         first, last = K.getOwnershipRange()
         indptr, columns, _ = K.getValuesCSR()
+        inside, _ = K.getDiagonalBlock().getRowIJ()
         own = (columns >= first) & (columns < last)
-        inside = np.append(0, np.cumsum(own))[indptr]
         lines = np.append(inside, inside[-1] + (indptr - inside)[1:]).astype(indptr.dtype)
         return Entries(lines, np.append(columns[own], columns[~own]), K)
 
     def of(self, lines: Bools) -> tuple[Ints, Ints]:
         """Places of the entries in some of the lines, and the lines that they are in."""
-        return entries_of(lines, self.indptr)
+        which = np.flatnonzero(lines).astype(self.indptr.dtype)
+        places, i = entries_of(which, self.indptr)
+        return places, which[i]
 
     def find(self, lines: Ints, columns: Ints) -> tuple[Ints, Bools]:
         """Places where entries of these lines and columns are or would be put, and whether they are there, ``(m,)`` each."""
@@ -70,10 +72,14 @@ class Entries:
         return low, there
 
 
-def entries_of(lines: Bools, indptr: Ints) -> tuple[Ints, Ints]:
-    """Places of the entries in some of the lines, and the lines that they are in."""
-    which = np.flatnonzero(lines).astype(indptr.dtype)
-    lengths = indptr[which + 1] - indptr[which]
-    ends = np.cumsum(lengths, dtype=indptr.dtype)
-    places = np.arange(ends[-1] if len(ends) else 0, dtype=indptr.dtype)
-    return places + np.repeat(indptr[which] - ends + lengths, lengths), np.repeat(which, lengths)
+def entries_of(which: Ints, starts: Ints) -> tuple[Ints, Ints]:
+    """Places of the entries of some lines, one line after the other, and which of ``which (k,)`` each is of.
+
+    ``starts`` are the first entry of every line and the number of entries.
+    """
+    lengths = starts[which + 1] - starts[which]
+    ends = np.cumsum(lengths, dtype=starts.dtype)
+    places = np.arange(ends[-1] if len(ends) else 0, dtype=starts.dtype)
+    return places + np.repeat(starts[which] - ends + lengths, lengths), np.repeat(
+        np.arange(len(which), dtype=starts.dtype), lengths
+    )

@@ -193,9 +193,7 @@ class UnitedSolver:
                 restriction.cross_out(self.A)
                 _stiffen_idle(self.A, K, restriction)
         else:
-            restriction.P  # noqa: B018
-            with timed("united matrix P'KP"):
-                self.A = self._united.update(restriction, restriction, K, curvature)
+            self.A = self._united.update(restriction, restriction, K, curvature)
         symmetric = is_symmetric(self.A)
         if not symmetric and self._instead and self.iterative:
             self._use(self._instead)
@@ -245,9 +243,7 @@ class UnitedSolver:
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
-        P.P, Q.P  # noqa: B018
-        with timed("united matrix Q'KP"):
-            A = self._unsymmetric.update(P, Q, K, curvature)
+        A = self._unsymmetric.update(P, Q, K, curvature)
         if self.iterative:
             self.ksp.setOperators(A, self.A)
             return

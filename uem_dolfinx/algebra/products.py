@@ -1,12 +1,12 @@
 """The united matrix ``Q'(K + G)P`` from its changes: K's values in a pattern that lasts, and products near the contact only.
 
-P and Q are the identity but for the rows of eliminated nodes and for prescribed components, which Z crosses out. With H, the rows of
-K that have an entry at an eliminated node,
+P and Q are the identity but for the rows of eliminated nodes and for prescribed components, which Z crosses out. With H, the entries
+of K between a part of the nodes, which has all that are coupled with an eliminated one,
 
     Q'(K + G)P = Z(K - H)Z + Q'(H + G)P
 
-so that only a thin matrix is multiplied, and all that grows with the bodies is a copy of values. ZKZ, with the diagonal of K where Z
-crosses out, is kept as well: its entries go line by line to where the matrix has them, in one piece between lines that have more.
+so that only matrices of that part are multiplied, and all that grows with the bodies is a copy of values. ZKZ, with the diagonal of K
+where Z crosses out, is kept as well: its entries go line by line to where the matrix has them, in one piece between lines that have more.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.entries import Entries, entries_of
+from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.log import timed
 
 #: Places of earlier products are kept while there are no more than this times as many of them as of the present one's.
 #: [convention; number of entries that K lacks; test_thresholds_algebra.py::test_places_of_earlier_products]
@@ -41,8 +43,9 @@ class UnitedMatrix:
         #: K and the free components that the matrix was made for, and the state of K's values that it holds.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
-        #: Z K Z with the diagonal of K, and the matrix.
+        #: Z K Z with the diagonal of K, where it is crossed out, and the matrix.
         self._K: Any = None
+        self._crossed: Ints = np.zeros(0, np.int64)
         self._A: Any = None
         #: Keys of the entries that K lacks, line times size plus column, sorted.
         self._filled: Ints = np.zeros(0, np.int64)
@@ -57,18 +60,30 @@ class UnitedMatrix:
 
     def update(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> PETSc.Mat:
         """Give the matrix its values for this P and Q, with the diagonal of K in idle columns (collective)."""
-        self._take(P, K)
-        near, H = self._near(P.united, curvature)
-        lines, columns, changes = self._entries(_product(H, P.P, Q.P))
+        name = "united matrix P'KP" if P is Q else "united matrix Q'KP"
+        with timed(name):
+            self._take(P, K)
+            part = self._part(P, P.united, P.equations.active, curvature)
+        rows, test = P.matrix(part), None if P is Q else Q.matrix(part)
+        with timed(name):
+            self._fill(P, Q, part, curvature, rows, test)
+            return self._A.mat
+
+    def _fill(self, P: Restriction, Q: Restriction, part: Part, curvature: PETSc.Mat | None, trial: Any, test: Any) -> None:
+        """Bring K's values and the product of the part into the matrix (collective)."""
+        H = part.of(self._made_for[0])
+        diagonal = H.getDiagonal().array_r
+        lines, columns, product = self._entries(_product(_sum(H, curvature, part), trial, test), part)
         begins = self._A is None or self._begins
         places, there = (lines, np.zeros(0, dtype=bool)) if begins else self._A.find(lines, columns)
         if begins or self.config.comm.allreduce(int(not there.all())):
             self._make_room(begins, lines, columns, P, Q, curvature)
             places, _ = self._A.find(lines, columns)
-        taken = self._place(*near)
-        idle = np.flatnonzero(~P.used)
-        own, _ = self._K.find(idle, idle + self._first)
-        diagonal = self._place(own, idle)
+        taken, _ = self._A.of(self._lines(part.components))
+        taken = taken[part.has(self._A.columns[taken])]
+        idle = np.flatnonzero(~P.used.ravel()[part.components])
+        own = part.components[idle]
+        held, _ = self._A.find(own, own + self._first)
         values = self._A.values
         if self._changed is None:
             for to, here in self._runs:
@@ -77,13 +92,12 @@ class UnitedMatrix:
             values[self._empty] = 0.0
         else:
             values[self._changed[0]] = self._changed[1]
-        at = np.concatenate([taken, places, diagonal])
+        at = np.concatenate([taken, places])
         self._changed = at, values[at]
         values[taken] = 0.0
-        values[places] += changes
-        values[diagonal] = self._K.values[own]
+        values[places] = product
+        values[held] = diagonal[idle]
         self._A.mat.assemble()
-        return self._A.mat
 
     def _take(self, P: Restriction, K: PETSc.Mat) -> None:
         """Take the values of K, and its places if they are new (collective)."""
@@ -91,48 +105,46 @@ class UnitedMatrix:
         fresh, changed = self.config.comm.allreduce(np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
             self._made_for, self._K, self._A = (K, P.free), Entries.as_in(K), None
+            # where Z crosses out, but for the diagonal
+            free = P.vector(P.free.astype(float))
+            self._K.values[:] = 1.0
+            self._K.mat.diagonalScale(free, free)
+            held = np.flatnonzero(~P.free)
+            self._K.values[self._K.find(held, held + self._first)[0]] = 1.0
+            self._crossed = np.flatnonzero(self._K.values == 0.0)
         if changed:
             K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            self._K.values[self._crossed] = 0.0
             self._state, self._changed = K.stateGet(), None
-            held = np.flatnonzero(~P.free)
-            own, _ = self._K.find(held, held + self._first)
-            diagonal, free = self._K.values[own], P.vector(P.free.astype(float))
-            self._K.mat.diagonalScale(free, free)
-            self._K.values[own] = diagonal
 
-    def _lines(self, components: Bools) -> Bools:
-        """Lines of owned components ``(n_owned, gdim)``."""
-        return np.tile(components.ravel(), 1 if self.config.comm.size == 1 else 2)
-
-    def _neighbours(self, nodes: Indices) -> Bools:
-        """Lines of the owned nodes that have an entry of K at ``nodes`` of any rank (collective)."""
-        g = self.config.gdim
-        here = np.zeros((self.config.n_owned, g), dtype=bool)
-        # components of a node have the same neighbours
-        here[nodes, 0] = True
-        at, line = self._K.of(self._lines(here))
-        # K's pattern is symmetric
-        touched, k = self._K.columns[at] // g, np.count_nonzero(line < self._n)
-        near = np.zeros_like(here)
-        near[touched[:k] - self._first // g] = True
-        near[self.config.gather_owned(np.unique(touched[k:]).astype(np.int64))] = True
-        return self._lines(near)
-
-    def _near(self, nodes: Indices, curvature: PETSc.Mat | None) -> tuple[tuple[Ints, Ints], PETSc.Mat]:
-        """Places and lines of the entries of H, the rows of K that have an entry at ``nodes``, and ``H + G`` (collective)."""
-        near = self._neighbours(nodes)
-        at, line = self._K.of(near)
-        lengths = np.diff(self._K.indptr) * near
-        H = Entries(np.append(0, np.cumsum(lengths)).astype(PETSc.IntType), self._K.columns[at], self._K.mat)
-        H.values[:] = self._K.values[at]
+    def _part(self, P: Restriction, nodes: Indices, which: Bools, curvature: PETSc.Mat | None) -> Part:
+        """The nodes that have an entry of K at ``nodes`` of any rank, those that ``which`` equations follow, and the curvature's."""
+        g, n = self.config.gdim, self.config.n_owned
+        first = self._first // g
+        # components of a node have the same neighbours, and K's pattern is symmetric
+        at, _ = self._K.of(self._lines(g * nodes.astype(np.int64)))
+        touched = np.union1d(self._K.columns[at] // g, P.followed(which)).astype(np.int64)
+        near = np.zeros(n, dtype=bool)
+        own = (touched >= first) & (touched < first + n)
+        near[touched[own] - first] = True
+        near[self.config.gather_owned(touched[~own])] = True
         if curvature is not None:
-            H.mat.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        return (at, line), H.mat
+            # a node with a row of it is coupled with itself
+            near |= np.diff(curvature.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
+        return Part(self.config, near)
 
-    def _entries(self, product: PETSc.Mat) -> tuple[Ints, Ints, Array]:
-        """Lines, columns and values of the entries of a matrix."""
-        indptr, columns, values = product.getValuesCSR()
-        rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    def _lines(self, components: Ints) -> Bools:
+        """Which lines have entries of owned components."""
+        lines = np.zeros(len(self._K.indptr) - 1, dtype=bool)
+        lines[components] = True
+        if self.config.comm.size > 1:
+            lines[components + self._n] = True
+        return lines
+
+    def _entries(self, A: PETSc.Mat, part: Part) -> tuple[Ints, Ints, Array]:
+        """Lines, columns and values of the entries of a part's matrix, in the whole (collective)."""
+        indptr, columns, values = A.getValuesCSR()
+        rows, columns = np.repeat(part.components, np.diff(indptr)), part.in_whole(columns)
         return np.where((columns >= self._first) & (columns < self._first + self._n), rows, rows + self._n), columns, values
 
     def _make_room(
@@ -142,9 +154,10 @@ class UnitedMatrix:
         comm = self.config.comm
         wanted = self._missing(lines, columns)
         if self.reserving:
-            reserved = P.reserved
-            more = _product(self._near(P.nodes, curvature)[1], reserved, reserved if Q is P else Q.reserved)
-            wanted = np.union1d(wanted, self._missing(*self._entries(more)[:2]))
+            part = self._part(P, P.nodes, np.ones_like(P.equations.active), curvature)
+            H = _sum(part.of(self._made_for[0]), curvature, part)
+            more = _product(H, P.reserved(part), None if Q is P else Q.reserved(part))
+            wanted = np.union1d(wanted, self._missing(*self._entries(more, part)[:2]))
         self._begins = False
         if begins:
             same = self._A is not None and np.array_equal(wanted, self._filled)
@@ -167,23 +180,22 @@ class UnitedMatrix:
         K = self._K
         new, columns = np.divmod(self._filled, self._size)
         counts = np.bincount(new, minlength=len(K.indptr) - 1)
-        #: How far the entries of each line have moved, and which lines have more.
-        self._shift = np.append(0, np.cumsum(counts))
-        self._grown = counts > 0
-        starts = (K.indptr + self._shift).astype(K.indptr.dtype)
-        old, line = K.of(self._grown)
+        shift, grown = np.append(0, np.cumsum(counts)), counts > 0
+        starts = (K.indptr + shift).astype(K.indptr.dtype)
+        old, line = K.of(grown)
         all_columns = np.empty(starts[-1], K.columns.dtype)
         merged = np.append(K.columns[old], columns)
-        at, order = entries_of(self._grown, starts)[0], np.lexsort((merged, np.append(line, new)))
+        at, order = entries_of(np.flatnonzero(grown), starts)[0], np.lexsort((merged, np.append(line, new)))
         place = np.empty_like(at)
         place[order] = at
         all_columns[place] = merged
+        #: Where the entries of lines that have more come from, and where they went to.
         self._moved = old, place[: len(old)]
         #: Where the lines between those that have grown went to, and where they come from.
         self._runs = []
-        ends = np.flatnonzero(self._grown)
+        ends = np.flatnonzero(grown)
         begins, ends = np.append(0, ends + 1), np.append(ends, len(counts))
-        for a, b, by in zip(K.indptr[begins], K.indptr[ends], self._shift[begins]):
+        for a, b, by in zip(K.indptr[begins], K.indptr[ends], shift[begins]):
             if a < b:
                 self._runs.append((slice(a + by, b + by), slice(a, b)))
         for there, here in self._runs:
@@ -192,13 +204,14 @@ class UnitedMatrix:
         #: Where K has no entry.
         self._empty = place[len(old) :]
 
-    def _place(self, at: Ints, line: Ints) -> Ints:
-        """Where the matrix has entries of K ``at`` these places of K, in these lines."""
-        place, moved = at + self._shift[line], self._grown[line]
-        place[moved] = self._moved[1][np.searchsorted(self._moved[0], at[moved])]
-        return place
+
+def _sum(H: PETSc.Mat, curvature: PETSc.Mat | None, part: Part) -> PETSc.Mat:
+    """H with the curvature of a part of the nodes."""
+    if curvature is not None:
+        H.axpy(1.0, part.of(curvature), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    return H
 
 
-def _product(H: PETSc.Mat, P: PETSc.Mat, Q: PETSc.Mat) -> PETSc.Mat:
-    """``Q'HP``."""
-    return H.PtAP(P) if P is Q else Q.transposeMatMult(H.matMult(P))
+def _product(H: PETSc.Mat, P: PETSc.Mat, Q: PETSc.Mat | None) -> PETSc.Mat:
+    """``Q'HP``, with P in place of Q if that is None."""
+    return H.PtAP(P) if Q is None else Q.transposeMatMult(H.matMult(P))

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
+from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -209,16 +210,22 @@ class Restriction:
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
     @cached_property
-    @timed("restriction matrix P")
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
-        active = self.equations.active
-        if self.chain == 0 or not self.stacked:
-            P = self._rows_of_P(active)
-            # a followed component that is prescribed is no unknown
-            P.diagonalScale(None, self.vector(self.used.astype(float)))
+        return self.matrix(Part(self.config, np.ones(self.config.n_owned, dtype=bool)))
+
+    def followed(self, which: Bools) -> Ints:
+        """Global nodes that some of the equations follow, each once."""
+        eq = self.equations
+        return np.unique(eq.followed[which[eq.row]])
+
+    @timed("restriction matrix P")
+    def matrix(self, part: Part) -> PETSc.Mat:
+        """P of a part of the nodes that has the eliminated ones and those they follow (collective)."""
+        P = self._rotation(part)
+        if self.chain == 0:
             return P
-        P, power, reach = self._rows_of_P(np.zeros_like(active)), self.M, 1
+        power, reach = part.of(self.M), 1
         # (1 + M)(1 + M^2)(1 + M^4)... T: twice as many equations follow one another with each product
         while True:
             P.axpy(1.0, power.matMult(P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -236,31 +243,27 @@ class Restriction:
         rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         return self._matrix(rows[kept], columns[kept], values[kept])
 
-    @property
-    def reserved(self) -> PETSc.Mat:
-        """A matrix with the places of P, and with those that equations would take if they held and followed no others."""
-        return self._rows_of_P(np.ones_like(self.equations.active))
+    def reserved(self, part: Part) -> PETSc.Mat:
+        """A matrix with the places of P, and with those that equations would take if they held and followed no others (collective)."""
+        P = self._rotation(part)
+        if self._n_rows:
+            M = self._matrix(*self._coupling_entries(np.ones_like(self.equations.active)))
+            P.axpy(1.0, part.of(M), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        return P
 
-    def _rows_of_P(self, which: Bools) -> PETSc.Mat:
-        """T, with the entries of M of some equations in the rows of the eliminated nodes."""
-        g, n = self.config.gdim, self.config.n_owned
-        k = np.arange(g)
-        block = np.broadcast_to((self.nodes[:, None] * g + k)[:, :, None], self.frames.shape).ravel().astype(np.int64)
-        parts = [(block, self._first + block.reshape(-1, g, g).transpose(0, 2, 1).ravel(), self.frames.ravel())]
-        if which.any():
-            parts.append(self._coupling_entries(which))
-        rows, columns, values = _sum_duplicates(*(np.concatenate(p) for p in zip(*parts)))
-        plain = np.ones((n, g), dtype=bool)
-        plain[self.nodes] = False
-        counts = np.where(plain.ravel(), 1, np.bincount(rows, minlength=n * g))
-        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-        all_columns = np.empty(indptr[-1], dtype=PETSc.IntType)
-        all_values = np.empty(indptr[-1])
-        alone = np.flatnonzero(plain.ravel())
-        all_columns[indptr[alone]], all_values[indptr[alone]] = self._first + alone, self.free.ravel()[alone]
-        united = np.repeat(~plain.ravel(), counts)
-        all_columns[united], all_values[united] = columns, values
-        return PETSc.Mat().createAIJ(self._sizes, bsize=g, csr=(indptr, all_columns, all_values), comm=self.comm)
+    def _rotation(self, part: Part) -> PETSc.Mat:
+        """T of a part of the nodes."""
+        g = self.config.gdim
+        k, row = np.arange(g), np.arange(len(part.components)).reshape(-1, g)
+        has = np.isin(self.nodes, part.nodes)
+        turned = np.isin(part.nodes, self.nodes)
+        counts = np.where(turned, g, 1)[:, None].repeat(g, axis=1).ravel()
+        indptr = np.append(0, np.cumsum(counts)).astype(PETSc.IntType)
+        columns, values = np.empty(indptr[-1], PETSc.IntType), np.empty(indptr[-1])
+        alone, block = row[~turned].ravel(), indptr[row[turned]][:, :, None] + k
+        columns[indptr[alone]], values[indptr[alone]] = part.first + alone, self.free.ravel()[part.components[alone]]
+        columns[block], values[block] = part.first + row[turned][:, None, :], self.frames[has]
+        return PETSc.Mat().createAIJ(part.sizes, bsize=g, csr=(indptr, columns, values), comm=self.comm)
 
     def cross_out(self, A: PETSc.Mat) -> None:
         """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""

@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx.algebra.entries import entries_of
 from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
@@ -152,10 +153,7 @@ class Elimination:
         term = np.concatenate([self._own, plain.followed])[order]
         value = np.concatenate([-plain.direction, plain.coefficients])[order]
         first = np.searchsorted(row[order], np.arange(len(own) + 1))
-        its = self._place[other - int(config.index_map.local_range[0])]
-        count = first[its + 1] - first[its]
-        i = np.repeat(np.arange(len(its)), count)
-        k = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + first[its][i]
+        k, i = entries_of(self._place[other - int(config.index_map.local_range[0])], first)
         return self.at_owners([(node[i], term[k], factor[i, None] * value[k])], np.ones(len(own)))
 
 
