@@ -157,6 +157,11 @@ class PushedSystem(ABC):
         return False
 
     @property
+    def rough(self) -> bool:
+        """Whether there is friction."""
+        return any(pair.rough for pair in self.pairs)
+
+    @property
     def in_contact(self) -> bool:
         """Whether there are contacts at all."""
         return bool(self.pairs)

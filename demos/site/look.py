@@ -1,6 +1,6 @@
 """Look at the pages that Sphinx has made: no broken link or picture, and what a browser shows of some of them, if there is one.
 
-python3 demos/site/look.py FOLDER
+python3 demos/site/look.py FOLDER [PICTURES]
 """
 
 from __future__ import annotations
@@ -66,8 +66,9 @@ folder = Path(sys.argv[1])
 lost = broken(folder)
 print(f"{len(list(folder.rglob('*.html')))} pages", *lost, sep="\n")
 browser = shutil.which("chromium") or shutil.which("google-chrome")
-pictures = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(tempfile.mkdtemp())
-pictures.mkdir(parents=True, exist_ok=True)
-ink = {name: show(browser, folder / f"{name}.html", pictures / f"{Path(name).name}.png") for name in SHOWN} if browser else {}
+with tempfile.TemporaryDirectory() as passing:
+    pictures = Path(sys.argv[2] if len(sys.argv) > 2 else passing)
+    pictures.mkdir(parents=True, exist_ok=True)
+    ink = {name: show(browser, folder / f"{name}.html", pictures / f"{Path(name).name}.png") for name in SHOWN} if browser else {}
 print(*(f"{name}: {part:.1%} shown" for name, part in ink.items()), sep="\n")
 sys.exit(bool(lost) or any(part < INK for part in ink.values()))

@@ -20,7 +20,7 @@ def vector(value):
 class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
 
-    linear = tolerant = in_contact = inexact = False
+    linear = tolerant = in_contact = rough = inexact = False
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0

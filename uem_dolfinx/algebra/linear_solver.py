@@ -76,6 +76,7 @@ class UnitedSolver:
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
         self.A: Any = None
+        self.ksp: Any = None
         self._use(self._first)
         #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
         self._united, self._unsymmetric = (UnitedMatrix(config, not self.iterative) for _ in range(2))
@@ -109,6 +110,8 @@ class UnitedSolver:
     def _use(self, options: dict[str, Any]) -> None:
         """Make a KSP with these options, which knows nothing yet (collective)."""
         self.options = options
+        if self.ksp is not None:
+            self.ksp.destroy()
         #: Whether the preconditioner has yet to see the present matrix; equations that it was made with.
         self._new = True
         self._made_with: UnitingEquations | None = None
@@ -121,7 +124,6 @@ class UnitedSolver:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
         self.A = self._crossed = self._served = self._factor_of = None
         self._kept.drop()
-        self.ksp.destroy()
         self._use(self._first)
         self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
 

@@ -137,6 +137,10 @@ class UnitedSystem(Protocol):
     def in_contact(self) -> bool:
         """Whether there are contacts at all."""
 
+    @property
+    def rough(self) -> bool:
+        """Whether there is friction."""
+
     def place(self, returning: bool) -> None:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
 
@@ -269,7 +273,7 @@ def solve_united(
         history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
         _report(history, verbose)
         if step.du is None:
-            error = FrictionError if getattr(system, "rough", False) else ConvergenceError
+            error = FrictionError if system.rough else ConvergenceError
             raise error(
                 f"the active set does not settle in {MOST_EXCHANGES} exchanges: take smaller load steps, or a target of finer facets",
                 history,
