@@ -91,7 +91,7 @@ class Answer:
     """What a code comes to.
 
     Attributes:
-        seconds: median of the runs that are counted.
+        seconds: of the processor, median of the runs that are counted.
         newton_iterations: of one run.
         P: force of all parts of the cylinder or sphere.
         p_max: largest pressure.

@@ -4,8 +4,8 @@ Small strain and feet on the target found once, which makes its discrete problem
 ``sliding="fixed"``. The contact forces are multipliers at the nodes of the arc with the augmentation 100 E, which took as few
 iterations as any from 0.01 E to 10,000 E. Supports are multipliers as well, as one matrix with a row for each value: what GetFEM
 makes of a region by itself took three times as long on 25,000 nodes. Its contact by rays took 1.7 times as long there. Forces
-are in units of E, without which its residuals stay above 1e-8. Seconds are taken inside, warm, from meshes with their regions in
-memory to the solution.
+are in units of E, without which its residuals stay above 1e-8. Seconds are those of the processor, taken inside, warm, from meshes
+with their regions in memory to the solution.
 """
 
 from __future__ import annotations
