@@ -16,6 +16,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra import kept_factor
 from uem_dolfinx.algebra.kept_factor import KeptFactor
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 
 COMM, COMM_SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 #: A direct solver by name, for any size and dimension.
@@ -139,3 +140,19 @@ def test_a_factor_that_does_not_serve(values, solves):
     assert (None if found is None else found[1]) == solves
     if found is not None:
         assert np.abs(found[0].array * diagonal.array - 1.0).max() < 1e-9
+
+
+def test_a_preconditioner_that_stays_reads_its_options_once():
+    """Where friction takes turns with none GMRES and CG read theirs; hypre that did so again would lose its coarsest grid and crash."""
+    options = {"ksp_type": "cg", "pc_type": "gamg", "pc_gamg_threshold": 0.02, "ksp_gmres_restart": 7}
+    solver = UnitedSolver(triangles(1), "kept_", options)
+    read = []
+    for symmetric in (False, True):
+        solver._unused = set(options)
+        solver._adapt(symmetric)
+        read.append(set(options) - solver._unused)
+        assert solver.pc.getType() == "gamg" and solver.ksp.getPC().handle == solver.pc.handle
+    assert all("ksp_type" in keys and "pc_gamg_threshold" not in keys for keys in read) and "ksp_gmres_restart" in read[0]
+    direct = UnitedSolver(triangles(1), "kept_", DIRECT | {"pc_type": "cholesky"})
+    direct._adapt(False)
+    assert direct.pc.getType() == "lu" and direct.pc.getFactorSolverType() == "mumps"

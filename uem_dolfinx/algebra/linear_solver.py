@@ -230,18 +230,23 @@ class UnitedSolver:
         if symmetric == self._symmetric:
             return
         self._symmetric = symmetric
-        pc = self.pc
-        self.ksp.setPC(pc)
+        pc, before = self.pc, self.pc.getType()
         if symmetric:
             self.ksp.setType(self._types[0])
             pc.setType(self._types[1])
         else:
-            self._types = self.ksp.getType(), pc.getType()
+            self._types = self.ksp.getType(), before
             self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
-            pc.setType({"cholesky": "lu", "icc": "ilu"}.get(self._types[1], self._types[1]))
-        # the others have options of their own
-        with self._in_database(ksp_type=self.ksp.getType(), pc_type=pc.getType()):
+            pc.setType({"cholesky": "lu", "icc": "ilu"}.get(before, before))
+        # the others have options of their own; one that stays is not shown its options again: hypre would lose what it has set up
+        reader = pc
+        if pc.getType() == before:
+            reader = PETSc.PC().create(self.config.comm)
+            reader.setType("none")
+        self.ksp.setPC(reader)
+        with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType()):
             self.ksp.setFromOptions()
+        self.ksp.setPC(pc)
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""

@@ -60,12 +60,13 @@ class UnitedMatrix:
 
     def update(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> PETSc.Mat:
         """Give the matrix its values for this P and Q, with the diagonal of K in idle columns (collective)."""
-        name = "united matrix P'KP" if P is Q else "united matrix Q'KP"
-        with timed(name):
-            self._take(P, K)
+        with timed("restriction matrix P"):
+            changed = self._know(P, K)
             part = self._part(P, P.united, P.equations.active, curvature)
-        rows, test = P.matrix(part), None if P is Q else Q.matrix(part)
-        with timed(name):
+            rows, test = P.matrix(part), None if P is Q else Q.matrix(part)
+        with timed("united matrix P'KP" if P is Q else "united matrix Q'KP"):
+            if changed:
+                self._take(K)
             self._fill(P, Q, part, curvature, rows, test)
             return self._A.mat
 
@@ -99,8 +100,8 @@ class UnitedMatrix:
         values[held] = diagonal[idle]
         self._A.mat.assemble()
 
-    def _take(self, P: Restriction, K: PETSc.Mat) -> None:
-        """Take the values of K, and its places if they are new (collective)."""
+    def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
+        """Take K's places if they are new; whether its values are (collective)."""
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
         fresh, changed = self.config.comm.allreduce(np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
@@ -112,10 +113,13 @@ class UnitedMatrix:
             held = np.flatnonzero(~P.free)
             self._K.values[self._K.find(held, held + self._first)[0]] = 1.0
             self._crossed = np.flatnonzero(self._K.values == 0.0)
-        if changed:
-            K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            self._K.values[self._crossed] = 0.0
-            self._state, self._changed = K.stateGet(), None
+        return bool(changed)
+
+    def _take(self, K: PETSc.Mat) -> None:
+        """Take the values of K (collective)."""
+        K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._K.values[self._crossed] = 0.0
+        self._state, self._changed = K.stateGet(), None
 
     def _part(self, P: Restriction, nodes: Indices, which: Bools, curvature: PETSc.Mat | None) -> Part:
         """The nodes that have an entry of K at ``nodes`` of any rank, those that ``which`` equations follow, and the curvature's."""

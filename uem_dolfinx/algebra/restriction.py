@@ -29,7 +29,6 @@ from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree
 
 #: Equations may follow each other in circles if what has gone through so many of them is rounding.
@@ -219,7 +218,6 @@ class Restriction:
         eq = self.equations
         return np.unique(eq.followed[which[eq.row]])
 
-    @timed("restriction matrix P")
     def matrix(self, part: Part) -> PETSc.Mat:
         """P of a part of the nodes that has the eliminated ones and those they follow (collective)."""
         P = self._rotation(part)
@@ -241,7 +239,7 @@ class Restriction:
         indptr, columns, values = power.getValuesCSR()
         kept = np.abs(values) > FADED
         rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-        return self._matrix(rows[kept], columns[kept], values[kept])
+        return self._matrix(rows[kept], columns[kept], values[kept], power.getSizes())
 
     def reserved(self, part: Part) -> PETSc.Mat:
         """A matrix with the places of P, and with those that equations would take if they held and followed no others (collective)."""
