@@ -39,7 +39,7 @@ args = common.arguments(__doc__, dim=("2", "3"), h=0.0, mu=0.3, part=0.88, steps
 dim, E, nu, R, mu = int(args.dim), 1.0, 0.3, 1.0, args.mu
 E_star, G = E / (2 * (1 - nu**2)), E / (2 * (1 + nu))
 #: How far it is pressed down, the size of the contact zone that h is a part of, h, steps of a push, loops.
-depth, reach, h, n, loops = (0.0012, 0.03, 1 / 60, 4, 2) if dim == 2 else (2.5e-5, 0.005, 1 / 5, 2, 1)
+depth, reach, h, n, loops = (0.0012, 0.03, 1 / 60, 4, 2) if dim == 2 else (2.5e-5, 0.005, 1 / 5, 1, 1)
 h, n, loops = args.h or h, args.steps or n, args.loops or loops
 
 # %% [markdown]
@@ -49,9 +49,10 @@ h, n, loops = args.h or h, args.steps or n, args.loops or loops
 if dim == 2:
     scene, sizes = "cattaneo_mindlin.geo", {"h": h, "zone": reach}
 else:
-    scene, sizes = "hertz_sphere.geo", {"h": h * reach, "W": 2 * R, "zone": 1.1 * reach, "growth": 1.2 / reach, "half": 1}
+    scene, sizes = "hertz_sphere.geo", {"h": h * reach, "W": 2 * R, "zone": 1.1 * reach, "growth": 0.4 / (h * reach)}
+    sizes |= {"half": 1, "flat": 1, "order": 2}
 mesh, tags = uem.read_gmsh(common.MESHES / scene, comm, gdim=dim, parameters={"R": R, **sizes})
-V = uem.function_space(mesh, 1, (dim,))
+V = uem.function_space(mesh, dim - 1, (dim,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
 material = uem.LinearElastic(E, nu, kind="plane_strain") if dim == 2 else uem.LinearElastic(E, nu)
 curved, flat = (tags[name] for name in (("disc_arc", "disc_top") if dim == 2 else ("sphere_cap", "sphere_top")))
@@ -96,6 +97,7 @@ def mindlin(r: np.ndarray, a: float, limit: float, last: float, Q: float) -> tup
 # The zone that sticks is as large as the part of the surface that its nodes have. Nodes within a facet of the edge of the contact are
 # left out of the error: Hertz' pressure falls with a vertical tangent there. The contact moves with the body, by its middle x. Under a
 # sphere nodes and facets lie against each other by chance, and nodal tractions scatter: means over rings a facet wide are compared.
+# Surfaces there are of degree 2: linear tetrahedra err three times as much on cells half as large.
 
 # %%
 rows, profiles, facet = [], [], h * reach
@@ -177,7 +179,8 @@ if args.plot:
     with uem.figure(args.plot, comm, panels=2, size=(6.0, 4.2)) as (left, right):
         if left:
             line = np.linspace(-1, 1, 801)
-            for k, colour in zip((n // 2 - 1, n - 1, n + n // 2 - 1, 2 * n - 1, 3 * n - 1), ("C0", "C1", "C2", "C3", "C4")):
+            shown = sorted({max(n // 2 - 1, 0), n - 1, n + n // 2 - 1, 2 * n - 1, 3 * n - 1})
+            for k, colour in zip(shown, ("C0", "C1", "C2", "C3", "C4")):
                 part, last, a, bound, x, q = profiles[k]
                 exact, *_ = mindlin(np.abs(line) * a, a, bound, last, part * limit)
                 left.plot(line, exact, color=colour, lw=1)
@@ -197,6 +200,6 @@ if args.plot:
 # %%
 assert results["stick_edge_error"] <= 1 and results["newton_iterations"] <= (5 if dim == 2 else 8), results
 assert results["loop_error"] < (1e-8 if loops > 1 and dim == 2 else 0.01), results
-# of first order: friction has a vertical tangent where stick ends
+# friction has a vertical tangent where stick ends
 if h <= (1 / 30, 1 / 4)[dim - 2]:
-    assert results["traction_error"] < 1.5 * h and results.get("compliance_error", 0.0) < 0.3 * h, results
+    assert results["traction_error"] < (1.5, 0.3)[dim - 2] * h and results.get("compliance_error", 0.0) < 0.3 * h, results

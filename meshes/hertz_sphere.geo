@@ -10,6 +10,7 @@ DefineConstant[
   zone = 0.05,   // the contact zone reaches this far from the tip
   growth = 30,   // cells at distance r are growth * h * r large
   order = 1,     // of the cells: 2 follows the sphere with curved ones
+  flat = 0,      // 1: the contact zone is a disc, and cells of either body grow with the depth below it as well
   half = 0       // 1: half of both bodies, not a quarter
 ];
 h_block = h * (ratio > 1 ? ratio : 1);
@@ -49,6 +50,9 @@ Physical Surface("symmetry_y") = {plane_y()};
 Field[1] = MathEval;
 Field[1].F = Sprintf("%g + (%g) * 0.5 * (1 + z / (Abs(z) + 1e-9)) + %g * Max(0, Sqrt(x*x + y*y + z*z) - %g)",
                      h_block, h_sphere - h_block, growth * h, zone);
+If (flat)
+  Field[1].F = Sprintf("%g + %g * Sqrt(Max(0, Sqrt(x*x + y*y) - %g)^2 + z*z)", h, growth * h, zone);
+EndIf
 Background Field = 1;
 Mesh.MeshSizeFromPoints = 0;
 Mesh.MeshSizeExtendFromBoundary = 0;
