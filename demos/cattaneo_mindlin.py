@@ -39,7 +39,7 @@ args = common.arguments(__doc__, dim=("2", "3"), h=0.0, mu=0.3, part=0.88, steps
 dim, E, nu, R, mu = int(args.dim), 1.0, 0.3, 1.0, args.mu
 E_star, G = E / (2 * (1 - nu**2)), E / (2 * (1 + nu))
 #: How far it is pressed down, the size of the contact zone that h is a part of, h, steps of a push, loops.
-depth, reach, h, n, loops = (0.0012, 0.03, 1 / 60, 4, 2) if dim == 2 else (2.5e-5, 0.005, 1 / 5, 1, 1)
+depth, reach, h, n, loops = (0.0012, 0.03, 1 / 60, 4, 2) if dim == 2 else (2.5e-5, 0.005, 1 / 5, 2, 1)
 h, n, loops = args.h or h, args.steps or n, args.loops or loops
 
 # %% [markdown]
