@@ -436,8 +436,8 @@ class BodySystem:
 
     @property
     def tolerant(self) -> bool:
-        """Whether the united tangent changes with the displacement, so that an iteration follows in any case."""
-        return not self.linear or self._curvature is not None
+        """Whether the united tangent changes with the displacement, so that an iteration follows in any case; momentum is kept exactly."""
+        return self.forces.dynamics is None and not (self.linear and self._curvature is None)
 
     @property
     def rough(self) -> bool:
