@@ -226,11 +226,10 @@ class BodySystem:
         if not self.pairs:
             return None
         assert isinstance(state, BodyState)
-        rows = state.rows
         with timed("uniting equations"):
             F = self._foreseen_forces(state, du)
             increment = du.array_r.reshape(-1, self.config.gdim)
-            forces = self._read_forces(rows, rows.test.pass_on(F), increment)
+            forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             left = 0.0 if self.solver.exact else accuracy
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
             foreseen = [pair.foreseen(increment) for pair in self.pairs]
@@ -238,8 +237,9 @@ class BodySystem:
             moved = increment if sliding is None else increment + sliding
             wrong = []
             for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
-                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * self._along(pair), left * driving))
-                wrong.append(pair.wrong(gap, lam, self._along(pair), least, near, self._swept, moved))
+                along = self._along(pair)
+                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
+                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept, moved))
             count = self._count(wrong)
             if not count and sliding is not None:
                 raise FrictionError(
