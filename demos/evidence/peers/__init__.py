@@ -6,9 +6,12 @@ long it took.
 
 from __future__ import annotations
 
+import json
 import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,6 +164,44 @@ def run(command: Sequence[str], folder: Path, timeout: float) -> str:
         last = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
         raise PeerError(f"{name} ended with {done.returncode}: {last.strip()}")
     return done.stdout
+
+
+@cache
+def python_with(module: str, *pythons: str) -> str | None:
+    """The first of some Pythons that has a module, if one does."""
+    for python in pythons:
+        try:
+            run([python, "-I", "-c", f"import numpy, {module}"], Path.cwd(), 60.0)
+        except PeerError:
+            continue
+        return python
+    return None
+
+
+def told_by(code: str, python: str, script: Path, timeout: float, **scene: Any) -> dict[str, Any]:
+    """What a script tells that solves the scene with another code, in a Python of its own: ``scene.npz answer.json``.
+
+    Args:
+        code: its name.
+        python: that has it.
+        script: what to run.
+        timeout: seconds until it is stopped.
+        scene: arrays, numbers and texts for it.
+
+    Returns:
+        Its answer, with the median of those ``seconds`` that count.
+
+    Raises:
+        PeerError: it failed, was stopped, or did not converge.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.savez(folder / "scene.npz", **scene)
+        run([python, "-I", str(script), "scene.npz", "answer.json"], folder, timeout)
+        told: dict[str, Any] = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
+    if not told["converged"]:
+        raise PeerError(f"{code} did not converge in {told['iterations']} iterations")
+    return told | {"seconds": float(np.median(told["seconds"][1:] or told["seconds"]))}
 
 
 def timed(solve: Callable[[], float], runs: int, timeout: float) -> float:

@@ -12,28 +12,19 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
-from functools import cache
 from pathlib import Path
 
 import numpy as np
-from evidence.peers import REPEATED, Answer, Hertz, PeerError, run
+from evidence.peers import REPEATED, Answer, Hertz, PeerError, python_with, told_by
 
 INSTALL = "apt-get install python3-getfem"
 SETTINGS = "nodal multipliers, augmentation 100 E, feet found once, MUMPS, 1 step; time from meshes in memory"
 SCRIPT = Path(__file__).with_name("getfem_script.py")
 
 
-@cache
 def interpreter() -> str | None:
     """The Python that has GetFEM: this one, or the system's."""
-    for python in dict.fromkeys((sys.executable, "/usr/bin/python3")):
-        try:
-            run([python, "-I", "-c", "import getfem, numpy"], Path.cwd(), 60.0)
-        except PeerError:
-            continue
-        return python
-    return None
+    return python_with("getfem", sys.executable, "/usr/bin/python3")
 
 
 def available() -> bool:
@@ -61,18 +52,13 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
         name: scene.nodes(name) for name, *_ in scene.supports
     }
     numbers = {"nu": scene.nu, "supports": json.dumps(scene.supports), "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        np.savez(folder / "scene.npz", x=scene.x, cells=scene.cells, upper=scene.upper, **arrays, **numbers)
-        run([python, "-I", str(SCRIPT), "scene.npz", "answer.json"], folder, timeout)
-        told = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
-    if not told["converged"]:
-        raise PeerError(f"GetFEM did not converge in {told['iterations']} iterations")
+    bodies = {"x": scene.x, "cells": scene.cells, "upper": scene.upper}
+    told = told_by("GetFEM", python, SCRIPT, timeout, **bodies, **arrays, **numbers)
     # GetFEM has its own numbers of the nodes
     here, there = (np.lexsort(np.round(x.T / scene.h, 6)) for x in (scene.x[scene.nodes(scene.contactor)], np.array(told["x"])))
     pressures = scene.E * np.array(told["forces"])[there] / scene.sizes(scene.contactor)[here]
     return Answer(
-        float(np.median(told["seconds"][1:] or told["seconds"])),
+        told["seconds"],
         told["iterations"],
         scene.parts * scene.E * told["P"],
         float(pressures.max()),

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
-from functools import cache
 from pathlib import Path
 
 import numpy as np
-from evidence.peers import REPEATED, Answer, Hertz, PeerError, run
+from evidence.peers import REPEATED, Answer, Hertz, PeerError, python_with, told_by
 
 INSTALL = "pip install KratosContactStructuralMechanicsApplication KratosLinearSolversApplication; --kratos names that python"
 SETTINGS = "ALM mortar, dual scalar multipliers, GMRES with AMGCL, 1 step; time from nodes and cells in memory"
@@ -40,16 +38,9 @@ LINEAR_SOLVER = {
 python = ""
 
 
-@cache
 def interpreter() -> str | None:
     """The Python that has Kratos: the one that was named, or this one."""
-    for candidate in filter(None, (python, sys.executable)):
-        try:
-            run([candidate, "-I", "-c", "import KratosMultiphysics.ContactStructuralMechanicsApplication"], Path.cwd(), 60.0)
-        except PeerError:
-            continue
-        return candidate
-    return None
+    return python_with("KratosMultiphysics.ContactStructuralMechanicsApplication", *filter(None, (python, sys.executable)))
 
 
 def available() -> bool:
@@ -78,19 +69,8 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
     }
     numbers = {"E": scene.E, "nu": scene.nu, "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
     words = {"supports": json.dumps(scene.supports), "linear_solver": json.dumps(LINEAR_SOLVER | {"tolerance": rtol})}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        np.savez(folder / "scene.npz", x=scene.x, cells=scene.cells, **arrays, **numbers, **words)
-        run([found, "-I", str(SCRIPT), "scene.npz", "answer.json"], folder, timeout)
-        told = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
-    if not told["converged"]:
-        raise PeerError(f"Kratos did not converge in {told['iterations']} iterations")
-    return Answer(
-        float(np.median(told["seconds"][1:] or told["seconds"])),
-        told["iterations"],
-        scene.parts * told["P"],
-        told["p_max"],
-    )
+    told = told_by("Kratos", found, SCRIPT, timeout, x=scene.x, cells=scene.cells, **arrays, **numbers, **words)
+    return Answer(told["seconds"], told["iterations"], scene.parts * told["P"], told["p_max"])
 
 
 def outward(scene: Hertz, name: str) -> np.ndarray:
