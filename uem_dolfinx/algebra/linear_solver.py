@@ -14,6 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
+from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard, without
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
@@ -44,8 +45,6 @@ KEPT_SLOWER = 2.0
 SYMMETRIC = 1e-11
 #: Types of PC that cannot see contactors much stiffer than their targets.
 MULTIGRID = ("hypre", "gamg", "ml")
-#: Types of PC that solve exactly.
-FACTORISATIONS = ("cholesky", "lu")
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)
 
@@ -208,7 +207,7 @@ class UnitedSolver:
         self.pc.setOperators(self.A)
         self._deflate(restriction, K)
         self.ksp.setOperators(self.A)
-        if symmetric and not self.iterative and self.pc.getType() in FACTORISATIONS:
+        if symmetric and not self.iterative and self.pc.getType() in mumps.FACTORISATIONS:
             self._factor_of = restriction, K
 
     def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
@@ -298,20 +297,33 @@ class UnitedSolver:
     @property
     def _tells_sign(self) -> bool:
         """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
-        return self._apart and self.ksp.getPC().getFactorSolverType() == "mumps"
+        return self._apart and mumps.solves(self.pc)
 
     @property
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
-        return self._tells_sign and bool(self.ksp.getPC().getFactorMatrix().getMumpsRinfog(12) < 0.0)
+        return self._tells_sign and mumps.is_negative(self.pc)
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
         self._kept.drop()
         self.set_operator(restriction, K, curvature)
-        with self._in_database(mat_mumps_icntl_33=1):
+        self._set_up(**mumps.TELLS_SIGN)
+        return mumps.is_negative(self.pc)
+
+    def _set_up(self, **options: Any) -> None:
+        """Let the preconditioner see the present matrix, with these options beside its own (collective)."""
+        with self._in_database(**options):
             self.ksp.setUp()
-        return bool(self.ksp.getPC().getFactorMatrix().getMumpsRinfog(12) < 0.0)
+            self.ksp.setUpOnBlocks()
+        more = mumps.more_room(self.pc)
+        if more:
+            logger.debug("MUMPS lacked room, and gets more: %s", more)
+            operators = self.ksp.getOperators()
+            self.pc.reset()
+            self.ksp.setOperators(*operators)
+            self._set_up(**options | more)
+        self._new = False
 
     @property
     def inexact(self) -> bool:
@@ -346,25 +358,22 @@ class UnitedSolver:
             near.copy(dq)
         if self.inexact:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
-        with self._in_database(**({"mat_mumps_icntl_33": 1} if self._tells_sign else {})):
-            try:
-                if self._new:
-                    with timed("factorisation or preconditioner set-up"):
-                        self.ksp.setUp()
-                        self.ksp.setUpOnBlocks()
-                    self._new = False
-                with timed("linear solve"):
-                    self.ksp.solve(rhs, dq)
-            except PETSc.Error as error:
-                kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
-                if error.ierr in NO_SUCH_TYPE:
-                    raise InputError(
-                        f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {_last_words(error)}; choose others"
-                    ) from error
-                raise LinearSolveError(
-                    f"PETSc error {error.ierr} in the united solve with {kinds} ({_last_words(error)}): "
-                    "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
+        try:
+            if self._new:
+                with timed("factorisation or preconditioner set-up"):
+                    self._set_up(**(mumps.TELLS_SIGN if self._tells_sign else {}))
+            with timed("linear solve"), self._in_database():
+                self.ksp.solve(rhs, dq)
+        except PETSc.Error as error:
+            kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
+            if error.ierr in NO_SUCH_TYPE:
+                raise InputError(
+                    f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {_last_words(error)}; choose others"
                 ) from error
+            raise LinearSolveError(
+                f"PETSc error {error.ierr} in the united solve with {kinds} ({_last_words(error)}): "
+                "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
+            ) from error
         self._tell_unused()
         reason, iterations = self.ksp.getConvergedReason(), int(self.ksp.getIterationNumber())
         if reason < 0 and self._instead and self.iterative:
@@ -377,7 +386,7 @@ class UnitedSolver:
         if reason < 0 or not np.isfinite(dq.norm()):
             raise LinearSolveError(
                 f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "
-                f"{iterations} iterations: a body may be free to move as a rigid body, the tangent may be "
+                f"{iterations} iterations{mumps.how_it_ended(self.pc)}: a body may be free to move as a rigid body, the tangent may be "
                 "indefinite (use a direct solver), or ksp_max_it too small"
             )
         self._keep_pace(iterations)

@@ -1,0 +1,53 @@
+"""Room that MUMPS had not foreseen to need: it gets more, to an end, and nobody sees more of it than the answer."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from helpers import blocks, clamp, linear, raised
+
+import uem_dolfinx as uem
+from uem_dolfinx.algebra import mumps
+from uem_dolfinx.algebra.options import has_mumps
+
+pytestmark = pytest.mark.skipif(not has_mumps(), reason="this PETSc has no MUMPS")
+
+DIRECT = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
+#: Per cent of what MUMPS foresees: less than it needs.
+TOO_LITTLE = {"mat_mumps_icntl_14": -60}
+
+
+def pressed(comm, options, friction=0.0):
+    """A block that is pressed on another one and pulled aside."""
+    b = blocks(comm, "hexahedron", 8, 9, overhang=0.25)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[1e-3, 0.0, -1e-2])]
+    contact = uem.Contact(b.high, b.low, friction=friction)
+    return b, uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact], petsc_options=DIRECT | options)
+
+
+@pytest.mark.parametrize("kind, friction", [("cholesky", 0.0), ("lu", 0.0), ("lu", 0.02)])
+def test_mumps_gets_the_room_it_asks_for(comm, kind, friction, caplog):
+    """With too little room at first the state is that of a run with enough; with friction the sign of the determinant is told."""
+    states = []
+    for room in ({}, TOO_LITTLE):
+        caplog.clear()
+        b, problem = pressed(comm, {"pc_type": kind} | room, friction)
+        with caplog.at_level(logging.DEBUG, logger="uem_dolfinx"):
+            problem.solve()
+        assert comm.bcast("MUMPS lacked room" in caplog.text) == bool(room)
+        states.append(b.scene.gather(b.u))
+    assert np.abs(states[1] - states[0]).max() <= 1e-12 * np.abs(states[0]).max()
+
+
+@pytest.mark.parametrize("room, gets", [(900, {"mat_mumps_icntl_14": 1800}), (1100, {})])
+def test_room_has_an_end(comm, room, gets, monkeypatch):
+    """A factorisation that lacked room gets twice as much as it had, up to the most; then the error tells what MUMPS says."""
+    _, problem = pressed(comm, {"pc_type": "cholesky"} | TOO_LITTLE)
+    with monkeypatch.context() as m:
+        m.setattr(mumps, "MOST_ROOM", 0)
+        raised(uem.LinearSolveError, r"MUMPS: INFOG\(1\) = -\d", problem.solve)
+    pc = problem.system.solver.pc
+    pc.getFactorMatrix().setMumpsIcntl(14, room)
+    assert mumps.more_room(pc) == gets
