@@ -4,9 +4,11 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import blocks, clamp, linear
+from dolfinx import fem
+from helpers import at, blocks, box, clamp, highest, linear, scene
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 from uem_dolfinx.contact.corners import Corners, find_corners
 
 COMM = MPI.COMM_WORLD
@@ -58,7 +60,7 @@ def vertex_of_three_facets(rise):
     some, nowhere = np.ones(1, bool), np.zeros((1, 3, 0))
     return Corners(
         np.zeros(1, int), np.full(1, 3), some, ~some, np.full(1, rise), normals[None], away[None], np.eye(3)[None], np.zeros((1, 3), int),
-        np.ones((1, 3)) / 3, np.zeros((1, 3)), np.zeros((1, 3, 3)), nowhere, np.zeros((1, 3, 0, 0)),
+        np.ones((1, 3)) / 3, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3, 3)), nowhere, np.zeros((1, 3, 0, 0)),
     )  # fmt: skip
 
 
@@ -91,3 +93,35 @@ def test_friction_in_a_vertex():
         # what the others have none of is in the first facet's plane, and at its limit
         rest = tau + 0.3 * (pressed[1] * away[1] + pressed[2] * away[2])
         assert np.linalg.norm(rest) == pytest.approx(0.3 * pressed[0]) and abs(rest @ n[0]) <= 1e-14
+
+
+@pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), (2, 0.0)])
+def test_a_valley_that_ends_with_its_target(degree, friction):
+    """A ridge is pushed along a groove and out of it: contactors that have passed its end carry nothing, moments balance."""
+    low, high = (box("hexahedron", [0, 0, z], [1, 1, z + 1.0], [n, 2, 2]) for z, n in ((-1.0, 5), (0.0, 4)))
+
+    def pose(x):
+        return x + np.outer(0.4 * np.abs(x[:, 1] - 0.5) * (1 - np.abs(x[:, 2])), [0.0, 0.0, 1.0])
+
+    s = scene(COMM, "hexahedron", [low, high], pose=pose)
+    V = compat.function_space(s.mesh, degree, (3,))
+    u = fem.Function(V)
+    bcs = [*clamp(V, s.tag("bottom", 0, at(2, -1.0))), *clamp(V, s.tag("top", 1, at(2, 1.0)), value=[0.45, 0, -1e-2])]
+    contact = uem.Contact(s.tag("high", 1, at(2, 0.0)), s.tag("low", 0, at(2, 0.0)), friction=friction)
+    problem, held, steps = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact]), [], 12
+    for _ in uem.load_steps(problem, steps):
+        held.append(COMM.allreduce(int(contact.pair.trial.in_corner.sum())))
+        x = problem.config.x[contact.pair.nodes, 0]
+        assert highest(COMM, x[contact.pair.trial.active]) <= 1.0 + 0.1 / 5 + 1e-3
+        balance = contact.balance()
+        assert balance.force <= 1e-14 and balance.moment <= 1e-10
+    assert len(held) == steps and held[0] > held[-1] > 0
+
+
+def test_blocks_of_equal_width_pushed_aside():
+    """Contactors past the end, between two facets whose ends bulge, are held where they stand: the moment is zero to rounding."""
+    b = blocks(COMM, "hexahedron", 4, 5, degree=2)
+    contact = uem.Contact(b.high, b.low)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[1e-3, 0.0, -1e-2])]
+    uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact]).solve()
+    assert contact.balance().moment <= 1e-13

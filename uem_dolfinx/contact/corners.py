@@ -14,9 +14,9 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.state import PairState
-from uem_dolfinx.geometry.projection import gap_hessians
-from uem_dolfinx.geometry.search import IN_PLANE, MeshTarget
-from uem_dolfinx.geometry.shapes import closest_point
+from uem_dolfinx.geometry.projection import FacetProjection, gap_hessians
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.shapes import beneath, closest_point
 
 #: Facets whose slopes differ by less are one plane.
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]
@@ -41,7 +41,8 @@ class Corners:
         axes: orthonormal; the first ``count`` span the normals, the very first is their mean ``(k, gdim, gdim)``.
         nodes: global nodes of the first facet ``(k, nn)``.
         weights: shape functions at the closest point of the shared place ``(k, nn)``.
-        foot: that point ``(k, gdim)``.
+        foot: that point ``(k, gdim)``; past the target's end, where the edge is continued, as far as the contactor is.
+        beyond: how far that is, and in which direction ``(k, gdim)``.
         x: positions of the nodes ``(k, nn, gdim)``.
         dN: derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``.
         ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
@@ -58,6 +59,7 @@ class Corners:
     nodes: Ints
     weights: Array
     foot: Array
+    beyond: Array
     x: Array
     dN: Array
     ddN: Array
@@ -191,7 +193,7 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
         common[i] &= (first.nodes[i][:, :, None] == other.nodes[:, None, :]).any(axis=2)
         middles[i, j] = other.x.mean(axis=1)
     count = (facets >= 0).sum(axis=1)
-    place = _shared_place(target, first.x, points, common, count, normals)
+    place = _shared_place(target, first, points, common, count, normals)
     arms = middles - place.foot[:, None]
     arm = arms[np.arange(k), count - 1]
     arm /= np.linalg.norm(arm, axis=1, keepdims=True)
@@ -199,7 +201,7 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
     rising = np.where(earlier, np.einsum("kg,kjg->kj", arm, normals), np.inf).min(axis=1)
     return Corners(
         which, count, place.found, place.loose, rising, normals, _away(arms, normals, count), _axes(normals, count), first.nodes,
-        place.weights, place.foot, first.x, place.dN, place.ddN,
+        place.weights, place.foot, place.beyond, first.x, place.dN, place.ddN,
     )  # fmt: skip
 
 
@@ -209,12 +211,17 @@ class _Place:
     loose: Bools
     weights: Array
     foot: Array
+    beyond: Array
     dN: Array
     ddN: Array
 
 
-def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, count: Ints, normals: Array) -> _Place:
+def _shared_place(
+    target: MeshTarget, first: FacetProjection, points: Array, common: Bools, count: Ints, normals: Array
+) -> _Place:
     """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three.
+
+    A side that ends where the target does is continued for contactors that are past that end.
 
     Two facets that share only a vertex stand for others beside them; their planes meet in a line.
     """
@@ -223,9 +230,15 @@ def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, co
     d = shape.dim - 1
     found, loose, weights = np.zeros(k, bool), np.zeros(k, bool), np.zeros((k, nn))
     dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
+    x, beyond, past = first.x, np.zeros(points.shape), (first.beyond != 0).any(axis=1)
     for side, nodes, _, _ in shape.edges():
         i = np.flatnonzero((count == 2) & common[:, nodes].all(axis=1) & ~found)
         s, _ = closest_point(side, x[i][:, nodes], points[i])
+        if d:
+            j = np.flatnonzero(past[i])
+            line, end = x[i[j]][:, nodes], s[j]
+            s[j] = beneath(side, line, end, points[i[j]])
+            beyond[i[j]] = np.einsum("ka,kag->kg", side.functions(s[j]) - side.functions(end), line)
         tab = side.tabulate(s)
         weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
         found[i] = True
@@ -238,7 +251,7 @@ def _shared_place(target: MeshTarget, x: Array, points: Array, common: Bools, co
             loose[i] = True
             weights[i], dN[i, :, 0] = _on_line(target, x[i], points[i], node, normals[i])
     foot = np.einsum("ka,kag->kg", weights, x)
-    return _Place(found, loose, weights, foot, dN, ddN)
+    return _Place(found, loose, weights, foot, beyond, dN, ddN)
 
 
 def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Array) -> tuple[Array, Array]:
@@ -252,12 +265,7 @@ def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Ar
     along /= np.where(length > 0, length, 1.0)
     vertex = x[:, node]
     foot = vertex + np.einsum("kg,kg->k", along, points - vertex)[:, None] * along
-    xi = np.tile(target.shape.nodes[node], (len(x), 1))
-    for _ in range(IN_PLANE):
-        tab = target.shape.tabulate(xi)
-        t = np.einsum("kaf,kag->kfg", tab.dN, x)
-        m = np.einsum("kfg,keg->kfe", t, t)
-        xi = xi + np.linalg.solve(m, np.einsum("kfg,kg->kf", t, foot - np.einsum("ka,kag->kg", tab.N, x))[..., None])[..., 0]
+    xi = beneath(target.shape, x, np.tile(target.shape.nodes[node], (len(x), 1)), foot)
     tab = target.shape.tabulate(xi)
     t = np.einsum("kaf,kag->kfg", tab.dN, x)
     m = np.einsum("kfg,keg->kfe", t, t)

@@ -16,7 +16,7 @@ import numpy as np
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, closest_point, unit_normals
+from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
 
@@ -26,9 +26,6 @@ LEAST_LEAN = 0.1
 #: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
 #: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
-#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
-#: [bound; iterations; -]
-IN_PLANE = 4
 #: Facets whose distances or heights differ by less are equally near.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
 EQUALLY_NEAR = 1e-9
@@ -123,15 +120,9 @@ class MeshTarget:
     def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
         """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
         p, x = projection, projection.x[which]
-        t = np.einsum("kaf,kag->kfg", p.dN[which], x)
-        xi, tab, foot = p.xi[which], self.shape.tabulate(p.xi[which]), p.foot[which]
-        end = foot + p.beyond[which]
-        for _ in range(IN_PLANE):
-            slope = np.einsum("kaf,kag->kfg", tab.dN, x)
-            missing = np.einsum("kfg,kg->kf", t, end - foot)
-            xi = xi + np.linalg.solve(np.einsum("kfg,keg->kfe", t, slope), missing[..., None])[..., 0]
-            tab = self.shape.tabulate(xi)
-            foot = np.einsum("ka,kag->kg", tab.N, x)
+        xi = beneath(self.shape, x, p.xi[which], p.foot[which] + p.beyond[which])
+        tab = self.shape.tabulate(xi)
+        foot = np.einsum("ka,kag->kg", tab.N, x)
         return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     def chords(self, projection: FacetProjection) -> Array:

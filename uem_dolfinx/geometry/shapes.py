@@ -15,6 +15,10 @@ import numpy.typing as npt
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.forms import create_lagrange_element, reference_topology
 
+#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+#: [bound; iterations; -]
+IN_PLANE = 4
+
 
 @dataclass(frozen=True)
 class Tabulated:
@@ -170,6 +174,19 @@ def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -
         xi[nearer] = (o + s @ D)[nearer]
         d2 = np.where(nearer, s2, d2)
     return xi, d2
+
+
+def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> Array:
+    """Coordinates ``(n, fdim)`` of what lies under ``places (n, gdim)``, seen along the normal at ``xi (n, fdim)``.
+
+    Facets ``x (n, nn, gdim)`` are continued past their sides.
+    """
+    t = tangents(shape.tabulate(xi), x)
+    for _ in range(IN_PLANE):
+        tab = shape.tabulate(xi)
+        missing = np.einsum("nfg,ng->nf", t, places - np.einsum("na,nag->ng", tab.N, x))
+        xi = xi + np.linalg.solve(np.einsum("nfg,neg->nfe", t, tangents(tab, x)), missing[..., None])[..., 0]
+    return xi
 
 
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
