@@ -237,11 +237,11 @@ if args.output and last is not None:
 
 # %% [markdown]
 # ## The same scene
-# On one mesh all codes agree in P: multipliers to rounding, a penalty but for its overlap, mortar but for its other equations. Nodal
-# pressures scatter in 3D, and a penalty's may jump at one edge.
+# On one mesh all codes agree in P: multipliers to rounding, a penalty but for its overlap, mortar but for its other equations, both of
+# which coarse meshes in space show most. Nodal pressures scatter in 3D, and a penalty's may jump at one edge.
 
 # %%
 for run in runs:
-    bound = {"calculix": 0.01, "uem_mortar": 0.02, "kratos": 0.02}.get(run["code"], 1e-3)
+    bound = {"calculix": 0.01 if dim == 2 else 0.02, "uem_mortar": 0.02, "kratos": 0.02}.get(run["code"], 1e-3)
     assert run["difference"] is None or abs(run["difference"]) < bound, run
     assert mu or dim == 3 or run["code"] == "calculix" or abs(run["p_max_ratio"] - 1) < 0.06, run

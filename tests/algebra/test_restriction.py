@@ -21,6 +21,7 @@ from petsc4py import PETSc
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.linear_solver import UnitedSolver, rigid_body_modes
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 
 COMM = MPI.COMM_WORLD
@@ -251,3 +252,13 @@ def test_forces_keep_their_sum_and_moment():
     moments = COMM.allreduce(np.array([(x[:, 0] * nodal[:, 1]).sum(), (x[:, 0] * target[:, 1]).sum()]))
     assert np.abs(sums[0] - sums[1]).max() < 1e-14
     assert abs(moments[0] - moments[1]) < 1e-14
+
+
+@pytest.mark.parametrize("m", [0, 1, 500])
+def test_sums_of_rows(m):
+    """They are NumPy's, to the last bit, and floats where there is nothing to add."""
+    rng = np.random.default_rng(m)
+    places, values, sums = rng.integers(0, 7, m), rng.normal(size=(m, 3)), np.zeros((7, 3))
+    np.add.at(sums, places, values)
+    added = sums_of_rows(places, values, 7)
+    assert added.dtype == float and np.array_equal(added, sums)

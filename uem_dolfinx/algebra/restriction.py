@@ -163,7 +163,12 @@ class Restriction:
         m, k = len(eq), np.arange(g)
         counts = np.array(self.comm.allgather(m))
         first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
-        terms = np.broadcast_to(eq.row[:, None], eq.coefficients.shape), eq.followed[:, None] * g + k, eq.coefficients
+        eliminated = np.zeros((self.config.n_owned, 1))
+        eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
+        on = self.config.ask_owners(eq.followed, eliminated)[:, 0] > 0
+        if not self.comm.allreduce(int(on.any())):
+            return int(sizes[1] > 0)
+        terms = np.broadcast_to(eq.row[on, None], (on.sum(), g)), eq.followed[on, None] * g + k, eq.coefficients[on]
         own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift
         C = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in terms)), (sizes, self._sizes[1]))
         L = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in own)), (self._sizes[0], sizes))

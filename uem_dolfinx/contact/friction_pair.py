@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.contact import friction
 from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.checks import check_driven
@@ -91,9 +91,7 @@ class FrictionalPair(ContactPair):
     def _relative(self, du: Array, weights: tuple[Ints, Ints, Array]) -> Array:
         """How an increment ``(n_owned, gdim)`` moves contactors relative to what they follow ``(n, gdim)`` (collective)."""
         row, followed, weight = weights
-        move = du[self.nodes]
-        np.subtract.at(move, row, weight[:, None] * self.config.ask_owners(followed, du))
-        return move
+        return du[self.nodes] - sums_of_rows(row, weight[:, None] * self.config.ask_owners(followed, du), len(self.nodes))
 
     @property
     def _off_anchor(self) -> Array:

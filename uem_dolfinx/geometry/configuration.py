@@ -13,7 +13,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Ints, sums_of_rows
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.parallel import Exchange
 
@@ -128,9 +128,7 @@ class Configuration:
     def add_at_owners(self, nodes: Ints, values: Array) -> Array:
         """Sums of values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners ``(n_owned, k)`` (collective)."""
         there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
-        out = np.zeros((self.n_owned, values.shape[1]))
-        np.add.at(out, there - self._first_nodes[self.comm.rank], arrived)
-        return out
+        return sums_of_rows(there - self._first_nodes[self.comm.rank], arrived, self.n_owned)
 
     @cached_property
     def size(self) -> float:

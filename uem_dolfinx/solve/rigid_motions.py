@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
@@ -61,9 +61,7 @@ class RigidMotions:
     def _middles(self) -> Array:
         """Means of the bodies' nodes ``(count, gdim)`` (collective)."""
         own = self._body[: self.config.n_owned]
-        sums = np.zeros((self.count, self.config.gdim + 1))
-        np.add.at(sums, own, np.column_stack([np.ones(len(own)), self._places]))
-        sums = self.comm.allreduce(sums)
+        sums = self.comm.allreduce(sums_of_rows(own, np.column_stack([np.ones(len(own)), self._places]), self.count))
         return np.asarray(sums[:, 1:] / sums[:, :1])
 
     def _modes(self, x: Array, body: Ints) -> Array:
@@ -96,8 +94,7 @@ class RigidMotions:
         rows = self._spread(np.einsum("nmg,ng->nm", modes, equations.direction), own[equations.node])
         body = known[:, 0].astype(np.int64)
         terms = np.einsum("nmg,ng->nm", self._modes(known[:, 1 : 1 + g], body), equations.coefficients)
-        np.subtract.at(rows, equations.row, self._spread(terms, body))
-        return rows
+        return rows - sums_of_rows(equations.row * self.count + body, terms, len(rows) * self.count).reshape(rows.shape)
 
     def open_motions(self, equations: UnitingEquations | None, resistance: float = OPEN) -> Array:
         """Orthonormal motions that neither conditions nor active equations resist ``(n_motions, k)`` (collective).
@@ -111,7 +108,7 @@ class RigidMotions:
         held = self._held()
         resisted = held.T @ held
         if equations is not None:
-            rows = self.rates(equations)[equations.active]
+            rows = self.rates(equations.select(equations.active))
             resisted = resisted + rows.T @ rows
         values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
         return vectors[:, values < resistance**2]
@@ -148,8 +145,7 @@ class RigidMotions:
         """
         own = self._body[: self.config.n_owned]
         work = -np.einsum("nmg,ng->nm", self._modes(self._places, own), residual)
-        force = np.zeros((self.count, self.n_modes))
-        np.add.at(force, own, work)
+        force = sums_of_rows(own, work, self.count)
         total, scale = (
             sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual if among is None else among).sum())))
         )
