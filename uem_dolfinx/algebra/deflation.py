@@ -20,6 +20,7 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
+from uem_dolfinx.algebra.options import has_mumps
 from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -55,7 +56,7 @@ class Deflation:
         self._solver.setType("preonly")
         self._solver.setOperators(W.transposeMatMult(self.AW))
         pc = self._solver.getPC()
-        if PETSc.Sys.hasExternalPackage("mumps"):
+        if has_mumps():
             pc.setType("lu")
             pc.setFactorSolverType("mumps")
             pc.setFactorSetUpSolverType()

@@ -163,6 +163,7 @@ class Restriction:
         m, k = len(eq), np.arange(g)
         counts = np.array(self.comm.allgather(m))
         first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
+        # terms at nodes of which nothing is eliminated lead nowhere
         eliminated = np.zeros((self.config.n_owned, 1))
         eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
         on = self.config.ask_owners(eq.followed, eliminated)[:, 0] > 0

@@ -16,7 +16,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import FacetProjection, gap_hessians
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.shapes import beneath, closest_point
+from uem_dolfinx.geometry.shapes import beneath, closest_point, tangents
 
 #: Facets whose slopes differ by less are one plane.
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]
@@ -221,9 +221,8 @@ def _shared_place(
 ) -> _Place:
     """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three.
 
-    A side that ends where the target does is continued for contactors that are past that end.
-
-    Two facets that share only a vertex stand for others beside them; their planes meet in a line.
+    A side that ends where the target does is continued for contactors that are past that end. Two facets that share only a vertex stand
+    for others beside them; their planes meet in a line.
     """
     k, nn = common.shape
     shape = target.shape
@@ -237,8 +236,8 @@ def _shared_place(
         if d:
             j = np.flatnonzero(past[i])
             line, end = x[i[j]][:, nodes], s[j]
-            s[j] = beneath(side, line, end, points[i[j]])
-            beyond[i[j]] = np.einsum("ka,kag->kg", side.functions(s[j]) - side.functions(end), line)
+            s[j], there = beneath(side, line, end, points[i[j]])
+            beyond[i[j]] = np.einsum("ka,kag->kg", there.N - side.functions(end), line)
         tab = side.tabulate(s)
         weights[i[:, None], nodes], dN[i[:, None], nodes], ddN[i[:, None], nodes] = tab.N, tab.dN, tab.ddN
         found[i] = True
@@ -265,9 +264,8 @@ def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Ar
     along /= np.where(length > 0, length, 1.0)
     vertex = x[:, node]
     foot = vertex + np.einsum("kg,kg->k", along, points - vertex)[:, None] * along
-    xi = beneath(target.shape, x, np.tile(target.shape.nodes[node], (len(x), 1)), foot)
-    tab = target.shape.tabulate(xi)
-    t = np.einsum("kaf,kag->kfg", tab.dN, x)
+    _, tab = beneath(target.shape, x, np.tile(target.shape.nodes[node], (len(x), 1)), foot)
+    t = tangents(tab, x)
     m = np.einsum("kfg,keg->kfe", t, t)
     rate = np.linalg.solve(m, np.einsum("kfg,kg->kf", t, along)[..., None])[..., 0]
     return tab.N, np.einsum("kaf,kf->ka", tab.dN, rate)

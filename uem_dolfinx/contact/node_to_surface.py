@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.corners import Corners
 from uem_dolfinx.contact.coupling import NORMAL, LabelledEquations, Placement
 from uem_dolfinx.contact.state import PairState
@@ -213,9 +213,8 @@ class NodeToSurface:
         row, followed, weight = self._beneath(placement)
         held = weight[:, None] * (1.0 - self.config.ask_owners(followed, self._free_of_owned.astype(float)))
         moved = self.config.ask_owners(followed, way)
-        share, by_held, by_all = np.zeros((3, len(self.nodes), self.config.gdim))
-        for total, part in ((share, held), (by_held, held * moved), (by_all, weight[:, None] * moved)):
-            np.add.at(total, row, part)
+        parts = held, held * moved, weight[:, None] * moved
+        share, by_held, by_all = (sums_of_rows(row, part, len(self.nodes)) for part in parts)
         most = share > 0.5
         over = np.where(most, by_held / np.where(most, share, 1.0), by_all)
         return np.asarray(np.where(self.free, 0.0, way[self.nodes] - over))

@@ -64,9 +64,8 @@ class Valleys:
         if c is None:
             return projection, None
         at_corner: dict[str, Any] = {"normal": c.axes[:, 0], "gap": c.gaps(points[held])[:, 0], "facet": state.facet[held]}
-        return projection.with_rows(
-            held, at_corner | {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": c.beyond}
-        ), c
+        at_corner |= {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": c.beyond}
+        return projection.with_rows(held, at_corner), c
 
     def place_again(
         self, nearest: Projection, left: Bools, points: Array, state: PairState

@@ -120,8 +120,7 @@ class MeshTarget:
     def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
         """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
         p, x = projection, projection.x[which]
-        xi = beneath(self.shape, x, p.xi[which], p.foot[which] + p.beyond[which])
-        tab = self.shape.tabulate(xi)
+        xi, tab = beneath(self.shape, x, p.xi[which], p.foot[which] + p.beyond[which])
         foot = np.einsum("ka,kag->kg", tab.N, x)
         return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 

@@ -176,17 +176,18 @@ def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -
     return xi, d2
 
 
-def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> Array:
-    """Coordinates ``(n, fdim)`` of what lies under ``places (n, gdim)``, seen along the normal at ``xi (n, fdim)``.
+def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> tuple[Array, Tabulated]:
+    """What lies under ``places (n, gdim)``, seen along the normal at ``xi (n, fdim)``: its coordinates, and the functions there.
 
     Facets ``x (n, nn, gdim)`` are continued past their sides.
     """
-    t = tangents(shape.tabulate(xi), x)
+    tab = shape.tabulate(xi)
+    t = tangents(tab, x)
     for _ in range(IN_PLANE):
-        tab = shape.tabulate(xi)
         missing = np.einsum("nfg,ng->nf", t, places - np.einsum("na,nag->ng", tab.N, x))
         xi = xi + np.linalg.solve(np.einsum("nfg,neg->nfe", t, tangents(tab, x)), missing[..., None])[..., 0]
-    return xi
+        tab = shape.tabulate(xi)
+    return xi, tab
 
 
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
