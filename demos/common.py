@@ -55,6 +55,12 @@ def cg(amg: str = "", rtol: float | None = None) -> dict[str, Any]:
     return {"ksp_type": "cg"} | uem.multigrid_options(amg) | ({} if rtol is None else {"ksp_rtol": rtol})
 
 
+def direct() -> dict[str, Any]:
+    """PETSc options of a factorisation, MUMPS where PETSc has it: it leaves no more than rounding."""
+    mumps = {"pc_factor_mat_solver_type": "mumps"} if PETSc.Sys.hasExternalPackage("mumps") else {}
+    return {"ksp_type": "preonly", "pc_type": "lu"} | mumps
+
+
 def numbers(text: str, mark: str = ",") -> list[int]:
     """Whole numbers of a list, parted by a mark."""
     return [int(float(word)) for word in text.split(mark) if word]

@@ -84,7 +84,7 @@ seconds = time.perf_counter() - start
 # %% [markdown]
 # ## The figures
 # Both halves together carry P. The half width is the length of surface that belongs to active contactors, which is exact to
-# half a cell. The scatter is the root mean square of what the pressures differ from Hertz', over p0, within 0.95 a: on meshes that
+# half a cell. The scatter is the rms deviation of nodal pressures from Hertz, relative to p0, within 0.95 a: on meshes that
 # do not match, as with `--ratio 1.3`, it is large and stays with node_to_surface, and is small with mortar.
 
 # %%

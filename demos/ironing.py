@@ -12,6 +12,7 @@ python3 demos/ironing.py --plot ironing.png
 # Without friction the slab stores energy and gives it back: after one pitch of the mesh the scene looks the same again, so that
 # the drag force does no work over a pitch and its mean is zero. The faceted surface makes it go up and down between. With
 # `--coupling mortar` whole facets slide over each other: no node jumps from facet to facet, and no step is cut for it.
+# As the tool leaves the slab, the slab's corner is inside one of its facets for a moment, which the package warns of.
 
 # %%
 import time

@@ -13,9 +13,9 @@ python3 demos/peers.py --plot peers.png
 # - `uem`: the united elements with the package's defaults, but with feet on the target that are found once, as GetFEM finds them;
 # - `uem_finite`: the same with feet that move in every iteration, the default;
 # - `uem_mortar`: mortar coupling, rows found once, which pairs whole facets;
-# - `calculix`: a penalty, see `evidence/peers/by_calculix.py`;
-# - `getfem`: multipliers, see `evidence/peers/by_getfem.py`;
-# - `kratos`: mortar with an augmented Lagrangian, in 3D, see `evidence/peers/by_kratos.py`; `--kratos` names a Python that has it.
+# - `calculix`: a penalty, see `benchmarks/peers/by_calculix.py`;
+# - `getfem`: multipliers, see `benchmarks/peers/by_getfem.py`;
+# - `kratos`: mortar with an augmented Lagrangian, in 3D, see `benchmarks/peers/by_kratos.py`; `--kratos` names a Python that has it.
 #
 # With `--friction 0.3` the scene is that of `cattaneo_mindlin.py` in 2D, led down in one step and sideways in another, so that part of
 # the contact slips. GetFEM's nodal contact knows no history of friction, and is left out.
@@ -35,10 +35,10 @@ import numpy as np
 import ufl
 from common import comm
 from dolfinx import fem
-from evidence import peers
-from evidence.measure import machine
-from evidence.peers import by_calculix, by_getfem, by_kratos
-from evidence.problems import hertz_answer
+from benchmarks import peers
+from benchmarks.measure import machine
+from benchmarks.peers import by_calculix, by_getfem, by_kratos
+from benchmarks.problems import hertz_answer
 
 import uem_dolfinx as uem
 

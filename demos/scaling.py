@@ -31,7 +31,7 @@ import numpy as np
 import ufl
 from common import comm
 from dolfinx import fem
-from evidence.traffic import Surfaces, plates, search_traffic
+from benchmarks.traffic import Surfaces, plates, search_traffic
 
 import uem_dolfinx as uem
 

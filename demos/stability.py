@@ -16,7 +16,7 @@ python3 demos/stability.py --methods united --quick
 # - *wrong*: anything else, with the figure that shows it.
 #
 # Right is what follows from a closed form, from balances, or from the conditions of contact, which are read from the bodies and not
-# from the method (`evidence/cases_laws.py`). The cases are in `evidence/cases_*.py`.
+# from the method (`benchmarks/cases_laws.py`). The cases are in `benchmarks/cases_*.py`.
 
 # %%
 import argparse
@@ -29,9 +29,9 @@ from pathlib import Path
 import common
 import numpy as np
 from common import comm
-from evidence import cases_bending, cases_friction, cases_motion, cases_pressing, cases_scales, cases_touching, methods
-from evidence.cases import COLUMNS, Column, Trial, judge
-from evidence.cases_scales import springs
+from benchmarks import cases_bending, cases_friction, cases_motion, cases_pressing, cases_scales, cases_touching, methods
+from benchmarks.cases import COLUMNS, Column, Trial, judge
+from benchmarks.cases_scales import springs
 
 import uem_dolfinx as uem
 

@@ -70,7 +70,7 @@ with open(file, "w", encoding="utf-8") as out:
 # %%
 def small() -> dict[str, list[str]]:
     """Options of every demo's first small configuration, but of this one."""
-    lines = (HERE / "evidence" / "small.txt").read_text(encoding="utf-8").splitlines()
+    lines = (HERE / "small.txt").read_text(encoding="utf-8").splitlines()
     parted = [line.partition(":") for line in lines if line and not line.startswith("#")]
     return {name: options.partition(";")[0].split() for name, _, options in parted if name != Path(__file__).stem}
 

@@ -29,11 +29,11 @@ from pathlib import Path
 
 import common
 from common import comm
-from evidence import methods
-from evidence.graphs import draw_all
-from evidence.measure import at_a_glance, at_equal_error, grouped, label, machine, measure, name_of, rate, sweep
-from evidence.problems import bar_impact, cattaneo, hertz_answer, hertz_cylinder, indenter
-from evidence.signorini import signorini
+from benchmarks import methods
+from benchmarks.graphs import draw_all
+from benchmarks.measure import at_a_glance, at_equal_error, grouped, label, machine, measure, name_of, rate, sweep
+from benchmarks.problems import bar_impact, cattaneo, hertz_answer, hertz_cylinder, indenter
+from benchmarks.signorini import signorini
 
 args = common.arguments(
     __doc__,

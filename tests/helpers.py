@@ -1,4 +1,4 @@
-"""What tests assert in common, and the scenes they do it on, which are those of the evidence."""
+"""What tests assert in common, and the scenes of boxes and blocks that most do it on."""
 
 from __future__ import annotations
 
@@ -15,33 +15,15 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 import pytest
+from benchmarks.scenes import CELLS, NU, Array, Body, Ints, Scene, at, box, clamp, oedometric, rotation, scene
+from block_scenes import Blocks, arch, blocks, linear, modulus, run, st_venant
 from common import outside_mpi
-from evidence.scenes import (
-    CELLS,
-    NU,
-    Array,
-    Blocks,
-    Body,
-    Ints,
-    Scene,
-    arch,
-    at,
-    blocks,
-    box,
-    clamp,
-    linear,
-    modulus,
-    oedometric,
-    rotation,
-    run,
-    scene,
-    st_venant,
-)  # fmt: skip
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.friction_pair import FrictionalPair
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.solve.tangent import curvature_of
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 #: Oedometric modulus over Young's modulus.
@@ -106,7 +88,7 @@ def complementary(contact: uem.Contact, length: float, force: float) -> None:
     assert highest(comm, np.abs(gap[active])) <= length
 
 
-def coulomb(pair: FrictionalPair, length: float, force: float) -> None:
+def coulomb(pair: Interface, length: float, force: float) -> None:
     """Assert Coulomb's law: friction in its cone, no motion where contactors stick, friction against it where they slip (collective).
 
     Args:
@@ -115,11 +97,11 @@ def coulomb(pair: FrictionalPair, length: float, force: float) -> None:
         force: nodal forces below it are rounding.
     """
     comm, trial, friction = pair.config.comm, pair.trial, pair.trial.friction
-    assert friction is not None
-    tau, slip, s = pair.tangential(friction.tau), pair.slip, pair.directions
-    bound = pair.mu * trial.lam
-    rubbing, slipping = pair.rubbing, pair.slipping
-    stuck = rubbing & friction.stick
+    assert friction is not None and pair.friction is not None
+    along = pair.friction
+    tau, slip, s = along.frame.tangential(friction.tau), along.frame.slip, along.directions(trial)
+    bound, slipping = along.bound(trial.lam), along.slipping(trial)
+    stuck = along.active(trial) & friction.stick
     assert highest(comm, (np.linalg.norm(tau, axis=1) - bound)[~trial.in_corner]) <= force
     assert highest(comm, np.linalg.norm(slip[stuck], axis=1)) <= length
     assert highest(comm, np.linalg.norm(tau + bound[:, None] * s, axis=1)[slipping]) <= force
@@ -143,9 +125,10 @@ def lawful(contact: uem.Contact, size: float = 1.0, force: float = 1.0) -> None:
     comm, trial = contact.config.comm, contact.pair.trial
     complementary(contact, 1e-12 * size, 1e-10 * force)
     assert lowest(comm, contact.pressures) >= -1e-10 * force
-    # control forces of degree 2 add up to the nodal ones
-    control, nodal = (float(comm.allreduce(values.sum())) for values in (trial.lam, trial.nodal))
+    # control forces of degree 2 add up to the nodal ones; forces of the facets of a corner to more than along their mean normal
+    control, nodal = (float(comm.allreduce(values[~trial.in_corner].sum())) for values in (trial.lam, trial.nodal))
     assert control == pytest.approx(nodal, rel=1e-9, abs=1e-12 * force)
+    assert highest(comm, (trial.nodal - trial.lam)[trial.in_corner]) <= 1e-10 * force
     balance = contact.balance()
     if balance is not None:
         assert balance.force <= 1e-12
@@ -201,7 +184,7 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     residual(smooth)
     facets = pair.projection.facet.copy()
     A = problem.forces.update_tangent().copy()
-    curvature = system.curvature()
+    curvature = curvature_of(system.pairs, system.forces.vector(), system._apart, False)
     assert curvature is not None
     du = A.createVecRight()
     du.array[:] = direction[: problem.config.n_owned].ravel()
@@ -218,7 +201,7 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
 def environment(**more: str) -> dict[str, str]:
     """For a process that is told from this one's MPI, with this checkout of the package, its demos and its tests."""
     kept, here = outside_mpi(), Path(__file__).resolve().parents[1]
-    paths = [here, here / "demos", here / "tests", *filter(None, [kept.get("PYTHONPATH")])]
+    paths = [here, here / "demos", here / "tests", here / "tests" / "scenes", *filter(None, [kept.get("PYTHONPATH")])]
     return kept | {"PYTHONPATH": os.pathsep.join(map(str, paths))} | more
 
 

@@ -16,7 +16,7 @@ import thresholds
 REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
-    ("arrays", "errors", "compat", "log", "parallel", "given", "files", "forms"), ("geometry",), ("algebra",), ("contact",),
+    ("arrays", "errors", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",), ("contact",),
     ("materials", "dynamics"), ("restart",), ("solve",), ("output",), ("scripting",),
 ]  # fmt: skip
 LONGEST = 450
@@ -46,18 +46,19 @@ def imports(files):
     return edges
 
 
+def reached(start, edges):
+    """Nodes that edges lead to from this one."""
+    seen, todo = set(), [start]
+    while todo:
+        new = edges.get(todo.pop(), set()) - seen
+        seen |= new
+        todo += new
+    return seen
+
+
 def circles(edges):
     """Sets of nodes that reach each other."""
-
-    def reach(start):
-        seen, todo = set(), [start]
-        while todo:
-            new = edges.get(todo.pop(), set()) - seen
-            seen |= new
-            todo += new
-        return seen
-
-    far = {node: reach(node) for node in edges}
+    far = {node: reached(node, edges) for node in edges}
     return sorted({tuple(sorted(m for m in far[n] if n in far.get(m, ()))) for n in edges if n in far[n]})
 
 
@@ -84,7 +85,7 @@ def test_circles_are_seen():
 
 def test_no_circle_of_imports_between_files():
     assert circles(package()) == []
-    assert circles(imports(modules(REPOSITORY / "demos" / "evidence"))) == []
+    assert circles(imports(modules(REPOSITORY / "demos" / "benchmarks"))) == []
 
 
 def test_no_circle_of_imports_between_rooms():
@@ -100,6 +101,18 @@ def test_imports_point_one_way():
     edges = package()
     assert {room(name) for name in edges} == set(floor)
     assert [(a, b) for a, found in edges.items() for b in found if floor[room(b)] > floor[room(a)]] == []
+
+
+def test_demos_stand_on_their_own():
+    """They import nothing from the tests, and the package nothing from either; only studies import rival methods."""
+    tests, demos = ({path.stem for path in python_files(top)} for top in ("tests", "demos"))
+    for path in python_files("uem_dolfinx", "demos"):
+        roots = set(re.findall(r"^\s*(?:from|import) (\w+)", path.read_text(encoding="utf-8"), re.M))
+        assert not roots & (tests if "demos" in path.parts else tests | demos | {"benchmarks"}), path
+    scripts = {path.stem: path for path in (REPOSITORY / "demos").glob("*.py")}
+    edges = imports(modules(REPOSITORY / "demos" / "benchmarks") | scripts)
+    with_rivals = {name for name in scripts if any(to.startswith("benchmarks.rivals") for to in reached(name, edges))}
+    assert with_rivals == {"cost", "peers", "stability", "work_precision"}
 
 
 def test_tests_do_not_import_from_each_other():
@@ -132,12 +145,22 @@ def asks_for_a_version(node):
 
 
 def test_versions_are_asked_for_in_compat_alone():
-    """Nowhere else in the package, the demos and the tests; what was measured where is told by ``demos/evidence/measure.py``."""
+    """Nowhere else in the package, the demos and the tests; what was measured where is told by ``demos/benchmarks/measure.py``."""
     asking = set()
     for path in python_files("uem_dolfinx", "demos", "tests"):
         if any(map(asks_for_a_version, ast.walk(ast.parse(path.read_text(encoding="utf-8"))))):
             asking.add(path.relative_to(REPOSITORY).as_posix())
-    assert asking - {"demos/evidence/measure.py"} == {"uem_dolfinx/compat.py"}
+    assert asking - {"demos/benchmarks/measure.py"} == {"uem_dolfinx/compat.py"}
+
+
+def test_the_developer_guide_is_of_this_code():
+    """Its map names every module, and every file that it names is there."""
+    text = thresholds.README.read_text(encoding="utf-8").partition(thresholds.BEGIN)[0]
+    named = set(re.findall(r"`([\w/.]+)`", text.partition("## The map of rooms")[2].partition("## Glossary")[0]))
+    files = [path.relative_to(REPOSITORY).as_posix() for path in python_files("uem_dolfinx", "demos", "tests")]
+    assert {path for path in files if path.startswith("uem_dolfinx") and Path(path).stem not in named | {"__init__"}} == set()
+    told = {name.removeprefix("../") for name in re.findall(r"`([\w/.]+\.py)`", text)}
+    assert {name for name in told if not any(f"/{path}".endswith(f"/{name}") for path in files)} == set()
 
 
 # -- thresholds ------------------------------------------------------------------------------------------------------------

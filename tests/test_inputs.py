@@ -58,7 +58,7 @@ def bilinear(b):
         ("F", lambda b: linear(b.u, 1.0) - b.u[0] * ufl.dx, uem.InputError, ("F is not linear", "every term")),
         ("F", lambda b: ufl.sin(ufl.TestFunction(b.V)[0]) * ufl.dx + linear(b.u, 1.0), uem.InputError, ("F is not linear", "once")),
         ("F", bilinear, uem.InputError, ("2 arguments", "TrialFunction")),
-        ("F", lambda b: linear(fem.Function(scene().V), 1.0), uem.SpaceError, ("test function of F", "another space")),
+        ("F", lambda b: linear(fem.Function(scene().V), 1.0), uem.SpaceError, ("F is integrated over another mesh",)),
         ("F", lambda b: linear(b.u, nan), uem.InputError, ("F holds the number nan", "finite")),
         ("u", lambda b: ufl.TrialFunction(b.V), uem.InputTypeError, ("u = an Argument", "a Function")),
         ("bcs", lambda b: b.oedometer(0.0)[0], uem.InputTypeError, ("bcs = ", "a list", "bcs=[...]")),

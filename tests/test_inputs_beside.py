@@ -93,10 +93,10 @@ def test_schemes(rho):
         (lambda p: uem.EnergyBook(None), uem.InputTypeError, ("problem = None", "a UnitedProblem")),
         (lambda p: uem.EnergyBook(p, p.u[0]), uem.InputTypeError, ("stored = ", "a UFL form", "ufl.dx")),
         (lambda p: uem.EnergyBook(p, linear(p.u, 1.0)), uem.InputError, ("stored has 1 argument(s)", "without test function")),
-        (lambda p: uem.EnergyBook(p, external=p.u[0] * ufl.dx), uem.InputError, ("external has 0 argument(s)", "in a test function")),
+        (lambda p: uem.EnergyBook(p, external=p.u[0] * ufl.dx), uem.InputError, ("external is a functional", "linear in one")),
         (lambda p: uem.Checkpoint("run.uem", every=0), uem.InputError, ("every = 0", "a whole number")),
         (lambda p: uem.integrate(p.u[0]), uem.InputTypeError, ("integrals = ", "ufl.dx")),
-        (lambda p: uem.integrate(linear(p.u, 1.0)), uem.InputError, ("a test function", "a functional")),
+        (lambda p: uem.integrate(linear(p.u, 1.0)), uem.InputError, ("1 argument(s)", "a functional")),
         (lambda p: uem.dirichlet(p.u, None), uem.InputTypeError, ("V = a Function", "u.function_space")),
         (lambda p: uem.dirichlet(p.config.V, [0], "x"), uem.InputError, ("component = 'x'", "one of 0 to 1")),
         (lambda p: uem.dirichlet(p.config.V, [0], 0, "fast"), uem.InputTypeError, ("= 'fast'", "a number")),
@@ -108,6 +108,92 @@ def test_schemes(rho):
 def test_writers_and_scripts(call, error, words):
     problem = Bar(4).problem
     refused(error, words, lambda: call(problem))
+
+
+def moving(**options):
+    """A problem in time with these options of its dynamics."""
+    b = blocks(COMM, "triangle", 2, 2)
+    return uem.UnitedProblem(linear(b.u, 1.0), b.u, dynamics=uem.Dynamics(uem.lumped_mass(b.V, 1.0), **options))
+
+
+def fails(x):
+    """A function of the user's that is wrong on the last rank alone."""
+    if COMM.rank == COMM.size - 1:
+        raise KeyError("no such place")
+    return np.ones(len(x))
+
+
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda p: uem.lumped_mass(p.u, 1), uem.InputTypeError, ("V = a Function", "a function space", "u.function_space")),
+        (lambda p: uem.consistent_mass(None, 1), uem.InputTypeError, ("V = None", "a function space")),
+        (lambda p: uem.lumped_mass(p.config.V.sub(0), 1), uem.SpaceError, ("V is a part", "a whole one")),
+        (lambda p: uem.lumped_mass(p.config.V, ufl.TestFunction(p.config.V)[0]), uem.MassError, ("a test or trial function",)),
+        (lambda p: uem.nodal_mass(p.config.V, "a"), uem.MassError, ("nodal masses = 'a'", "numbers")),
+        (lambda p: uem.nodal_mass(p.config.V, fails), uem.UserFunctionError, ("function of nodal masses raised KeyError",)),
+        (lambda p: moving(velocity=("a", "b")), uem.InputTypeError, ("velocity = ('a', 'b')", "2 finite numbers")),
+        (lambda p: moving(velocity=(0.0, nan)), uem.InputError, ("velocity = (0.0, nan)", "2 finite numbers")),
+        (lambda p: moving(velocity=lambda x: x), uem.InputTypeError, ("velocity = a function", "2 numbers", "interpolate")),
+        (lambda p: moving(gravity="down"), uem.InputTypeError, ("gravity = 'down'", "2 finite numbers")),
+        (lambda p: moving(damping=lambda v: fails([])), uem.UEMError, ("damping",)),
+        (lambda p: uem.Scheme(0.25, 0.5, alpha_f=1), uem.InputError, ("alpha_f = 1", "alpha_m <= alpha_f <= 1/2")),
+        (lambda p: uem.Scheme(0.25, 0.5, alpha_m=1), uem.InputError, ("alpha_m = 1", "alpha_m <= alpha_f <= 1/2")),
+        (lambda p: uem.time_steps(p, 1e-300, 1e-299), uem.InputError, ("dt = 1e-300", "other units")),
+        (lambda p: uem.time_steps(p, 1e-300, 1.0), uem.InputError, ("dt = 1e-300",)),
+        (lambda p: uem.time_steps(p, 1e200, 1e201), uem.InputError, ("dt = 1e+200", "other units")),
+        (lambda p: uem.time_steps(None, 0.1, 1.0), uem.InputTypeError, ("problem = None", "a UnitedProblem")),
+        (lambda p: uem.load_steps(p.u), uem.InputTypeError, ("problem = a Function", "a UnitedProblem")),
+        (lambda p: uem.load_steps(p, checkpoint="run"), uem.InputTypeError, ("checkpoint = 'run'", "a Checkpoint")),
+        (lambda p: uem.write_checkpoint(3, p.state()), uem.InputTypeError, ("path = 3", "the path of a file")),
+        (lambda p: uem.write_checkpoint("", p.state()), uem.InputError, ("path = ''", "the path of a file")),
+        (lambda p: uem.read_checkpoint(None, p.state()), uem.InputTypeError, ("path = None", "the path of a file")),
+        (lambda p: uem.write_checkpoint("run", p), uem.InputTypeError, ("UnitedProblem: expected a State", "problem.state()")),
+        (lambda p: uem.Checkpoint("run").begin(p), uem.InputTypeError, ("UnitedProblem: expected a State", "problem.state()")),
+        (lambda p: uem.Checkpoint(3), uem.InputTypeError, ("path = 3", "the path of a file")),
+        (lambda p: uem.interpolate(p.u, 3), uem.InputError, ("the shape ()", "expected (2,)")),
+        (lambda p: uem.interpolate(p.u, p.u[0]), uem.InputError, ("the shape ()", "expected (2,)")),
+        (lambda p: uem.interpolate(p.u, lambda x: x), uem.InputTypeError, ("expression = a function", "u.interpolate")),
+        (lambda p: uem.interpolate(3, p.u), uem.InputTypeError, ("u = 3", "a Function")),
+        (lambda p: uem.interpolate(p.u, ufl.TestFunction(p.config.V)), uem.InputError, ("a test or trial function",)),
+        (lambda p: uem.read_gmsh("a.geo", None), uem.InputTypeError, ("comm = None", "MPI.COMM_WORLD")),
+        (lambda p: uem.read_gmsh("a.geo", COMM, parameters={"h": "a"}), uem.InputTypeError, ("parameters['h'] = 'a'", "a finite")),
+        (lambda p: uem.read_gmsh("a.geo", COMM, parameters=[1]), uem.InputTypeError, ("parameters = [1]", "by name")),
+        (lambda p: uem.dirichlet(p.config.V.sub(0), [0]), uem.SpaceError, ("whole Lagrange space", "a component")),
+        (lambda p: uem.ds([0], 3), uem.InputTypeError, ("mesh = 3", "a mesh")),
+        (lambda p: uem.function_space(None, 1), uem.InputError, ("domain = None", "a mesh")),
+        (lambda p: uem.function_space(p.config.mesh, ("Foo", 1)), uem.InputError, ("element = ('Foo', 1)", "a family and a degree")),
+        (lambda p: uem.function_space(p.config.mesh, 1, 2), uem.InputError, ("shape = 2", "(2,)")),
+        (lambda p: p.solve(start="a"), uem.InputTypeError, ("start = 'a'", "finite numbers")),
+        (lambda p: p.solve(start=np.zeros(1)), uem.InputError, ("start = ", "shape (1,)")),
+        (lambda p: p.solve(fraction="a"), uem.InputTypeError, ("fraction = 'a'", "a finite number")),
+        (lambda p: uem.LinearElastic(p.u, 0.3), uem.InputTypeError, ("E = a Function", "a scalar")),
+        (lambda p: uem.LinearElastic(1.0, 0.3, "plane_strain").energy(3), uem.InputTypeError, ("u = 3", "a displacement")),
+    ],
+)  # fmt: skip
+def test_near_by(call, error, words):
+    problem = Bar(4).problem
+    if error is uem.UEMError:
+        error = uem.UserFunctionError
+    refused(error, words, lambda: call(problem))
+
+
+def mixed_space(mesh):
+    """A displacement and a scalar of degree 1."""
+    try:
+        from basix.ufl import element, mixed_element
+    except ImportError:
+        parts = ufl.VectorElement("Lagrange", mesh.ufl_cell(), 1), ufl.FiniteElement("Lagrange", mesh.ufl_cell(), 1)
+        return fem.FunctionSpace(mesh, ufl.MixedElement(*parts))
+    return fem.functionspace(mesh, mixed_element([element("Lagrange", "triangle", 1, shape=shape) for shape in ((2,), ())]))
+
+
+def test_a_part_of_a_mixed_space():
+    b = blocks(COMM, "triangle", 2, 2)
+    W = mixed_space(b.scene.mesh)
+    for call in (lambda: uem.dirichlet(W.sub(0), b.bottom), lambda: uem.dirichlet(W, b.bottom)):
+        refused(uem.SpaceError, ("whole Lagrange space", "mixed"), call)
+    refused(uem.SpaceError, ("V is a part",), lambda: uem.lumped_mass(W.sub(0), 1.0))
 
 
 @pytest.mark.parametrize("name", ["my u", "Δ u/2", "a-b"])
@@ -132,8 +218,8 @@ def test_agreed_blocks():
 
     with agreed(COMM):
         pass
-    for kind in (uem.InputError, LocalError):
-        with pytest.raises(Exception, match=f"from rank {COMM.size // 2}") as caught, agreed(COMM):
+    for kind in (uem.InputError, LocalError, SystemExit, KeyboardInterrupt):
+        with pytest.raises(BaseException, match=f"from rank {COMM.size // 2}") as caught, agreed(COMM):
             if COMM.rank >= COMM.size // 2:
                 raise kind(f"from rank {COMM.rank}")
         assert len(set(COMM.allgather(type(caught.value).__name__))) == 1

@@ -7,7 +7,7 @@ The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, a
 1. Unite: the normal displacement of each active contactor follows the target: ``contact.node_to_surface`` and
    ``contact.bernstein``, or ``contact.mortar``, write the equations, ``algebra.restriction`` builds P and c from them.
 2. Solve the united system (``algebra.linear_solver``), then return each contactor along the normal onto the moved target
-   (``contact.pair``, with projections from ``geometry``).
+   (``contact.interface``, with projections from ``geometry``).
 3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.system``.
 4. Activate contactors that have gone through, release those that pull (``contact.active_set``), iterate (``solve.newton``).
 
@@ -18,24 +18,34 @@ Mechanics and Engineering 191 (2001) 843-860.
 from __future__ import annotations
 
 __all__ = [
-    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Dynamics", "Elastic", "Energies",
-    "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError", "InputTypeError",
+    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
+    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
     "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
     "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
     "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
-    "Tags", "TimeStep", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "consistent_mass",
-    "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
+    "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
+    "consistent_mass", "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
     "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene",
     "read_checkpoint", "read_gmsh", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
-from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
+try:
+    from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
+
+    import dolfinx as _dolfinx  # noqa: F401
+except ImportError as _error:
+    from uem_dolfinx.errors import MissingBackendError
+
+    raise MissingBackendError(
+        f"uem_dolfinx needs mpi4py and DOLFINx ({_error}): install python3-dolfinx-real on Debian, or pip install 'uem_dolfinx[wheel]'"
+    ) from _error
 
 from uem_dolfinx.algebra.options import multigrid_options
 from uem_dolfinx.compat import function_space
-from uem_dolfinx.compat import interpolate_expression as interpolate
 from uem_dolfinx.contact.contact import Balance, Contact, Resultant
+from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.contact.laws.tresca import Tresca
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
 from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark
@@ -79,7 +89,7 @@ from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
 from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.scripting import dirichlet, ds, dx, integrate
+from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem

@@ -121,7 +121,16 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
     given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
     if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
         raise InputError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
-    return _space(domain, given[0], int(given[1]), tuple(given[2] if len(given) == 3 else shape))
+    if not hasattr(domain, "topology"):
+        raise InputError(f"domain = {domain!r}: expected a mesh, as that of read_gmsh")
+    shape = given[2] if len(given) == 3 else shape
+    whole = all(isinstance(n, (int, np.integer)) and n >= 1 for n in shape) if isinstance(shape, (tuple, list)) else False
+    if not whole:
+        raise InputError(f"shape = {shape!r}: expected whole numbers, 1 or more, in brackets, as (2,)")
+    try:
+        return _space(domain, given[0], int(given[1]), tuple(shape))
+    except Exception as error:  # of which class depends on the version of UFL
+        raise InputError(f"element = {element!r} ({error}): expected a family and a degree that DOLFINx knows") from error
 
 
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:

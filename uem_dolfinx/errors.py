@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,13 @@ if TYPE_CHECKING:
 
 class UEMError(Exception):
     """Root of every error this package raises on purpose."""
+
+    def amend(self, more: str) -> None:
+        """Say more at the end of the message, and no longer advise smaller steps, which do not help."""
+        smaller = "take smaller (load )?steps"
+        text = re.sub(f"[:;,] (or )?{smaller}$", "", str(self))
+        text = re.sub(f"{smaller},? or (?=raise |give )", "", text)
+        self.args = (f"{re.sub(f'{smaller},? or ', 'take ', text)}; {more}",)
 
 
 class InputError(UEMError, ValueError):
@@ -85,7 +93,7 @@ class EnergyGivenError(UEMError, ArithmeticError):
 
 
 class TunnellingError(UEMError, ArithmeticError):
-    """A contactor passes through a target within a step, where no step ends."""
+    """A contactor passes through a target within a step, where no step ends: between two instants, or, in statics, two equilibria."""
 
 
 class MissingBackendError(UEMError, ImportError):

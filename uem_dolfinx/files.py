@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray
-from uem_dolfinx.errors import OutputError, UEMError
+from uem_dolfinx.errors import InputError, OutputError, UEMError
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, agreed
 
 T = TypeVar("T")
 
@@ -61,6 +64,16 @@ class Trouble:
         agree(self.comm, self._error)
 
 
+def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
+    """A path, the same on all ranks; InputTypeError or InputError if it is none (collective)."""
+    with agreed(comm):
+        given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
+        if not Path(value).name:
+            raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
+    given.alike(comm, "files", **{what: str(value)})
+    return Path(value)
+
+
 def on_rank_0(comm: MPI.Comm, what: str, action: Callable[[], T]) -> T:
     """Do something with files on rank 0, and tell all ranks what came of it (collective).
 
@@ -74,21 +87,21 @@ def on_rank_0(comm: MPI.Comm, what: str, action: Callable[[], T]) -> T:
 
     Raises:
         OutputError: if the system refuses.
-        UEMError, ValueError: of the action.
+        BaseException: what else the action raises.
     """
-    found: Exception | None = None
+    found: BaseException | None = None
     result: T | None = None
     if comm.rank == 0:
         try:
             result = action()
-        except (UEMError, ValueError) as error:
+        except UEMError as error:
             found = error
         except OSError as error:
             found = OutputError(f"{what} ({error}): {REMEDY}")
-    found, result = comm.bcast((found, result))
-    if found is not None:
-        raise found
-    return result  # type: ignore[return-value]
+        except BaseException as error:
+            found = error
+    agree(comm, found)
+    return comm.bcast(result)  # type: ignore[return-value]
 
 
 def as_bytes(array: AnyArray) -> AnyArray:
@@ -123,27 +136,124 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def replace_end(path: Path, offset: int, data: bytes) -> None:
-    """Put other bytes in place of all from an offset on; if the disk refuses, those that were there come back.
+class OwnFile:
+    """A file that one run alone writes from its opening to its closing; it stays this run's when another moves it aside.
+
+    The lock that keeps others from going on with it ends with the process; where a file system has none, a file that another run has
+    written to is known by its size.
+
+    Args:
+        path: name of the file, which must be there unless it is ``new``.
+        new: make it, where none may be.
+        locked: lock it; one rank does it for all.
 
     Raises:
-        OSError: if not all can be written.
+        OutputError: if another run has not closed it.
+        OSError: if it cannot be opened or made.
     """
-    with path.open("r+b", buffering=0) as file:
-        size = os.fstat(file.fileno()).st_size
-        before = os.pread(file.fileno(), max(0, size - offset), offset)
+
+    def __init__(self, path: Path, *, new: bool = False, locked: bool = True):
+        self.path = path
+        self._descriptor = os.open(path, os.O_RDWR | (os.O_CREAT | os.O_EXCL if new else 0), 0o666)
+        #: Closes the file, once; also where nobody knows it any more.
+        self.close = weakref.finalize(self, os.close, self._descriptor)
+        self._size = self.size
+        if locked and not _lock(self._descriptor):
+            self.close()
+            raise OutputError(
+                f"{path} is being written by another run, or by a writer that was not closed: let it end, or choose another name"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return os.fstat(self._descriptor).st_size
+
+    def check(self, sized: bool = True) -> None:
+        """Refuse to write to a file that is no longer there, or if ``sized`` has become longer or shorter by itself.
+
+        Raises:
+            OutputError: if it is so.
+        """
+        gone, size = not os.fstat(self._descriptor).st_nlink, self.size
+        if gone or (sized and size != self._size):
+            what = "has been removed or replaced" if gone else f"has been changed, from {self._size} to {size} bytes,"
+            raise OutputError(
+                f"{self.path} {what} since this run wrote to it last: give each run a name of its own for its results"
+            )
+
+    def read(self) -> bytes:
+        """All that is in it."""
+        return os.pread(self._descriptor, self.size, 0)
+
+    def read_at(self, offset: int, array: AnyArray) -> None:
+        """Read a contiguous array from an offset in bytes, as far as there is one."""
+        data, done = as_bytes(array).data, 0
+        while done < len(data) and (n := os.preadv(self._descriptor, [data[done : done + PIECE]], offset + done)):
+            done += n
+
+    def write_at(self, offset: int, array: AnyArray) -> None:
+        """Write an array at an offset in bytes."""
+        _write_all(self._descriptor, offset, as_bytes(np.ascontiguousarray(array)).data)
+
+    def hand_over(self) -> None:
+        """Give what was written to the file system, so that others see it, as closing a file does where it is another machine's."""
+        os.close(os.dup(self._descriptor))
+
+    def replace_end(self, offset: int, data: bytes) -> None:
+        """Put other bytes in place of all from an offset on; if the disk refuses, those that were there come back.
+
+        Raises:
+            OSError: if not all can be written.
+            OutputError: see ``check``.
+        """
+        self.check()
+        before = os.pread(self._descriptor, max(0, self._size - offset), offset)
         try:
-            _write_all(file.fileno(), offset, data)
-            file.truncate(offset + len(data))
+            _write_all(self._descriptor, offset, memoryview(data))
+            os.truncate(self._descriptor, offset + len(data))
         except OSError:
-            _write_all(file.fileno(), offset, before)
-            file.truncate(size)
+            _write_all(self._descriptor, offset, memoryview(before))
+            os.truncate(self._descriptor, self._size)
             raise
+        self._size = offset + len(data)
+
+    def truncate(self, size: int) -> None:
+        """Cut what is behind a size in bytes."""
+        os.truncate(self._descriptor, size)
 
 
-def _write_all(descriptor: int, offset: int, data: bytes) -> None:
+def _lock(descriptor: int) -> bool:
+    """Lock an open file: whether no other run holds it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        # other errors are those of file systems without locks
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
+    return True
+
+
+def in_use(path: Path) -> bool:
+    """Whether a run has the file open as its own."""
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        return not _lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def begin_file(path: Path) -> OwnFile:
+    """A new empty file of one's own, in place of one that nobody needs."""
+    path.unlink(missing_ok=True)
+    return OwnFile(path, new=True)
+
+
+def _write_all(descriptor: int, offset: int, data: memoryview) -> None:
     while data:
-        n = os.pwrite(descriptor, data, offset)
+        n = os.pwrite(descriptor, data[:PIECE], offset)
         data, offset = data[n:], offset + n
 
 
@@ -155,8 +265,20 @@ def aside(stem: Path, ending: str = "") -> Path:
     return free
 
 
+def new_folder(stem: Path) -> Path:
+    """Make a folder beside others: the stem's name with the next free number."""
+    while True:
+        folder = aside(stem)
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            # another run was faster
+            continue
+        return folder
+
+
 def keep_aside(stem: Path, names: Iterable[Path]) -> None:
-    """Move what there is of earlier results to a folder of their own, and say so.
+    """Move what there is of earlier results to a folder of their own, and say so; a run that still writes them goes on there.
 
     Args:
         stem: the folder's name but for its number.
@@ -168,8 +290,8 @@ def keep_aside(stem: Path, names: Iterable[Path]) -> None:
     there = [name for name in names if name.exists()]
     if not there:
         return
-    folder = aside(stem)
-    folder.mkdir()
+    whose = "another run, which still writes them," if any(map(in_use, there)) else "an earlier run"
+    folder = new_folder(stem)
     for name in there:
         name.rename(folder / name.name)
-    logger.warning("%s: results of an earlier run are kept in %s", there[0], folder)
+    logger.warning("%s: results of %s are kept in %s", there[0], whose, folder)

@@ -29,7 +29,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
 
 #: Integrands that are no polynomials get a quadrature rule of this times the degree of the displacement.
-#: [convention; degrees; test_elastic.py::test_quadrature_of_what_is_no_polynomial]
+#: [convention; degrees; test_elastic.py::test_degrees_that_are_asked_for]
 DEGREES_ENOUGH = 4
 
 

@@ -20,7 +20,7 @@ from uem_dolfinx.errors import UEMError, UserFunctionError
 T = TypeVar("T")
 
 
-def agree(comm: MPI.Comm, error: Exception | None) -> None:
+def agree(comm: MPI.Comm, error: BaseException | None) -> None:
     """Raise on every rank the error of the first rank that has one (collective).
 
     Ranks that each look at their own part of the mesh must not raise alone: the others would wait for ever
@@ -31,18 +31,30 @@ def agree(comm: MPI.Comm, error: Exception | None) -> None:
         error: what this rank found wrong, or None.
 
     Raises:
-        Exception: the same error on all ranks, if any rank had one; a RuntimeError with its words if it cannot be sent as it is.
+        BaseException: the same error on all ranks, if any rank had one, SystemExit and KeyboardInterrupt among them; a RuntimeError
+            with its words if it cannot be sent as it is.
     """
     if comm.size > 1 and comm.allreduce(error is not None, op=MPI.LOR):
         errors = comm.allgather(_sendable(error))
         first = next(rank for rank, e in enumerate(errors) if e is not None)
         if first != comm.rank or errors[first].__class__ is not error.__class__:
-            raise errors[first] from error
+            raise mark_as_agreed(errors[first]) from error
     if error is not None:
-        raise error
+        raise mark_as_agreed(error)
 
 
-def _sendable(error: Exception | None) -> Any:
+def mark_as_agreed(error: BaseException) -> BaseException:
+    """The error, of which is known that all ranks raise it."""
+    error.of_all_ranks = True  # type: ignore[attr-defined]
+    return error
+
+
+def is_agreed(error: BaseException | None) -> bool:
+    """Whether all ranks raise this error."""
+    return getattr(error, "of_all_ranks", False)
+
+
+def _sendable(error: BaseException | None) -> Any:
     """The error, or one with its words if other ranks could not read it."""
     try:
         return error if type(pickle.loads(pickle.dumps(error))) is type(error) else RuntimeError(str(error))
@@ -53,10 +65,10 @@ def _sendable(error: Exception | None) -> Any:
 @contextmanager
 def agreed(comm: MPI.Comm) -> Iterator[None]:
     """What is raised in this block on one rank, at its end is raised on all; the block itself must not be collective (collective)."""
-    error: Exception | None = None
+    error: BaseException | None = None
     try:
         yield
-    except Exception as found:
+    except BaseException as found:
         error = found
     agree(comm, error)
 
@@ -70,7 +82,8 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
         args: of the function.
 
     Raises:
-        UserFunctionError: naming it, and what it raised where; an error of the package's own passes as it is.
+        UserFunctionError: naming it, and what it raised where; an error of the package's own passes as it is, and so do SystemExit
+            and KeyboardInterrupt.
     """
     try:
         return f(*args)

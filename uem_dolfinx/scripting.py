@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Number
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,12 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.core.expr import Expr
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.form_checks import check_expression, check_functional
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag
 from uem_dolfinx.parallel import agreed
 
@@ -56,8 +60,10 @@ def dirichlet(
 def _checked(V: Any, component: int | None, value: Any) -> Any:
     """The value as ``fem.dirichletbc`` takes it, which fits the space and is finite."""
     degree, size = compat.lagrange_degree(V), V.dofmap.index_map_bs
-    if degree is None or V.dofmap.bs != size:
-        raise SpaceError("a Dirichlet condition needs a whole Lagrange space: give that of the displacement, and a component")
+    if degree is None or V.dofmap.bs != size or len(V.component()):
+        raise SpaceError(
+            "V is no whole Lagrange space: expected that of the displacement, no part of it or of a mixed one; name a component"
+        )
     if component is not None and component not in range(size):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
@@ -110,7 +116,34 @@ def _mesh_of(part: Part, mesh: Any) -> Any:
         raise InputError(
             f"a measure of {given.shown(part)} needs the mesh as its second argument: only tags of read_gmsh know theirs"
         )
-    return known[0] if mesh is None else mesh
+    found = known[0] if mesh is None else mesh
+    return given.kind("mesh", found, hasattr(found, "topology"), "a mesh, as u.function_space.mesh")
+
+
+def interpolate(u: fem.Function, expression: Any) -> None:
+    """Interpolate a UFL expression, or a number, into a Function of a Lagrange or DG0 space, ghosts included (collective).
+
+    Raises:
+        InputTypeError: if ``u`` is no Function, or the expression none of UFL.
+        InputError: if the expression has another shape than the values of ``u``.
+        SpaceError: if it is of another mesh, or the values of ``u`` are not known at points.
+    """
+    given.kind("u", u, isinstance(u, fem.Function), "a Function", "f = fem.Function(uem.function_space(mesh, 1))")
+    remedy = "values of the places x go by u.interpolate(lambda x: ...)"
+    if not isinstance(expression, Expr):
+        given.kind("expression", expression, isinstance(expression, Number), "a UFL expression, or a number", remedy)
+        expression = ufl.as_ufl(expression)
+    V = u.function_space
+    if expression.ufl_shape != u.ufl_shape:
+        raise InputError(
+            f"expression has the shape {expression.ufl_shape}: expected {u.ufl_shape}, that of u; take a component, or ufl.as_vector"
+        )
+    if (compat.element_family(V) or ("",))[0] not in ("Lagrange", "Discontinuous Lagrange"):
+        raise SpaceError("u is of a space without nodal values: expected a Lagrange or DG space; make it by uem.function_space")
+    if any(isinstance(part, ufl.Argument) for part in traverse_unique_terminals(expression)):
+        raise InputError("expression holds a test or trial function: expected values alone; put a Function in its place")
+    check_expression("expression", expression, V.mesh.ufl_domain(), "the mesh of u")
+    compat.interpolate_expression(u, expression)
 
 
 def integrate(integrals: ufl.Form | fem.Form) -> float:
@@ -120,14 +153,17 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
         integrals: in UFL, or compiled by ``fem.form``, which saves time where it is asked for again and again.
 
     Raises:
-        InputError, InputTypeError: for anything else, or a form with a test function.
+        InputError, InputTypeError: for anything else, or a form with a test function or without integrals.
+        SpaceError: if it is of several meshes.
     """
     if not isinstance(integrals, ufl.Form):
         remedy = "multiply an expression by ufl.dx or uem.ds(tag)"
         given.kind(
             "integrals", integrals, hasattr(integrals, "function_spaces"), "a UFL form, or one compiled by fem.form", remedy
         )
-    elif integrals.arguments():
-        raise InputError("integrals hold a test function: expected a functional; leave the test function out")
+    elif not integrals.empty():
+        check_functional("the integral", integrals)
+    else:
+        raise InputError("the form of no integrals belongs to no mesh: expected one integral at least")
     M = forms.form(integrals) if isinstance(integrals, ufl.Form) else integrals
     return forms.assemble_scalar(M, forms.parts_of(M)[0].mesh.comm)

@@ -22,7 +22,7 @@ root_doc = "site/index"
 nb_custom_formats = {".py": "reading.demo"}
 nb_execution_mode = "off"
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
-exclude_patterns = ["common.py", "evidence/**", "report/tables.py", "site/*.py", "**/__pycache__/**", "**/results/**"]
+exclude_patterns = ["common.py", "benchmarks/**.py", "site/*.py", "**/__pycache__/**", "**/results/**"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
 

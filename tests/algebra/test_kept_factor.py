@@ -142,6 +142,20 @@ def test_a_factor_that_does_not_serve(values, solves):
         assert np.abs(found[0].array * diagonal.array - 1.0).max() < 1e-9
 
 
+def test_a_factor_leaves_little():
+    """However little is asked for, a solve leaves less than 1e-3, and is not much more accurate than that."""
+    config, K, pc = identity(8)
+    kept = KeptFactor(config)
+    kept.keep(pc, united(config, []), K)
+    diagonal = K.getDiagonal()
+    diagonal.array[:] = 1.0 + 0.5 * np.linspace(0.0, 1.0, len(diagonal.array))
+    K.setDiagonal(diagonal)
+    rhs = diagonal.duplicate()
+    rhs.set(1.0)
+    dq, _ = kept.solve(united(config, []), K, None, rhs, 0.1)
+    assert 1e-4 < (K * dq - rhs).norm() / rhs.norm() < 1e-3
+
+
 def test_a_preconditioner_that_stays_reads_its_options_once():
     """Where friction takes turns with none GMRES and CG read theirs; hypre that did so again would lose its coarsest grid and crash."""
     options = {"ksp_type": "cg", "pc_type": "gamg", "pc_gamg_threshold": 0.02, "ksp_gmres_restart": 7}

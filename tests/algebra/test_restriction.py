@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 from dolfinx import fem
-from equation_scenes import CASES, Case, nodes_at
+from equation_scenes import CASES, Case, nodes_at, united
 from helpers import blocks, clamp, gathered_matrix, gathered_vector, linear, scattered
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx.algebra.linear_solver import UnitedSolver, rigid_body_modes
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.configuration import Configuration
 
 COMM = MPI.COMM_WORLD
 DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
@@ -162,7 +163,7 @@ def test_rigid_motion_is_a_united_motion(cell):
     solver = UnitedSolver(problem.config, "modes_", {"ksp_type": "cg", "pc_type": "gamg"})
     solver.set_operator(r, K, None)
     size = gathered_matrix(K).max()
-    for mode in rigid_body_modes(problem.config):
+    for mode in problem.config.modes().transpose(1, 0, 2):
         full = solver.A.createVecLeft()
         full.array[:] = mode.ravel()
         q = r.reduce(full)
@@ -174,7 +175,7 @@ def test_rigid_motion_is_a_united_motion(cell):
     upper = COMM.allreduce(int(body[contact.pair.nodes].max(initial=-1)), op=MPI.MAX)
     assert {int(k) for k in body[contact.pair.nodes]} <= {upper}
     assert (body == upper)[problem.config.X[:, -1] > 1e-9].all() and not (body == upper)[problem.config.X[:, -1] < -1e-9].any()
-    full.array[:] = (rigid_body_modes(problem.config)[0] * (body == upper)[: problem.config.n_owned, None]).ravel()
+    full.array[:] = (problem.config.modes()[:, 0] * (body == upper)[: problem.config.n_owned, None]).ravel()
     q = r.reduce(full)
     assert q.norm() > 0 and (solver.A * q).norm() < 1e-12 * size * q.norm()
     vectors = solver.A.getNearNullSpace().getVecs()
@@ -262,3 +263,42 @@ def test_sums_of_rows(m):
     np.add.at(sums, places, values)
     added = sums_of_rows(places, values, 7)
     assert added.dtype == float and np.array_equal(added, sums)
+
+
+@pytest.mark.parametrize("length", [1, 17, 40])
+def test_chains_of_any_length(comm, length):
+    """What the last node of a chain does, all do; closed to a circle it is refused."""
+    config = Configuration(blocks(comm, "triangle", 5, 5, gap=0.5).u)
+    order = np.random.default_rng(0).permutation(config.index_map.size_global)[: length + 1]
+    rows = [(a, [0.0, 1.0], b) for a, b in zip(order, order[1:])]
+    r = united(config, rows)
+    assert r.chain == length
+    first = config.index_map.local_range[0]
+    q = r.P.createVecRight()
+    q.array.reshape(-1, 2)[np.arange(config.n_owned) + first == order[-1]] = [0.2, 0.7]
+    moved = gathered_vector(r.expand(q)).reshape(-1, 2)
+    assert np.abs(moved[order[:-1]] - [0.0, 0.7]).max() < 1e-15 and np.abs(moved[order[-1]] - [0.2, 0.7]).max() < 1e-15
+    assert np.abs(moved).sum() == pytest.approx(0.7 * (length + 1) + 0.2)
+    assert np.abs(gathered_matrix(r.P) @ gathered_vector(q) - moved.ravel()).max() < 1e-15
+    with pytest.raises(uem.ConflictError, match="follows itself"):
+        united(config, [*rows, (order[-1], [0.0, 1.0], order[0])])
+
+
+@pytest.mark.parametrize("part, length", [(5e-9, 2), (0.1, 16), (0.32, 32), (0.33, None), (0.5, None), (1.0, None)])
+def test_circles_that_fade(comm, part, length):
+    """Equations that follow each other in a circle by a part each: du = part du + the rest, unless what comes round stays."""
+    config = Configuration(blocks(comm, "triangle", 2, 2, gap=0.5).u)
+    circle = [(0, [0.0, 1.0], 3), (3, [0.6, 0.8], 5), (5, [0.0, 1.0], 0)]
+    if length is None:
+        with pytest.raises(uem.ConflictError, match="follows itself"):
+            united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part)
+        return
+    assert united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part).chain == length
+    r = united(config, circle, coefficient=part)
+    q = r.P.createVecRight()
+    q.array[:] = np.sin(1.0 + np.arange(q.local_size) + q.owner_range[0])
+    moved = r.expand(q)
+    assert ((r.P * q) - moved).norm() <= 1e-15 * moved.norm()
+    du = gathered_vector(moved).reshape(-1, 2)
+    for node, direction, followed in circle:
+        assert np.dot(direction, du[node] - part * du[followed]) == pytest.approx(0.0, abs=4e-16)

@@ -167,7 +167,7 @@ def place_hash(X, seed):
 @given(seed=st.integers(0, 1000), zeros=st.floats(0.0, 0.9))
 def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
     """Where no control gap is negative no point of the surface is inside the target; nodal gaps cannot promise that."""
-    config, family = top.config, top.pair.coupling.family
+    config, family = top.config, top.pair.discretisation.family
     wanted = place_hash(np.round(config.X, 6), seed)
     wanted = 0.01 * np.where(wanted < zeros, 0.0, wanted)
     # nodal gaps from control gaps, ancestors first: vertices, edges, facets
@@ -182,7 +182,7 @@ def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
         top.u.x.scatter_forward()
         nodal = np.array(top.u.x.array.reshape(-1, top.g)[:, -1])
     top.open(nodal)
-    assert COMM.allreduce(int((~top.pair.placement.details.control.shared).sum())) == 0
+    assert COMM.allreduce(int((~top.pair.kinematics.control.shared).sum())) == 0
     assert highest(COMM, np.abs(top.pair.gap - wanted[top.pair.nodes])) < 1e-15
     assert lowest(COMM, [top.sampled(nodal, seed)]) >= -1e-15
 
@@ -198,7 +198,7 @@ def test_control_forces_of_a_pressure_press(top, seed, share):
     b = compat.create_vector(top.S)
     forms.assemble_vector(b, top.push)
     f = np.array(b.array_r)[top.pair.nodes]
-    lam, nodal = top.pair.placement.details.control.forces(f, np.ones(len(f), bool))
+    lam, nodal = top.pair.kinematics.control.forces(f, np.ones(len(f), bool))
     total = float(COMM.allreduce(f.sum()))
     assert lowest(COMM, lam) >= -1e-15 * max(total, 1e-300)
     assert COMM.allreduce(lam.sum()) == pytest.approx(total, rel=1e-12, abs=1e-300)
@@ -210,7 +210,7 @@ def test_areas(top):
     """Positive, and together the surface's, where those of the shape functions are zero or negative at vertices."""
     top.open(np.zeros(top.config.n_local), active=True)
     plain = tributary_areas(top.config, top.tag)[top.pair.nodes]
-    areas = top.pair.coupling.areas(top.pair.placement, plain)
+    areas = top.pair.kinematics.areas(plain, False)
     assert lowest(COMM, areas) > 0.01
     assert COMM.allreduce(areas.sum()) == pytest.approx(1.0, rel=1e-12)
     if top.g == 3 and len(np.unique(COMM.allreduce([len(f) for f in top.facets]))) == 1:

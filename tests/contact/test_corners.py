@@ -95,7 +95,7 @@ def test_friction_in_a_vertex():
         assert np.linalg.norm(rest) == pytest.approx(0.3 * pressed[0]) and abs(rest @ n[0]) <= 1e-14
 
 
-@pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), (2, 0.0)])
+@pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), pytest.param(2, 0.0, marks=pytest.mark.slow)])
 def test_a_valley_that_ends_with_its_target(degree, friction):
     """A ridge is pushed along a groove and out of it: contactors that have passed its end carry nothing, moments balance."""
     low, high = (box("hexahedron", [0, 0, z], [1, 1, z + 1.0], [n, 2, 2]) for z, n in ((-1.0, 5), (0.0, 4)))

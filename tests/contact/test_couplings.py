@@ -13,7 +13,8 @@ from helpers import arch, blocks, clamp, gathered_matrix, gathered_vector, highe
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.contact.coupling import NORMAL
+from uem_dolfinx.contact.kinematics import NORMAL
+from uem_dolfinx.contact.node_to_surface import NodeToSurface
 
 COMM = MPI.COMM_WORLD
 
@@ -59,8 +60,8 @@ def test_forces_come_in_pairs(cell, degree):
     pair, config = contact.pair, problem.config
     rows = pair.equations()
     multipliers = 1.0 + np.sin(7 * config.X[pair.nodes[rows.contactor]].sum(axis=1))
-    pair.set_forces(*pair.forces(rows, multipliers))
-    nodes, forces = pair.coupling.nodal_forces(pair.placement, pair.trial)
+    pair.set_forces(pair.forces(rows, multipliers))
+    nodes, forces = pair.nodal_forces(pair.trial)
     total = COMM.allreduce(forces.sum(axis=0))
     assert np.abs(total).max() <= 1e-13 * COMM.allreduce(np.abs(forces).sum())
     du = np.cos(5 * config.X + 1)
@@ -127,7 +128,7 @@ def test_nodal_gaps_for_other_methods():
     _, _, contact = pressed("triangle", 2)
     pair = contact.pair
     control = pair.gap.copy()
-    pair.coupling = pair.coupling.with_nodal_gaps()
+    pair.discretisation = NodeToSurface.like(pair.discretisation)
     pair.project()
     assert np.array_equal(pair.gap, pair.projection.gap)
     pair.trial = replace(pair.trial, active=np.zeros(len(pair.nodes), bool))

@@ -28,7 +28,7 @@ def slow(*values):
 def friction_at_nodes(contact):
     """Nodal forces of friction on both bodies, of the state last found ``(n_owned, gdim)`` (collective)."""
     pair = contact.pair
-    nodes, forces = pair.coupling.nodal_forces(pair.placement, replace(pair.trial, lam=0.0 * pair.trial.lam))
+    nodes, forces = pair.nodal_forces(replace(pair.trial, lam=0.0 * pair.trial.lam))
     return pair.config.add_at_owners(nodes, forces)
 
 
@@ -124,20 +124,20 @@ def test_friction_of_mortar_by_differences(cell, rigid):
         pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=state)
         problem.u.x.array[:] = u.ravel()
         problem.system.place(returning=False)
-        lam = pressure * pair.placement.details.area
+        lam = pressure * pair.kinematics.rows.area
         pair.trial = replace(pair.trial, lam=lam)
         forces = []
-        for tau in (-mu * lam[:, None] * pair.directions, np.zeros((n, g))):
+        for tau in (-mu * lam[:, None] * pair.friction.directions(pair.trial), np.zeros((n, g))):
             pair.trial = replace(pair.trial, friction=replace(state, tau=tau))
             forces.append(problem.forces.vector(scene.contact.force.x.array.reshape(-1, g)[: problem.config.n_owned].copy()))
         return forces[0] - forces[1]
 
     friction(smooth, np.tile([1.0, *[0.5] * (g - 1)], (n, 1)))
-    s = pair.directions
+    s = pair.friction.directions(pair.trial)
     friction(smooth, s)
     du = problem.forces.vector(way[: problem.config.n_owned])
-    tau = -mu * (pair.trial.lam / pair.coupling.shares(pair.placement, pair.trial))[:, None] * pair.directions
-    made = contact_curvature(pair.coupling.turning(pair.placement, pair.trial, np.arange(n), tau), du) * du
+    tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[:, None] * pair.friction.directions(pair.trial)
+    made = contact_curvature(pair.kinematics.turning(pair.trial, np.arange(n), tau), du) * du
     difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
     difference.scale(0.5 / h)
     assert (difference - made).norm() <= 1e-8 * difference.norm()
@@ -180,17 +180,19 @@ def test_friction_of_degree_2_by_differences(cell, where, bound):
         state = replace(friction, stick=np.zeros(n, bool), direction=direction)
         pair.trial = replace(pair.trial, active=touching, friction=state)
         problem.system.place(returning=False)
-        lam = np.where(touching, pressure * pair.placement.details.area, 0.0)
-        pair.trial = replace(pair.trial, lam=lam, friction=replace(state, tau=-mu * lam[:, None] * pair.directions))
+        lam = np.where(touching, pressure * pair.kinematics.rows.area, 0.0)
+        pair.trial = replace(
+            pair.trial, lam=lam, friction=replace(state, tau=-mu * lam[:, None] * pair.friction.directions(pair.trial))
+        )
         return problem.forces.vector(friction_at_nodes(scene.contact))
 
     force(start, np.tile([1.0, *[0.3] * (g - 1)], (n, 1)))
-    s = pair.directions
+    s = pair.friction.directions(pair.trial)
     force(start, s)
     which = np.flatnonzero(touching)
-    tau = -mu * (pair.trial.lam / pair.coupling.shares(pair.placement, pair.trial))[which, None] * s[which]
+    tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[which, None] * s[which]
     du = problem.forces.vector(way[: problem.config.n_owned])
-    made = contact_curvature(pair.coupling.turning(pair.placement, pair.trial, which, tau), du) * du
+    made = contact_curvature(pair.kinematics.turning(pair.trial, which, tau), du) * du
     difference = force(start + h * way, s) - force(start - h * way, s)
     difference.scale(0.5 / h)
     assert (difference - made).norm() <= bound * difference.norm()

@@ -61,7 +61,7 @@ def pushed(contact, before):
     """
     pair = contact.pair
     t, g = pair.trial, pair.config.gdim
-    out, c = t.lam[:, None] * pair.projection.normal, pair.placement.details.corners
+    out, c = t.lam[:, None] * pair.projection.normal, pair.kinematics.corners
     for k, i in [] if c is None else enumerate(c.which):
         assert c.count[k] == 2
         n = c.normals[k, :2] if t.facet[i] == before[i] or t.held[i, 0] != before[i] else c.normals[k, 1::-1]
@@ -95,7 +95,7 @@ def test_friction_and_normal_forces_do_all_the_work(cell, across):
         held += COMM.allreduce(int(pair.trial.in_corner.sum()))
         # those that were in contact all the time and have slid
         size = 0.5 * MU / np.hypot(1, MU) * (np.linalg.norm(before, axis=1) + np.linalg.norm(force, axis=1))
-        which = before.any(axis=1) & force.any(axis=1) & (pair.slipping | pair.trial.in_corner)
+        which = before.any(axis=1) & force.any(axis=1) & (pair.friction.slipping(pair.trial) | pair.trial.in_corner)
         slid += COMM.allreduce(np.array([taken[which].sum(), (size * np.linalg.norm(way, axis=1))[which].sum()]))
     assert held >= 4
     assert slid[0] == pytest.approx(slid[1], rel=2e-3)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
-
 from mpi4py import MPI
 
 import numpy as np
@@ -12,6 +10,7 @@ from helpers import CELLS
 from mortar_scenes import Blocks, disturbed
 
 import uem_dolfinx as uem
+from uem_dolfinx.contact.mortar_ends import curvature
 
 
 class WeightedGap:
@@ -25,19 +24,19 @@ class WeightedGap:
     def __init__(self, b, system):
         self.b, self.system, self.pair, self.g = b, system, b.contact.pair, b.g
         self.start = b.u.x.array.copy()
-        X, surface = self.pair.config.X, self.pair.coupling.surface
+        X, surface = self.pair.config.X, self.pair.discretisation.surface
         self.X, self.dofs = X, surface.dofs[self.points(self.start).facets]
         self.pressure = (1.0 + 0.5 * np.sin(5 * X[:, 0]))[self.dofs]
 
     def points(self, displacement):
         self.b.u.x.array[:] = displacement
         self.system.place(returning=False)
-        return self.pair.placement.details
+        return self.pair.kinematics.rows
 
-    def leave_out_ends(self):
-        """No multipliers where the end of the target moves over facets in 3D, which derivatives leave out; the rows."""
+    def leave_out(self, target):
+        """No multipliers where little is covered, or where sides all but coincide in 3D, as differences are poor there; the rows."""
         rows = self.points(self.start)
-        inner = rows.ratio > (1 - 1e-9 if self.g == 3 and self.pair.target.n_nodes else 0.5)
+        inner = rows.ratio > (1 - 1e-9 if self.g == 3 and target == "mesh" else 0.5)
         self.pressure[np.isin(self.dofs, self.pair.nodes[~inner]).any(axis=1)] = 0.0
         assert (self.pressure != 0).any()
         return rows
@@ -90,27 +89,30 @@ def weighted_gap(cell, target):
     return WeightedGap(b, problem.system)
 
 
-@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
+@pytest.mark.parametrize("cell", CELLS)
 def test_rows_are_derivatives_of_the_gaps(cell, target):
     """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
     phi = weighted_gap(cell, target)
-    phi.leave_out_ends()
+    phi.leave_out(target)
     first = phi.forces(phi.start)
     for way, (ahead, behind), h in phi.ways(cell):
         slope = (phi.value(ahead) - phi.value(behind)) / h
         assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
 
 
-@pytest.mark.parametrize(("cell", "target"), [*product(CELLS, ("mesh", "ball")), ("triangle", "end"), ("quadrilateral", "end")])
+@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
+@pytest.mark.parametrize("cell", CELLS)
 def test_curvature_against_differences(cell, target):
     """Blocks of the curvature against central differences of what the rows hand on at constant multipliers."""
     phi = weighted_gap(cell, target)
-    rows = phi.leave_out_ends()
-    nodes, blocks = rows.points.curvature(phi.pressure)
-    assert np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0
-    index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
+    rows = phi.leave_out(target)
+    parts = curvature(rows.points, phi.pressure)
+    assert all(np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0 for _, blocks in parts)
     for way, (ahead, behind), h in phi.ways(cell):
         measured = -(phi.forces(ahead) - phi.forces(behind)) / h
         told = np.zeros(len(phi.start))
-        np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        for nodes, blocks in parts:
+            index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
+            np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()

@@ -38,7 +38,7 @@ def sliding_block(cell, height, normals, start=0.0, n_low=8, length=2.0, offset=
     [
         *product(["triangle"], [0.15, -0.15], ["facet", "averaged"]),
         pytest.param("hexahedron", -0.15, "facet", marks=pytest.mark.slow),
-        ("hexahedron", 0.15, "averaged"),
+        pytest.param("hexahedron", 0.15, "averaged", marks=pytest.mark.slow),
         pytest.param("hexahedron", 0.15, "facet", marks=pytest.mark.slow),
         pytest.param("hexahedron", -0.15, "averaged", marks=pytest.mark.slow),
     ],

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, box, scene
+from helpers import at, blocks, box, clamp, linear, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
 from uem_dolfinx.solve.passages import refuse_passages
-from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.time_steps import _refuse_given_energy
 
 COMM = MPI.COMM_WORLD
@@ -40,30 +39,6 @@ def bar(mass=None, **how):
 
 
 # -- lengths of steps --------------------------------------------------------------------------------------------------
-
-
-def test_steps_are_cut_ten_times():
-    """Down to 1/1024 of the nominal length, whatever that is, and only for errors that a shorter step may mend."""
-    control, failed = StepControl(0.1), uem.ConvergenceError("no")
-    assert not control.shorten(0.1 / 700, failed) and control.length == 0.1
-    assert control.shorten(0.1 / 170, failed) and control.length == 0.1 / 340
-    control = StepControl(0.1)
-    cuts = 0
-    while control.shorten(control.length, failed):
-        cuts += 1
-    assert cuts == 10 and control.done([None]) == (1, 10) and control.done([None]) == (2, 0)
-    assert not StepControl(0.1).shorten(0.1, uem.FloatingBodyError("falls"))
-
-
-def test_easy_steps_are_doubled():
-    """After 2 linear solves the next step may be twice as long, after 18 not; never longer than the nominal length."""
-    control = StepControl(1.0)
-    control.shorten(0.5, uem.ConvergenceError("no"))
-    control.done([None] * 19)
-    assert control.length == 0.25
-    for length in (0.5, 1.0, 1.0):
-        control.done([None] * 3)
-        assert control.length == length
 
 
 @pytest.mark.parametrize(("left", "steps"), [(3e-10, 1), (3e-9, 2)])
@@ -204,3 +179,16 @@ def test_points_beside_the_centre(cell):
     squares = (x**2).mean(axis=0) - 0.25
     assert ((squares > 3e-9) & (squares < 3e-8)).all()
     assert points.volumes.sum() == pytest.approx(1.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_at_rest_nothing_is_cut(coupling):
+    """A block that a static solve has brought to rest under its weight stays there, in steps of full length."""
+    b, force = blocks(COMM, "quadrilateral", 3, 6, overhang=0.5), (0.0, -10.0)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.scene.tag("side", 1, at(0, 0.0)), 0)]
+    F, weight = linear(b.u, 1e3), ufl.inner(fem.Constant(b.scene.mesh, np.array(force)), ufl.TestFunction(b.V)) * ufl.dx
+    contacts = [uem.Contact(b.high, uem.RigidPlane([0.0, 0.0], [0.0, 1.0]), coupling=coupling) for _ in range(2)]
+    uem.UnitedProblem(F - weight, b.u, bcs=bcs, contacts=contacts[:1]).solve()
+    dynamics = uem.Dynamics(uem.consistent_mass(b.V, 1.0), gravity=force)
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=contacts[1:], dynamics=dynamics)
+    assert [step.cuts for step in uem.time_steps(problem, dt=0.01, end=0.05)] == [0] * 5

@@ -198,6 +198,21 @@ def test_without_groups_all_cells_are_taken(write, comm):
 # -- the ways in -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("end", ["", " ", "\n", " // the end", " // the end\n"])
+@pytest.mark.parametrize("included", [False, True])
+def test_last_line_without_end(write, comm, included, end):
+    """All statements of a last line are read, however the file ends, and so are those of files that it includes from its own folder."""
+    last = 'Physical Curve("left") = {4}; Physical Curve("right") = {2}; Physical Surface("body") = {1};' + end
+    write("bodies.inc.geo", "h = 0.5; w = 2;\n" + BODIES + (last if included else ""))
+    path = write("last.geo", 'Include "bodies.inc.geo";\n' + ('Physical Curve("top") = {3};' + end if included else last))
+    mesh, tags = read_gmsh(path, comm)
+    assert [size(mesh, tags[name]) for name in ("left", "right", "body")] == pytest.approx([1, 1, 2], rel=1e-12)
+    assert not included or size(mesh, tags["top"]) == pytest.approx(2)
+    wrong = write("wrong.geo", "h = 1;\nPoint(1) = {0, 0, unknown, h};" + end)
+    with pytest.raises(uem.MeshError, match=r"wrong.geo.*\bwrong.geo', line 2: Unknown variable 'unknown'"):
+        read_gmsh(wrong, comm)
+
+
 def test_live_model_and_msh_file(plates, comm, folder):
     """A live model is read where it is, in the user's session, which stays as it was."""
     model = None

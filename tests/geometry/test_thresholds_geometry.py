@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from dolfinx.mesh import locate_entities_boundary
+from helpers import at, box, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -55,6 +56,24 @@ def test_facets_equally_near(apart, alike):
         assert _nearest(pair, far, distance * np.array([0.1, 0.5]), number, 0.0)[0] == (1 if alike else 0)
         high = distance * np.array([0.5, 0.5 + apart])
         assert _nearest(pair, np.full(2, distance), high, number, 0.0)[0] == (0 if alike else 1)
+
+
+@pytest.mark.parametrize("height, told", [(0.2, True), (0.05, False)])
+def test_points_past_an_end(height, told):
+    """Below a fold and past its end, the plane that is farther counts; where it is past the end rather than below, neither does."""
+    upward = set()
+    for side in (-1, 1):
+
+        def fold(x, side=side):
+            return x + np.outer(np.maximum(side * (x[:, 0] - 1), 0.0), [0.0, 0.0, 1.0])
+
+        s = scene(MPI.COMM_SELF, "tetrahedron", [box("tetrahedron", [0.0, 0.0, -1.0], [2.0, 1.0, 0.0], [2, 1, 1])], pose=fold)
+        config = Configuration(fem.Function(compat.function_space(s.mesh, 1, (3,))))
+        target = MeshTarget(TargetFacets(config, s.tag("top", 0, at(2, 0.0))))
+        p = target.project(np.array([[1.0, -0.01, -0.01 * height]]))
+        assert np.allclose(p.foot, [[1.0, 0.0, 0.0]], atol=1e-12)
+        upward.add(round(float(target.outward(p)[0, 2]), 9))
+    assert (upward == {1.0}) == told
 
 
 def inside(cell, n=60):

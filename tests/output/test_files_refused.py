@@ -17,7 +17,7 @@ from results_scenes import pressed, rows, series, small_disk, strains
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.output import xdmf
+from uem_dolfinx.files import OwnFile
 from uem_dolfinx.parallel import agreed
 
 COMM = MPI.COMM_WORLD
@@ -85,12 +85,12 @@ def test_numbers_that_one_rank_cannot_write(rank, folder, monkeypatch):
     writer = uem.ResultsWriter(folder / "run", problem, fields=strains(problem))
     writer.write(0.0)
 
-    def full(file, offset, array):
+    def full(self, offset, array):
         raise OSError("no space left")
 
     with monkeypatch.context() as patch:
         if COMM.rank == rank:
-            patch.setattr(xdmf, "write_at", full)
+            patch.setattr(OwnFile, "write_at", full)
         raised(uem.OutputError, "run.xdmf cannot be written .no space left.", lambda: writer.write(1.0))
     writer.write(2.0)
     writer.close()

@@ -154,9 +154,8 @@ def test_a_pressure_that_is_the_same_everywhere(folder):
 
 def test_a_field_that_is_the_same_everywhere():
     """Rounding is not drawn, and what varies a little more is."""
-    even = drawings.EVEN
-    assert drawings._bounds(2.0, 2.0 * (1 + 0.1 * even), 12).tolist() == pytest.approx([1.9, 2.1])
-    assert len(drawings._bounds(2.0, 2.0 * (1 + 10 * even), 12)) > 6
+    assert drawings._bounds(2.0, 2.0 * (1 + 3e-10), 12).tolist() == pytest.approx([1.9, 2.1])
+    assert len(drawings._bounds(2.0, 2.0 * (1 + 3e-9), 12)) > 6
     assert len(drawings._bounds(0.0, 0.0, 12)) == 2
 
 

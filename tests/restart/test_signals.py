@@ -6,18 +6,24 @@ The test to read first is ``test_one_rank_is_interrupted``.
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import blocks, linear, serial, start_process
+from helpers import blocks, environment, linear, serial, start_process
 from ramp_scenes import COMM, nothing
 from resting_scenes import Bar
 
 import uem_dolfinx as uem
+from uem_dolfinx.restart.interruption import INTERRUPTED
+from uem_dolfinx.solve.system import BodySystem
 
 ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: SystemExit}
 
@@ -57,6 +63,91 @@ def scene(in_time, load):
     F = linear(b.u, 1.0) + 0.1 * weight * ufl.TestFunction(b.V)[1] * ufl.dx
     problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)], load=pull)
     return problem, lambda checkpoint: uem.load_steps(problem, 5, checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize("number", ENDS, ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("within", ["problem", "solve"])
+def test_one_rank_is_interrupted_outside_of_steps(number, within, monkeypatch):
+    """While the problem is made, or brought into equilibrium without steps: all ranks end."""
+    b = blocks(COMM, "triangle")
+
+    def method(*args, **how):
+        if within == "problem":
+            send(number)
+        return BodySystem(*args, **how)
+
+    def run():
+        contact = uem.Contact(b.high, b.low)
+        problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.05), contacts=[contact], method=method)
+        if within == "solve":
+            solve = problem.system.solve
+            monkeypatch.setattr(problem.system, "solve", lambda *args: send(number) or solve(*args))
+            problem.solve()
+
+    with pytest.raises(ENDS[number]):
+        run()
+    assert not b.u.x.array.any()
+
+
+@pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, ZeroDivisionError])
+@pytest.mark.parametrize("what", ["load", "constant", "distance", "friction", "damping", "mass"])
+def test_functions_that_end_one_rank(what, kind):
+    """Whatever a function of the user's raises on one rank, and be it the end of the script, ends all ranks alike."""
+    b, now = blocks(COMM, "triangle"), []
+
+    def fail(value):
+        if now and COMM.rank == COMM.size - 1:
+            raise kind("of one rank")
+        return value
+
+    weight = fem.Constant(b.scene.mesh, 0.0)
+    ground = uem.RigidSurface(lambda x: fail(x[:, 1]), lambda x: np.tile([0.0, 1.0], (len(x), 1)))
+    options = {
+        "load": lambda: {"load": lambda factor: fail(None)},
+        "constant": lambda: {"load": {weight: fail}},
+        "distance": dict,
+        "friction": lambda: {"contacts": [uem.Contact(b.high, b.low, friction=lambda x: fail(0.1))]},
+        "damping": lambda: {"dynamics": uem.Dynamics(uem.lumped_mass(b.V, 1.0), damping=fail)},
+        "mass": lambda: {"dynamics": uem.Dynamics(uem.nodal_mass(b.V, lambda x: fail(np.ones(len(x)))))},
+    }[what]
+
+    def run():
+        contacts = [uem.Contact(b.high, ground if what == "distance" else b.low)]
+        # the functions of a surface are asked where there are contactors
+        now.extend([1] * (what != "distance"))
+        given = {"bcs": b.oedometer(0.05), "contacts": contacts} | options()
+        problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, **given)
+        owners = COMM.allgather(len(problem.contacts[0].nodes) > 0)
+        now.extend([1] * (COMM.rank == owners.index(True)))
+        if what == "distance" and now:
+            ground.distance = end
+        for _ in uem.load_steps(problem, 1):
+            pass
+
+    def end(x):
+        raise kind("of one rank")
+
+    with pytest.raises(uem.UserFunctionError if kind is ZeroDivisionError else kind, match="of one rank"):
+        run()
+
+
+ALONE = """
+from mpi4py import MPI
+import signal, sys
+import uem_dolfinx as uem
+if MPI.COMM_WORLD.rank == 1:
+    signal.raise_signal(signal.SIGINT)
+MPI.COMM_WORLD.barrier()
+"""
+
+
+@serial
+def test_one_rank_is_interrupted_before_the_steps():
+    """In the script's own lines, where nothing is collective: the run ends, and the others do not wait for ever."""
+    mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
+    command = [str(mpiexec), "-n", "2", sys.executable, "-c", ALONE]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=120)
+    assert done.returncode == INTERRUPTED and "KeyboardInterrupt" in done.stderr
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -11,9 +11,22 @@ from resting_scenes import COMM
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.solve.tangent import contact_curvature
+from uem_dolfinx.solve.tangent import contact_curvature, convex_part
 
 # ---------------------------------------------------------------------------------------------- curvature of the contact
+
+
+def test_convex_part():
+    """Of symmetric blocks the positive eigenvalues stay, with their directions; others stay as they are."""
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(5, 6, 6))
+    blocks = np.concatenate([A + A.transpose(0, 2, 1), A])
+    made = convex_part(blocks)
+    assert np.array_equal(made[5:], A)
+    for block, convex in zip(blocks[:5], made):
+        rest = convex - block
+        assert np.linalg.eigvalsh(convex).min() > -1e-12 and np.linalg.eigvalsh(rest).min() > -1e-12
+        assert np.abs(convex @ rest).max() < 1e-12
 
 
 def test_curvature_is_the_sum_of_its_blocks():

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import CELLS, at, box, clamp, highest, lawful, linear, modulus, raised, rotation, scene, st_venant
+from falling_scenes import LAWS, Falling, arc, half_disc
+from helpers import CELLS, at, box, clamp, highest, lawful, modulus, raised, rotation
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 
 COMM = MPI.COMM_WORLD
-LAWS = {"linear": linear, "finite": st_venant}
 
 
 def shortening(stress, law):
@@ -29,46 +29,6 @@ def shortening(stress, law):
         return stress
     # s = e (1 - e)(2 - e) / 2
     return float(min(r.real for r in np.roots([0.5, -1.5, 1.0, -stress]) if abs(r.imag) < 1e-12))
-
-
-class Falling:
-    """Bodies that fall under weight, or under tractions on named facets.
-
-    Args:
-        cell: kind of cells.
-        bodies: boxes and others.
-        law: ``"linear"`` or ``"finite"``.
-        E: modulus of each body.
-        how: see ``helpers.scene``.
-    """
-
-    def __init__(self, cell, bodies, law="linear", E=(1.0, 1.0), nu=0.0, comm=COMM, **how):
-        self.s = scene(comm, cell, bodies, **how)
-        self.g = self.s.mesh.geometry.dim
-        self.V = compat.function_space(self.s.mesh, 1, (self.g,))
-        self.u = fem.Function(self.V)
-        self.F = LAWS[law](self.u, modulus(self.s, *E), nu)
-        self.bodies = np.repeat(np.arange(len(bodies)), [len(b.x) for b in bodies])
-
-    def weigh(self, *density, way=None):
-        """Weight per volume of each body, against the last axis or another way up; it can be turned later."""
-        load = self.load = fem.Constant(self.s.mesh, -(np.eye(self.g)[-1] if way is None else way))
-        self.F -= ufl.inner(load, modulus(self.s, *density) * ufl.TestFunction(self.V)) * ufl.dx
-
-    def pull(self, tag, traction):
-        """Dead traction on facets."""
-        t = fem.Constant(self.s.mesh, np.array(traction, dtype=float))
-        self.F -= ufl.inner(t, ufl.TestFunction(self.V)) * forms.surface_measure(self.s.mesh, tag.entities)
-
-    def problem(self, bcs=(), contacts=(), **options):
-        self.contacts = list(contacts)
-        self.p = uem.UnitedProblem(self.F, self.u, bcs=list(bcs), contacts=self.contacts, **options)
-        return self.p
-
-    def moved(self, body=None):
-        """Displacements of a body's nodes, in the drawing's order, on every rank."""
-        u = self.s.gather(self.u)
-        return u if body is None else u[self.bodies == body]
 
 
 def falling(cell, law="linear", *, gap=0.25, stress=0.02, E=(1.0, 2.0), n=(2, 4), nu=0.0, comm=COMM, traction=None, **how):
@@ -160,21 +120,6 @@ def test_tilted_block_comes_to_rest_flat(cell, law):
     else:
         # a linear body measures its strain in the pose that it was drawn in
         assert np.abs(x[:, -1] - (1 - stress) * f.s.drawing[:, -1]).max() < 5 * stress * angle + 2 * angle**2
-
-
-def half_disc(n, middle=(0.0, 1.0), radius=1.0):
-    """Lower half of a disc, flat above."""
-
-    def onto(x):
-        y = np.column_stack([x[:, 0] * np.sqrt(1 - x[:, 1] ** 2 / 2), x[:, 1] * np.sqrt(1 - x[:, 0] ** 2 / 2)])
-        return radius * y + middle
-
-    return box("quadrilateral", [-1.0, -1.0], [1.0, 0.0], [2 * n, n]).mapped(onto)
-
-
-def arc(middle=(0.0, 1.0), radius=1.0):
-    """Predicate of the nodes on a half disc's arc."""
-    return lambda x: np.abs(np.linalg.norm(x - middle, axis=1) - radius) < 1e-9
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.2])

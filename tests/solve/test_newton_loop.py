@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 from petsc4py import PETSc
 
@@ -20,7 +21,7 @@ def vector(value):
 class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
 
-    linear = tolerant = in_contact = rough = inexact = False
+    linear = tolerant = in_contact = rough = inexact = convex = False
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0
@@ -84,6 +85,31 @@ def test_what_the_line_search_accepts(left, length):
     system = OneUnknown(left)
     history = solve_united(system, rtol=1e-8, max_iterations=10, line_search=True, verbose=False)
     assert history[1].step_length == length
+
+
+@pytest.mark.parametrize("convex", [False, True])
+def test_steps_go_on_downhill(convex):
+    """Past a limit point forces grow at first: with a convex tangent steps go on as long as these drive the body that way."""
+
+    class Hill(OneUnknown):
+        """Its energy, ``cos u``, falls until u = pi; the tangent has no more than the step's sign."""
+
+        def F(self):
+            return -np.sin(0.05 + self.u)
+
+        def linearise(self, state):
+            self.solves += 1
+            return vector(-self.F())
+
+        def solve(self, rhs, accuracy, near):
+            return vector(0.1 * np.sign(rhs.array_r[0])), 1
+
+    system = Hill(1.0)
+    system.convex = convex
+    with pytest.raises(uem.ConvergenceError) as caught:
+        solve_united(system, rtol=1e-8, max_iterations=1, line_search=True, verbose=False)
+    # 0.05 + 0.1 * 16 < pi < 0.05 + 0.1 * 32
+    assert caught.value.history[-1].step_length == (16.0 if convex else 1.0 / 64)
 
 
 def test_no_convergence_is_an_error_with_its_history():

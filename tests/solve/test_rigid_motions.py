@@ -41,7 +41,7 @@ def test_what_counts_as_open(body):
     for resistance, left in ((3e-6, 3), (3e-5, 2)):
         # a corner moves by 1.2 of a motion's size at most
         equations = corner_equation(config, np.array([0.0, resistance]))
-        assert motions.open_motions(equations).shape[1] == left
+        assert motions.open_motions(motions.rates(equations)).shape[1] == left
 
 
 def test_what_counts_as_loaded(body):

@@ -41,7 +41,14 @@ def bumpy_top(cell, degree):
 @pytest.mark.parametrize("height", [0.0, 0.1, -0.05])
 @pytest.mark.parametrize(
     "cell,degree",
-    [("triangle", 1), ("triangle", 2), ("tetrahedron", 1), ("tetrahedron", 2), ("hexahedron", 1), ("hexahedron", 2)],
+    [
+        ("triangle", 1),
+        ("triangle", 2),
+        ("tetrahedron", 1),
+        pytest.param("tetrahedron", 2, marks=pytest.mark.slow),
+        ("hexahedron", 1),
+        ("hexahedron", 2),
+    ],
 )
 def test_gap_derivatives_on_a_facet(cell, degree, height):
     """First and second derivative of the gap, projected anew at every displaced configuration."""

@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from benchmarks.cases_scales import springs
 from dolfinx import fem
-from evidence.cases_scales import springs
 from helpers import CELLS, blocks, box, clamp, complementary, linear, modulus, oedometric, run, scene, st_venant
 
 import uem_dolfinx as uem

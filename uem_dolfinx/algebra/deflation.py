@@ -24,14 +24,14 @@ from uem_dolfinx.algebra.options import has_mumps
 from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.nodes import Nodes
 
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
 #: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
 MUCH_STIFFER = 10.0
 #: A mode of which less than this part is new adds nothing to those before it.
-#: [convention; part of its norm; test_thresholds_algebra.py::test_modes_that_are_nearly_alike]
+#: [convention; part of its norm; test_linear_solver.py::test_modes_that_are_nearly_alike]
 INDEPENDENT = 1e-6
 #: Room of MUMPS beyond what it foresees, which does not always do on several ranks; ``W'AW`` is small.
 #: [bound; per cent; -]
@@ -83,38 +83,38 @@ class Deflation:
         self.W.multAdd(moved, y, y)
 
 
-def pressed_hard(config: Configuration, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
+def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
     """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)`` (collective)."""
-    followed, pressed = np.zeros((2, config.n_owned), dtype=bool)
-    followed[config.gather_owned(P.followed(P.equations.active))] = True
+    followed, pressed = np.zeros((2, space.n_owned), dtype=bool)
+    followed[space.gather_owned(P.followed(P.equations.active))] = True
     followed[P.nodes] = False
-    part = Part(config, followed)
-    stiffness, own = (part.of(M).getDiagonal().array_r.reshape(-1, config.gdim) for M in (A, K))
+    part = Part(space, followed)
+    stiffness, own = (part.of(M).getDiagonal().array_r.reshape(-1, space.block) for M in (A, K))
     pressed[part.nodes] = (P.used[part.nodes] & (stiffness > MUCH_STIFFER * own)).any(axis=1)
     return pressed
 
 
-def without(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
+def without(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
     """A copy of A with nodes ``pressed (n_owned,)`` by much stiffer contactors crossed out (collective)."""
     rest = A.copy()
-    first = config.gdim * int(config.index_map.local_range[0])
+    first = space.block * int(space.index_map.local_range[0])
     rest.zeroRowsColumns((np.flatnonzero(P.used & pressed[:, None]) + first).astype(PETSc.IntType))
-    rest.setBlockSize(config.gdim)
+    rest.setBlockSize(space.block)
     rest.setNearNullSpace(A.getNearNullSpace())
     return rest
 
 
-def deflated(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
+def deflated(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
     """W for nodes ``pressed (n_owned,)`` by much stiffer contactors; the last rank has the columns of the modes (collective)."""
-    g, n, comm = config.gdim, config.n_owned, config.comm
-    first = g * int(config.index_map.local_range[0])
+    g, n, comm = space.block, space.n_owned, space.comm
+    first = g * int(space.index_map.local_range[0])
     touched = PETSc.IS().createGeneral(np.flatnonzero(np.repeat(pressed, g)).astype(PETSc.IntType) + first, comm=PETSc.COMM_SELF)
     A.increaseOverlap(touched, 1)
     near = np.zeros((n, 1), dtype=bool)
-    near[config.gather_owned(np.unique(touched.getIndices() // g).astype(np.int64))] = True
+    near[space.gather_owned(np.unique(touched.getIndices() // g).astype(np.int64))] = True
     alone = np.flatnonzero(P.used & near)
     counts = np.cumsum([0, *comm.allgather(len(alone))])
-    mode, row, value = _rigid_modes(config, P, pressed, ~near & P.used)
+    mode, row, value = _rigid_modes(space, P, pressed, ~near & P.used)
     n_modes = comm.allreduce(int(mode.max(initial=-1)) + 1, op=MPI.MAX)
     rows, values = np.append(alone, row), np.append(np.ones(len(alone)), value)
     columns = np.append(counts[comm.rank] + np.arange(len(alone)), counts[-1] + mode)
@@ -128,11 +128,11 @@ def deflated(config: Configuration, A: PETSc.Mat, P: Restriction, pressed: Bools
     )
 
 
-def _rigid_modes(config: Configuration, P: Restriction, pressed: Bools, where: Bools) -> tuple[Ints, Ints, Array]:
-    """Number, local component and value of the entries of the stiff bodies' rigid motions at components ``where (n_owned, gdim)``."""
-    body, n_bodies = find_bodies(config)
-    n, eq, comm = config.n_owned, P.equations, config.comm
-    hard = (config.ask_owners(eq.followed, pressed[:, None].astype(float))[:, 0] > 0) & eq.active[eq.row]
+def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> tuple[Ints, Ints, Array]:
+    """Number, local component and value of the entries of the stiff bodies' rigid motions at components ``where (n_owned, block)``."""
+    body, n_bodies = find_bodies(space)
+    n, eq, comm = space.n_owned, P.equations, space.comm
+    hard = (space.ask_owners(eq.followed, pressed[:, None].astype(float))[:, 0] > 0) & eq.active[eq.row]
     stiff = np.zeros(n_bodies, dtype=bool)
     stiff[body[eq.node[eq.row[hard]]]] = True
     comm.Allreduce(MPI.IN_PLACE, stiff, op=MPI.LOR)
@@ -141,10 +141,8 @@ def _rigid_modes(config: Configuration, P: Restriction, pressed: Bools, where: B
     mine = np.flatnonzero(stiff[body[:n]])
     number = (np.cumsum(stiff) - 1)[body[mine]]
     # lengths of the model's size make turns as large as shifts
-    velocities = rigid_velocities(
-        (config.x[:n] - comm.allreduce(config.x[:n].sum(axis=0)) / config.index_map.size_global) / config.size
-    )
-    modes = np.stack([P.reduce(P.vector(v)).array_r.reshape(n, -1) for v in velocities.transpose(1, 0, 2)], axis=2)
+    motions = space.modes(centred=True).transpose(1, 0, 2)
+    modes = np.stack([P.reduce(P.vector(v)).array_r.reshape(n, -1) for v in motions], axis=2)
     modes = (modes * where[:, :, None])[mine]
     gram = np.zeros((stiff.sum(), modes.shape[2], modes.shape[2]))
     np.add.at(gram, number, np.einsum("ngk,ngl->nkl", modes, modes))
@@ -154,4 +152,4 @@ def _rigid_modes(config: Configuration, P: Restriction, pressed: Bools, where: B
     column = (np.cumsum(independent) - 1).reshape(independent.shape)
     modes = np.einsum("ngk,nkl->ngl", modes, mixed / np.sqrt(np.where(independent, size, 1.0))[:, None, :])
     i, c, k = np.nonzero((modes != 0) & independent[number][:, None, :])
-    return column[number[i], k], mine[i] * config.gdim + c, modes[i, c, k]
+    return column[number[i], k], mine[i] * space.block + c, modes[i, c, k]

@@ -12,6 +12,7 @@ Rows that depend on others end as zeros and are left out: what they ask for hold
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 from mpi4py import MPI
@@ -20,16 +21,13 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import Exchange
 
 #: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
 #: do so only to the first order of their strain.
-#: [heuristic; part of the row's length in its free components; -]
+#: [heuristic; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
 DEPENDENT = 0.05
-#: A contactor's own component is eliminated unless another coefficient is larger by this factor, which orders pivots and no more.
-#: [heuristic; ratio of coefficients; -]
-OWN_FIRST = 1.5
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,40 @@ class Group:
 
     ``given (m,)`` tells which of the conflicting equations, ``redundant (m,)`` those left out; ``independent (k,)`` are of global
     nodes, which may live on any rank; ``shares (m, k)`` give the forces of the conflicting equations from those of the independent.
+    ``nodes (n_nodes,)`` are all that these act on, ascending.
     """
 
     given: Ints
     independent: UnitingEquations
     shares: Array
     redundant: Bools
+    nodes: Ints
+
+    def tilted(self, rows: UnitingEquations) -> Group:
+        """The group of the conflicting equations in other directions, which eliminate the same components.
+
+        With the given rows ``A`` and the shares ``S`` the independent ones are ``S'A``, here as there; they are solved for what those
+        eliminate, so that forces of the given equations keep their ratios.
+
+        Args:
+            rows: all conflicting equations, in their order, of global nodes.
+
+        Raises:
+            LinAlgError: if those components do not follow from the equations any more.
+        """
+        own, m, terms = self.independent, len(self.given), np.flatnonzero(np.isin(rows.row, self.given))
+        nodes = np.union1d(self.nodes, rows.followed[terms])
+        A = np.zeros((m, len(nodes), rows.direction.shape[1]))
+        np.add.at(A, (np.arange(m), np.searchsorted(nodes, rows.node[self.given])), rows.direction[self.given])
+        at = np.searchsorted(self.given, rows.row[terms]), np.searchsorted(nodes, rows.followed[terms])
+        np.add.at(A, at, -rows.coefficients[terms])
+        B, k, pivot = np.einsum("mk,mng->kng", self.shares, A), np.arange(len(own)), np.searchsorted(nodes, own.node)
+        solve = np.linalg.inv(np.einsum("kjg,jg->kj", B[:, pivot], own.direction))
+        B = np.einsum("kj,jng->kng", solve, B)
+        B[k, pivot] -= own.direction
+        row, column = np.nonzero((np.abs(B) > NEGLIGIBLE).any(axis=2))
+        independent = replace(own, row=row, followed=nodes[column], coefficients=-B[row, column])
+        return replace(self, independent=independent, shares=self.shares @ solve.T)
 
 
 class IndependentEquations:
@@ -52,35 +78,67 @@ class IndependentEquations:
     Conflicting equations are solved together on one rank; all others stay where they are.
 
     Args:
-        config: the space whose displacement is restricted.
+        space: the nodes whose components are restricted.
         equations: of this rank's contactors.
-        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, block)``.
         mutual: equations of surfaces that are contactor and target of each other ``(m,)``.
 
     Attributes:
         equations: the independent ones.
         redundant: which of the given equations were left out because they depend on others ``(m,)``, known after ``forces``.
+        undetermined: which of them no longer tell the components that they eliminate, being tilted ``(m,)``.
         found: whether any equations on any rank conflict.
     """
 
-    def __init__(self, config: Configuration, equations: UnitingEquations, free: Bools, mutual: Bools):
+    def __init__(self, space: Nodes, equations: UnitingEquations, free: Bools, mutual: Bools):
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
+        self.undetermined: Bools = self.redundant
         conflicting = equations.active & (mutual | _cannot_eliminate(equations, free))
-        counts = config.comm.allgather(int(conflicting.sum()))
+        counts = space.comm.allgather(int(conflicting.sum()))
         self.found = any(counts)
         self.equations = equations
         if not self.found:
             return
-        self._conflicting = _with_neighbours(config, equations, conflicting)
+        self._conflicting = _with_neighbours(space, equations, conflicting)
+        self._space, self._rank = space, int(np.argmax(counts))
+        self._groups = _solve(space, self._gather(equations), free)
+        self._scatter(equations)
+
+    def tilted(self, equations: UnitingEquations) -> IndependentEquations:
+        """The same equations in other directions, which eliminate the same components (collective).
+
+        Where these no longer follow from the equations, the equations stay as they were and are told of by ``undetermined``.
+
+        Args:
+            equations: of this rank's contactors, in the order of those that were resolved.
+        """
+        other, rows = copy(self), self._gather(equations)
+        other.redundant, other._groups, singular = self.redundant.copy(), [], np.zeros(len(rows), dtype=bool)
+        for group in self._groups:
+            try:
+                other._groups.append(group.tilted(rows))
+            except np.linalg.LinAlgError:
+                other._groups.append(group)
+                singular[group.given] = True
+        other.undetermined = np.zeros(len(equations), dtype=bool)
+        (other.undetermined[self._conflicting],) = self._gathered.back(singular)
+        other._scatter(equations)
+        return other
+
+    def _gather(self, equations: UnitingEquations) -> UnitingEquations:
+        """The conflicting ones of these equations from all ranks, of global nodes, on the rank that solves them (collective)."""
         mine = equations.select(self._conflicting)
-        together, self._gathered = _send(
-            config.comm, replace(mine, node=config.to_global(mine.node)), np.full(len(mine), np.argmax(counts))
-        )
-        self._groups = _solve(config, together, free)
-        independent = UnitingEquations.join([group.independent for group in self._groups], config.gdim)
-        solved, self._scattered = _send(config.comm, independent, config.owner_of(independent.node))
-        solved = replace(solved, node=(solved.node - config.index_map.local_range[0]).astype(np.int32))
-        self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], config.gdim)
+        mine = replace(mine, node=self._space.to_global(mine.node))
+        together, self._gathered = _send(self._space.comm, mine, np.full(len(mine), self._rank))
+        return together
+
+    def _scatter(self, equations: UnitingEquations) -> None:
+        """Take the groups' independent equations in place of the conflicting ones, each on the rank that has its node (collective)."""
+        space = self._space
+        independent = UnitingEquations.join([group.independent for group in self._groups], space.block)
+        solved, self._scattered = _send(space.comm, independent, space.owner_of(independent.node))
+        solved = replace(solved, node=(solved.node - space.index_map.local_range[0]).astype(np.int32))
+        self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], space.block)
 
     def forces(self, multipliers: Array) -> Array:
         """Contact forces of the given equations from ``multipliers``, those of ``equations`` in their order (collective)."""
@@ -113,11 +171,11 @@ def _send(comm: MPI.Comm, equations: UnitingEquations, rank: Ints) -> tuple[Unit
     return UnitingEquations(node, direction, gap, active, row, followed, coefficients), exchange
 
 
-def _solve(config: Configuration, rows: UnitingEquations, free: Bools) -> list[Group]:
+def _solve(space: Nodes, rows: UnitingEquations, free: Bools) -> list[Group]:
     """Solve conflicting equations group by group, on the rank that has them (collective)."""
     node, place = np.unique(np.concatenate([rows.node, rows.followed]), return_inverse=True)
-    movable = config.ask_owners(node, free.astype(float)) > 0
-    m, g = len(rows), config.gdim
+    movable = space.ask_owners(node, free.astype(float)) > 0
+    m, g = len(rows), space.block
     if m == 0:
         return []
     from scipy.sparse import coo_matrix
@@ -133,7 +191,7 @@ def _solve(config: Configuration, rows: UnitingEquations, free: Bools) -> list[G
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
-        groups.append(_eliminate(A, -rows.gap[which], at[: len(which)], movable[columns], node[columns], which))
+        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which))
     return groups
 
 
@@ -145,28 +203,28 @@ def _cannot_eliminate(equations: UnitingEquations, free: Bools) -> Bools:
     return unable
 
 
-def _with_neighbours(config: Configuration, equations: UnitingEquations, conflicting: Bools) -> Bools:
+def _with_neighbours(space: Nodes, equations: UnitingEquations, conflicting: Bools) -> Bools:
     """Add the equations of all nodes that conflicting ones act on, until none is left (collective)."""
     conflicting = conflicting.copy()
-    here = np.zeros(config.n_owned, dtype=bool)
+    here = np.zeros(space.n_owned, dtype=bool)
     while True:
         rows = conflicting[equations.row]
-        touched = np.unique(np.concatenate([equations.followed[rows], config.to_global(equations.node[conflicting])]))
-        here[config.gather_owned(touched)] = True
+        touched = np.unique(np.concatenate([equations.followed[rows], space.to_global(equations.node[conflicting])]))
+        here[space.gather_owned(touched)] = True
         more = equations.active & ~conflicting & here[equations.node]
         conflicting |= more
-        if not config.comm.allreduce(int(more.any())):
+        if not space.comm.allreduce(int(more.any())):
             return conflicting
 
 
-def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: Ints) -> Group:
+def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
-    Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which neither
-    pivots nor preferences change; it is then left out, and the others go on.
+    Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which
+    pivots do not change; it is then left out, and the others go on.
 
-    In ``A (m, n_nodes, gdim)`` and ``free (n_nodes, gdim)`` each of the global nodes ``node (n_nodes,)`` has its block of columns,
-    ``own (m,)`` that of each equation's contactor; ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides.
+    In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
+    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
@@ -178,7 +236,6 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: In
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
     while (rest := rest & (np.linalg.norm(across, axis=1) > DEPENDENT)).any():
         size = np.linalg.norm(A * free, axis=2)
-        size[np.arange(m), own] *= OWN_FIRST
         i, t = np.unravel_index(np.argmax(np.where(rest[:, None], size, -1.0)), size.shape)
         q = across[i] / np.linalg.norm(across[i])
         across -= (across @ q)[:, None] * q
@@ -205,4 +262,4 @@ def _eliminate(A: Array, h: Array, own: Ints, free: Bools, node: Ints, given: In
     )
     redundant = np.ones(m, dtype=bool)
     redundant[k] = False
-    return Group(given, independent, shares, redundant)
+    return Group(given, independent, shares, redundant, node)

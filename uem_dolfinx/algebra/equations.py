@@ -15,10 +15,10 @@ import numpy.typing as npt
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
-#: [convention; part of the direction's length; test_thresholds_algebra.py::test_what_a_condition_leaves_of_a_normal]
+#: [convention; part of the direction's length; test_equations.py::test_what_a_condition_leaves_of_a_normal]
 MOSTLY_PRESCRIBED = 1e-6
 #: Coefficients below it are rounding: nothing follows by them, and changes below it make no new P.
-#: [convention; directions of length one; test_thresholds_algebra.py::test_coefficients_that_are_rounding]
+#: [convention; directions of length one; test_equations.py::test_coefficients_that_are_rounding]
 NEGLIGIBLE = 1e-12
 
 
@@ -28,13 +28,13 @@ class UnitingEquations:
 
     Attributes:
         node: local number of the owned node whose displacement is eliminated ``(m,)``.
-        direction: vectors ``(m, gdim)``, of unit length where a contactor follows its target.
+        direction: vectors ``(m, block)``, of unit length where a contactor follows its target.
         gap: lengths ``(m,)``.
         active: whether the equation holds ``(m,)``; one that does not only keeps its place in the sparsity of P, so that
             contactors can be activated and released without new symbolic work.
         row: the equation that each term belongs to ``(k,)``.
         followed: global block number of the node that the term follows ``(k,)``.
-        coefficients: of its displacement ``(k, gdim)``.
+        coefficients: of its displacement ``(k, block)``.
     """
 
     node: npt.NDArray[np.integer]
@@ -59,11 +59,11 @@ class UnitingEquations:
         return UnitingEquations(node, direction, gap, active, row.astype(np.int64), targets[row, a], coefficients)
 
     @staticmethod
-    def join(parts: list[UnitingEquations], gdim: int) -> UnitingEquations:
+    def join(parts: list[UnitingEquations], block: int) -> UnitingEquations:
         """All equations of several lists, in this order."""
         if not parts:
             return UnitingEquations.along(
-                np.zeros(0, np.int32), np.zeros((0, gdim)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
+                np.zeros(0, np.int32), np.zeros((0, block)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
                 np.zeros(0, bool),
             )  # fmt: skip
         first = np.cumsum([0, *(len(p) for p in parts)])
@@ -87,7 +87,7 @@ class UnitingEquations:
 
 
 def least_left(A: Array) -> Array:
-    """What nodes have left to eliminate by k equations each with directions ``A (n, k, gdim)``, the least singular value ``(n,)``."""
+    """What nodes have left to eliminate by k equations each with directions ``A (n, k, block)``, the least singular value ``(n,)``."""
     if A.shape[1] > A.shape[2]:
         return np.zeros(len(A))
     return np.asarray(np.linalg.svd(A, compute_uv=False)[:, -1])

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 
 #: A factorisation that has not done after so many solves is made anew, which takes about as long.
@@ -26,8 +26,9 @@ FEW_CHANGES = 4
 #: A factorisation serves for bodies whose stiffness has changed by no more than this part anywhere.
 #: [convention; diagonal of K; test_kept_factor.py::test_a_factor_serves_few_changes]
 ALIKE = 0.02
-#: Solves leave no more than this part of their right-hand side, however little is asked for: another digit is cheap.
-#: [heuristic; right-hand side; -]
+#: Solves leave no more than this part of their right-hand side, however little is asked for: another digit is cheaper than another
+#: Newton iteration.
+#: [convention; right-hand side; test_kept_factor.py::test_a_factor_leaves_little]
 LEAST_ACCURATE = 1e-3
 
 
@@ -35,11 +36,11 @@ class KeptFactor:
     """The last factorisation of ``P'KP``, and what it was made with.
 
     Args:
-        config: the space that K acts on.
+        space: the space that K acts on.
     """
 
-    def __init__(self, config: Configuration):
-        self.config = config
+    def __init__(self, space: Nodes):
+        self.space = space
         self._pc: Any = None
         #: Which columns of P were used, and the diagonal of K.
         self._made_with: Any = None
@@ -60,7 +61,7 @@ class KeptFactor:
             there = diagonal.array_r
             if (np.abs(K.getDiagonal().array_r - there) <= ALIKE * np.abs(there)).all():
                 changed = float(np.count_nonzero(used != P.used))
-        return bool(self.config.comm.allreduce(changed) <= FEW_CHANGES)
+        return bool(self.space.comm.allreduce(changed) <= FEW_CHANGES)
 
     def solve(
         self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, rhs: PETSc.Vec, accuracy: float
@@ -68,8 +69,8 @@ class KeptFactor:
         """Unknowns that leave no more than the part ``accuracy`` of ``rhs``, and how many solves; None after too many (collective)."""
         if self._pc is None:
             return None
-        ksp = PETSc.KSP().create(self.config.comm)
-        A = PETSc.Mat().createPython(K.getSizes(), _United(P, K, curvature), comm=self.config.comm)
+        ksp = PETSc.KSP().create(self.space.comm)
+        A = PETSc.Mat().createPython(K.getSizes(), _United(P, K, curvature), comm=self.space.comm)
         ksp.setOperators(A)
         ksp.setType("fgmres")
         ksp.setGMRESRestart(MOST_SOLVES)
@@ -105,7 +106,7 @@ class _United:
 
 
 class _Solves:
-    """Solves by a factorisation that is not to be made anew; unknowns that are not used ``(n_owned gdim,)`` stay zero."""
+    """Solves by a factorisation that is not to be made anew; unknowns that are not used ``(n_owned block,)`` stay zero."""
 
     def __init__(self, pc: PETSc.PC, idle: Bools):
         self.pc, self.idle = pc, idle

@@ -21,27 +21,26 @@ from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.options import OFTEN_USED, check_options, default_options
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, LinearSolveError
-from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
 
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
-#: [convention; bodies; test_thresholds_algebra.py::test_few_bodies_have_modes_of_their_own]
+#: [convention; bodies; test_linear_solver.py::test_few_bodies_have_modes_of_their_own]
 MODES_OF_THEIR_OWN = 4
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
-#: [convention; ratio of norms; test_thresholds_algebra.py::test_accuracy_of_an_iterative_solve]
+#: [convention; ratio of norms; test_linear_solver.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
 #: A preconditioner is kept for matrices that differ from its own in no more than this part of the equations.
-#: [convention; part of the equations; test_thresholds_algebra.py::test_preconditioner_is_kept]
+#: [convention; part of the equations; test_linear_solver.py::test_preconditioner_is_kept]
 KEPT_CHANGES = 0.1
 #: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
-#: [convention; ratio of iterations; test_thresholds_algebra.py::test_preconditioner_is_kept]
+#: [convention; ratio of iterations; test_linear_solver.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
 #: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
-#: [convention; entries; test_thresholds_algebra.py::test_what_counts_as_symmetric]
+#: [convention; entries; test_linear_solver.py::test_what_counts_as_symmetric]
 SYMMETRIC = 1e-11
 #: Types of PC that cannot see contactors much stiffer than their targets.
 MULTIGRID = ("hypre", "gamg", "ml")
@@ -61,15 +60,15 @@ class UnitedSolver:
     its Newton iteration can use.
     """
 
-    def __init__(self, config: Configuration, prefix: str, options: dict[str, Any] | None):
-        self.config = config
-        size = config.gdim * config.index_map.size_global
-        with agreed(config.comm):
+    def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
+        self.space = space
+        size = space.block * space.index_map.size_global
+        with agreed(space.comm):
             check_options({} if options is None else options, prefix)
-        given.alike(config.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
+        given.alike(space.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
         self._prefix = prefix
         #: Options that are asked for first, and those that take over for the rest of a step where they fail or do not suit.
-        self._first, self._instead = default_options(size, config.gdim) if options is None else (dict(options), {})
+        self._first, self._instead = default_options(size, space.gdim) if options is None else (dict(options), {})
         self.options = self._first
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
@@ -78,10 +77,10 @@ class UnitedSolver:
         self.ksp: Any = None
         self._use(self._first)
         #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
-        self._united, self._unsymmetric = (UnitedMatrix(config, not self.iterative) for _ in range(2))
+        self._united, self._unsymmetric = (UnitedMatrix(space, not self.iterative) for _ in range(2))
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
         #: The last factorisation, and the united matrix that it serves to solve with, if it does.
-        self._kept = KeptFactor(config)
+        self._kept = KeptFactor(space)
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: P and K of the present united matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
@@ -91,7 +90,7 @@ class UnitedSolver:
         self._apart = self._begins = False
 
     def _create_ksp(self) -> PETSc.KSP:
-        ksp = PETSc.KSP().create(self.config.comm)
+        ksp = PETSc.KSP().create(self.space.comm)
         #: The preconditioner that the options ask for, which the KSP may have inside another one.
         self.pc = ksp.getPC()
         ksp.setOptionsPrefix(self._prefix)
@@ -124,7 +123,7 @@ class UnitedSolver:
         self.A = self._crossed = self._served = self._factor_of = None
         self._kept.drop()
         self._use(self._first)
-        self._united, self._unsymmetric = (UnitedMatrix(self.config, not self.iterative) for _ in range(2))
+        self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
     def begin_step(self) -> None:
         """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
@@ -202,7 +201,7 @@ class UnitedSolver:
         self._keep_preconditioner(restriction.equations)
         self.A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
-            self.A.setBlockSize(self.config.gdim)
+            self.A.setBlockSize(self.space.block)
             self.A.setNearNullSpace(self._near_null_space(restriction))
         self.pc.setOperators(self.A)
         self._deflate(restriction, K)
@@ -215,14 +214,14 @@ class UnitedSolver:
         if self.pc.getType() not in MULTIGRID:
             return
         with timed("deflation"):
-            pressed = pressed_hard(self.config, self.A, K, restriction)
-            if not self.config.comm.allreduce(int(pressed.any())):
+            pressed = pressed_hard(self.space, self.A, K, restriction)
+            if not self.space.comm.allreduce(int(pressed.any())):
                 self.ksp.setPC(self.pc)
                 return
-            self.pc.setOperators(without(self.config, self.A, restriction, pressed))
+            self.pc.setOperators(without(self.space, self.A, restriction, pressed))
             deflation = Deflation(self.pc)
-            deflation.update(self.A, deflated(self.config, self.A, restriction, pressed))
-            self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.config.comm))
+            deflation.update(self.A, deflated(self.space, self.A, restriction, pressed))
+            self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.space.comm))
 
     def _adapt(self, symmetric: bool) -> None:
         """Take the KSP and PC of the options, or ones for unsymmetric matrices in place of those for symmetric ones."""
@@ -240,7 +239,7 @@ class UnitedSolver:
         # the others have options of their own; one that stays is not shown its options again: hypre would lose what it has set up
         reader = pc
         if pc.getType() == before:
-            reader = PETSc.PC().create(self.config.comm)
+            reader = PETSc.PC().create(self.space.comm)
             reader.setType("none")
         self.ksp.setPC(reader)
         with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType()):
@@ -263,7 +262,7 @@ class UnitedSolver:
         if self.iterative and before is not None:
             same = np.array_equal(equations.node, before.node)
             changed = (equations.active != before.active).sum() if same else len(before) + 1
-            changed, present = self.config.comm.allreduce(np.array([changed, before.active.sum()]))
+            changed, present = self.space.comm.allreduce(np.array([changed, before.active.sum()]))
             keep = changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
             self._made_with, self._first_pace = equations, 0.0
@@ -276,10 +275,10 @@ class UnitedSolver:
         Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
         across a contact would lock its sliding.
         """
-        body, n_bodies = find_bodies(self.config)
-        body = body[: self.config.n_owned]
+        body, n_bodies = find_bodies(self.space)
+        body = body[: self.space.n_owned]
         own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
-        joint = rigid_body_modes(self.config)
+        joint = list(self.space.modes().transpose(1, 0, 2))
         vectors: list[PETSc.Vec] = []
         for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
             full = self.A.createVecLeft()
@@ -292,7 +291,7 @@ class UnitedSolver:
             if q.norm() > INDEPENDENT * before:
                 q.normalize()
                 vectors.append(q)
-        return PETSc.NullSpace().create(vectors=vectors, comm=self.config.comm)
+        return PETSc.NullSpace().create(vectors=vectors, comm=self.space.comm)
 
     @property
     def _tells_sign(self) -> bool:
@@ -433,8 +432,3 @@ def is_symmetric(A: PETSc.Mat) -> bool:
     difference.axpy(-1.0, across)
     difference.pointwiseMult(difference, scale)
     return bool(difference.norm(PETSc.NormType.INFINITY) <= SYMMETRIC)
-
-
-def rigid_body_modes(config: Configuration) -> list[Array]:
-    """Translations and linearised rotations of the current configuration, each ``(n_owned, gdim)``."""
-    return list(rigid_velocities(config.x[: config.n_owned]).transpose(1, 0, 2))

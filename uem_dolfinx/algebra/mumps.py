@@ -15,9 +15,6 @@ FACTORISATIONS = ("cholesky", "lu")
 #: MUMPS has at most so much room beyond what it foresees; a matrix that needs more is better not factorised.
 #: [convention; per cent; test_mumps.py::test_room_has_an_end]
 MOST_ROOM = 2000
-#: What a factorisation that lacked room gets at least.
-#: [heuristic; per cent; -]
-LEAST_ROOM = 50
 #: Ends of a factorisation that lacked room: for integers, for entries, for messages that were sent and received.
 SHORT_OF_ROOM = (-8, -9, -17, -20)
 #: The option by which the determinant is told.
@@ -37,7 +34,8 @@ def more_room(pc: PETSc.PC) -> dict[str, Any]:
     if not solves(pc):
         return {}
     factors = pc.getFactorMatrix()
-    room = max(2 * factors.getMumpsIcntl(14), LEAST_ROOM)
+    # what is foreseen is 100 per cent
+    room = 2 * factors.getMumpsIcntl(14) + 100
     short = factors.getMumpsInfog(1) in SHORT_OF_ROOM and room <= MOST_ROOM
     return {"mat_mumps_icntl_14": room} if short else {}
 

@@ -14,13 +14,13 @@ from uem_dolfinx import given
 from uem_dolfinx.errors import InputError, MissingBackendError
 
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
-#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
+#: [convention; unknowns; test_options.py::test_direct_solvers_up_to]
 DIRECT_UP_TO = {2: 300_000, 3: 30_000}
 #: CG with hypre takes less time from so many unknowns on, where it takes few iterations; GAMG does not.
-#: [convention; unknowns; test_thresholds_algebra.py::test_direct_solvers_up_to]
+#: [convention; unknowns; test_options.py::test_direct_solvers_up_to]
 HYPRE_FROM = {2: 300_000, 3: 4_000}
 #: CG that takes more iterations leaves a matrix to a factorisation that pays.
-#: [convention; iterations; test_thresholds_algebra.py::test_cg_gives_way]
+#: [convention; iterations; test_linear_solver.py::test_cg_gives_way]
 FEW_ITERATIONS = 200
 #: Options that misspelt ones are likely to mean.
 OFTEN_USED = (

@@ -20,11 +20,11 @@ from uem_dolfinx.algebra.entries import Entries, entries_of
 from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 
 #: Places of earlier products are kept while there are no more than this times as many of them as of the present one's.
-#: [convention; number of entries that K lacks; test_thresholds_algebra.py::test_places_of_earlier_products]
+#: [convention; number of entries that K lacks; test_linear_solver.py::test_places_of_earlier_products]
 KEPT_PLACES = 2.0
 
 
@@ -32,14 +32,14 @@ class UnitedMatrix:
     """``Q'(K + G)P`` of one K after the other, in the same matrix while its entries keep their places.
 
     Args:
-        config: the space that K acts on.
+        space: the space that K acts on.
         reserving: whether equations that do not hold have their places too.
     """
 
-    def __init__(self, config: Configuration, reserving: bool):
-        self.config, self.reserving = config, reserving
-        self._first, self._n = config.gdim * int(config.index_map.local_range[0]), config.gdim * config.n_owned
-        self._size = int(config.gdim * config.index_map.size_global)
+    def __init__(self, space: Nodes, reserving: bool):
+        self.space, self.reserving = space, reserving
+        self._first, self._n = space.block * int(space.index_map.local_range[0]), space.block * space.n_owned
+        self._size = int(space.block * space.index_map.size_global)
         #: K and the free components that the matrix was made for, and the state of K's values that it holds.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
@@ -77,7 +77,7 @@ class UnitedMatrix:
         lines, columns, product = self._entries(_product(_sum(H, curvature, part), trial, test), part)
         begins = self._A is None or self._begins
         places, there = (lines, np.zeros(0, dtype=bool)) if begins else self._A.find(lines, columns)
-        if begins or self.config.comm.allreduce(int(not there.all())):
+        if begins or self.space.comm.allreduce(int(not there.all())):
             self._make_room(begins, lines, columns, P, Q, curvature)
             places, _ = self._A.find(lines, columns)
         taken, _ = self._A.of(self._lines(part.components))
@@ -103,7 +103,7 @@ class UnitedMatrix:
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
         """Take K's places if they are new; whether its values are (collective)."""
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
-        fresh, changed = self.config.comm.allreduce(np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
+        fresh, changed = self.space.comm.allreduce(np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
             self._made_for, self._K, self._A = (K, P.free), Entries.as_in(K), None
             # where Z crosses out, but for the diagonal
@@ -123,7 +123,7 @@ class UnitedMatrix:
 
     def _part(self, P: Restriction, nodes: Indices, which: Bools, curvature: PETSc.Mat | None) -> Part:
         """The nodes that have an entry of K at ``nodes`` of any rank, those that ``which`` equations follow, and the curvature's."""
-        g, n = self.config.gdim, self.config.n_owned
+        g, n = self.space.block, self.space.n_owned
         first = self._first // g
         # components of a node have the same neighbours, and K's pattern is symmetric
         at, _ = self._K.of(self._lines(g * nodes.astype(np.int64)))
@@ -131,17 +131,17 @@ class UnitedMatrix:
         near = np.zeros(n, dtype=bool)
         own = (touched >= first) & (touched < first + n)
         near[touched[own] - first] = True
-        near[self.config.gather_owned(touched[~own])] = True
+        near[self.space.gather_owned(touched[~own])] = True
         if curvature is not None:
             # a node with a row of it is coupled with itself
             near |= np.diff(curvature.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
-        return Part(self.config, near)
+        return Part(self.space, near)
 
     def _lines(self, components: Ints) -> Bools:
         """Which lines have entries of owned components."""
         lines = np.zeros(len(self._K.indptr) - 1, dtype=bool)
         lines[components] = True
-        if self.config.comm.size > 1:
+        if self.space.comm.size > 1:
             lines[components + self._n] = True
         return lines
 
@@ -155,7 +155,7 @@ class UnitedMatrix:
         self, begins: bool, lines: Ints, columns: Ints, P: Restriction, Q: Restriction, curvature: PETSc.Mat | None
     ) -> None:
         """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective)."""
-        comm = self.config.comm
+        comm = self.space.comm
         wanted = self._missing(lines, columns)
         if self.reserving:
             part = self._part(P, P.nodes, np.ones_like(P.equations.active), curvature)

@@ -28,14 +28,14 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, Uniting
 from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import agree
 
 #: Equations may follow each other in circles if what has gone through so many of them is rounding.
-#: [convention; number of equations; test_thresholds_algebra.py::test_circles_that_fade]
+#: [convention; number of equations; test_restriction.py::test_circles_that_fade]
 MOST_ROUND = 32
 #: Parts of a unit displacement below it are rounding.
-#: [derived; directions of length one; test_thresholds_algebra.py::test_circles_that_fade]
+#: [derived; directions of length one; test_restriction.py::test_circles_that_fade]
 FADED = np.finfo(float).eps
 
 
@@ -43,10 +43,10 @@ class Restriction:
     """P and c of one set of uniting equations.
 
     Args:
-        config: the space whose displacement is restricted.
+        space: the nodes whose components are restricted, as many each as they have.
         equations: uniting equations of the nodes this rank owns.
-        free: components without Dirichlet condition, of the owned nodes ``(n_owned, gdim)``.
-        prescribed: increments that the Dirichlet conditions ask for ``(n_owned, gdim)``, zero where free.
+        free: components without Dirichlet condition, of the owned nodes ``(n_owned, block)``.
+        prescribed: increments that the Dirichlet conditions ask for ``(n_owned, block)``, zero where free.
         stacked: whether a node that is followed may itself be eliminated.
         like: restriction of the same equations in other directions, whose components are eliminated and whose unknowns kept.
 
@@ -56,24 +56,24 @@ class Restriction:
 
     def __init__(
         self,
-        config: Configuration,
+        space: Nodes,
         equations: UnitingEquations,
         free: Bools,
         prescribed: Array,
         stacked: bool = True,
         like: Restriction | None = None,
     ):
-        self.config, self.equations, self.free, self.stacked = config, equations, free, stacked
-        self.comm = config.comm
-        g, n = config.gdim, config.n_owned
-        self._sizes = ((g * n, g * config.index_map.size_global),) * 2
-        self._first = g * int(config.index_map.local_range[0])
+        self.space, self.equations, self.free, self.stacked = space, equations, free, stacked
+        self.comm = space.comm
+        g, n = space.block, space.n_owned
+        self._sizes = ((g * n, g * space.index_map.size_global),) * 2
+        self._first = g * int(space.index_map.local_range[0])
         self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift = self._eliminate() if like is None else self._eliminate_like(like)
-        #: Columns of P that are in use ``(n_owned, gdim)``.
+        #: Columns of P that are in use ``(n_owned, block)``.
         self.used: Bools = free.copy()
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
         closure = np.array(prescribed)
@@ -88,7 +88,7 @@ class Restriction:
 
     def vector(self, values: Array) -> PETSc.Vec:
         """A vector with these values at the owned components."""
-        v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.config.gdim, comm=self.comm)
+        v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.space.block, comm=self.comm)
         v.array[:] = values.ravel()
         return v
 
@@ -96,7 +96,7 @@ class Restriction:
 
     def _eliminate(self) -> tuple[Array, Array]:
         """Blocks of T at ``nodes (k, g, g)``, and how each equation acts on its node ``(m, g)``."""
-        g, eq = self.config.gdim, self.equations
+        g, eq = self.space.block, self.equations
         frames = self.free[self.nodes, None, :] * np.eye(g)
         lift = np.zeros_like(eq.direction)
         error = None
@@ -131,21 +131,21 @@ class Restriction:
     def _conflict(self, node: int, n_equations: int) -> ConflictError:
         fixed = [c for c, f in zip("xyz", self.free[node]) if not f]
         return ConflictError(
-            f"the contactor at {self.config.describe(node)} has {n_equations} uniting equation(s) but its displacement "
+            f"the contactor at {self.space.describe(node)} has {n_equations} uniting equation(s) but its displacement "
             f"in {', '.join(fixed) or 'no direction'} is prescribed, so nothing is left to eliminate: release the Dirichlet "
             "condition there, or make the other surface the contactor"
         )
 
     def _matrix(self, rows: Ints, columns: Ints, values: Array, sizes: Any = None) -> PETSc.Mat:
         """Matrix from sorted local rows, global columns and values; of the displacement's size unless others are given."""
-        bsize = self.config.gdim if sizes is None else None
+        bsize = self.space.block if sizes is None else None
         sizes = sizes or self._sizes
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=sizes[0][0]))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
 
     def _coupling_entries(self, which: Bools) -> tuple[Ints, Ints, Array]:
         """Local rows, global columns and values of M for some equations, zeros stored so that no place depends on directions."""
-        g, eq = self.config.gdim, self.equations.select(which)
+        g, eq = self.space.block, self.equations.select(which)
         values = self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :]
         rows = np.broadcast_to((eq.node[eq.row, None] * g + np.arange(g))[:, :, None], values.shape)
         columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
@@ -159,14 +159,14 @@ class Restriction:
         Raises:
             ConflictError: if they neither end nor fade.
         """
-        g, eq = self.config.gdim, self.equations
+        g, eq = self.space.block, self.equations
         m, k = len(eq), np.arange(g)
         counts = np.array(self.comm.allgather(m))
         first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
         # terms at nodes of which nothing is eliminated lead nowhere
-        eliminated = np.zeros((self.config.n_owned, 1))
+        eliminated = np.zeros((self.space.n_owned, 1))
         eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
-        on = self.config.ask_owners(eq.followed, eliminated)[:, 0] > 0
+        on = self.space.ask_owners(eq.followed, eliminated)[:, 0] > 0
         if not self.comm.allreduce(int(on.any())):
             return int(sizes[1] > 0)
         terms = np.broadcast_to(eq.row[on, None], (on.sum(), g)), eq.followed[on, None] * g + k, eq.coefficients[on]
@@ -206,7 +206,7 @@ class Restriction:
         rows, error = np.flatnonzero(at.array_r > FADED), None
         if len(rows):
             error = ConflictError(
-                f"the contactor at {self.config.describe(int(self.equations.node[rows[0]]))} follows itself through its targets: "
+                f"the contactor at {self.space.describe(int(self.equations.node[rows[0]]))} follows itself through its targets: "
                 "two surfaces are contactor and target of each other; drop one of the two contacts"
             )
         agree(self.comm, error)
@@ -217,7 +217,7 @@ class Restriction:
     @cached_property
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
-        return self.matrix(Part(self.config, np.ones(self.config.n_owned, dtype=bool)))
+        return self.matrix(Part(self.space, np.ones(self.space.n_owned, dtype=bool)))
 
     def followed(self, which: Bools) -> Ints:
         """Global nodes that some of the equations follow, each once."""
@@ -257,7 +257,7 @@ class Restriction:
 
     def _rotation(self, part: Part) -> PETSc.Mat:
         """T of a part of the nodes."""
-        g = self.config.gdim
+        g = self.space.block
         k, row = np.arange(g), np.arange(len(part.components)).reshape(-1, g)
         has = np.isin(self.nodes, part.nodes)
         turned = np.isin(part.nodes, self.nodes)
@@ -283,7 +283,7 @@ class Restriction:
 
     def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
         """``P dq``, without c."""
-        q = dq.array_r.reshape(-1, self.config.gdim)
+        q = dq.array_r.reshape(-1, self.space.block)
         du = q * self.free
         du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
         return self._series(self.vector(du))
@@ -300,7 +300,7 @@ class Restriction:
 
     def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
         """``T' y``; with y from ``pass_on`` this is ``P'F``."""
-        full = y.array_r.reshape(-1, self.config.gdim)
+        full = y.array_r.reshape(-1, self.space.block)
         q = full * self.free
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
         return self.vector(q)
@@ -311,7 +311,7 @@ class Restriction:
 
     def multipliers(self, y: PETSc.Vec) -> Array:
         """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed."""
-        nodal = y.array_r.reshape(-1, self.config.gdim)
+        nodal = y.array_r.reshape(-1, self.space.block)
         return np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
 
     def _series(self, v: PETSc.Vec) -> PETSc.Vec:
@@ -342,21 +342,21 @@ def _frames(A: Array, pinv: Array, free: Bools) -> Array:
     ``A (k, r, g)`` are directions in the free components ``free (k, g)``, and ``pinv (k, g, r)`` their pseudo-inverses.
     """
     k, r, g = A.shape
-    left = free.sum(axis=1) - r
-    blocks, axis = np.zeros((k, g, g)), np.zeros((k, g))
+    left, blocks = free.sum(axis=1) - r, np.zeros((k, g, g))
     if r == 1:
-        single = left > 0
-        axis[single] = A[single, 0] / np.linalg.norm(A[single, 0], axis=1, keepdims=True)
-    else:
-        # the one direction left, from the projector onto the null space
-        single = left == 1
-        null = free[single, None, :] * np.eye(g) - pinv[single] @ A[single]
-        column = np.argmax(np.einsum("kgg->kg", null), axis=1)
-        t = null[np.arange(len(column)), :, column]
-        axis[single] = t / np.linalg.norm(t, axis=1, keepdims=True)
-    H, main = _reflection(axis[single])
-    nearest = np.arange(g) == main[:, None]
-    blocks[single] = H * (free[single] & ~nearest if r == 1 else nearest)[:, None, :]
+        some = left > 0
+        H, main = _reflection(A[some, 0] / np.linalg.norm(A[some, 0], axis=1, keepdims=True))
+        blocks[some] = H * (free[some] & (np.arange(g) != main[:, None]))[:, None, :]
+        return blocks
+    # directions left one after the other, each in the place that it is nearest to, from the projector onto the null space
+    null = free[:, None, :] * np.eye(g) - pinv @ A
+    for n in range(left.max(initial=0)):
+        more = np.flatnonzero(left > n)
+        column = np.argmax(np.einsum("kgg->kg", null[more]), axis=1)
+        t = null[more, :, column]
+        t /= np.linalg.norm(t, axis=1, keepdims=True)
+        blocks[more, :, column] = t
+        null[more] -= t[:, :, None] * t[:, None, :]
     return blocks
 
 

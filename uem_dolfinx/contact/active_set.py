@@ -8,14 +8,13 @@ moves: its solution foretells gaps and forces, contactors that it shows on the w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.state import PairState
-from uem_dolfinx.errors import ConvergenceError
 
 #: Contactors whose gap is smaller, as part of the model's size, touch without force.
 #: [convention; the model's size; test_active_set.py::test_what_touches_at_the_start]
@@ -27,12 +26,18 @@ GAP_ROUNDING = 1e-13
 #: paraboloid that comes down on something elastic touches where it would overlap by more than half of the most (Hertz).
 #: [derived; the deepest overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 DEEP_ENOUGH = 0.5
+#: Size of the bodies that give way about a contact in the plane.
+#: [convention; the model's size; test_active_set.py::test_first_touch_of_a_paraboloid]
+GIVING_WAY = 0.25
+#: Half of what touches at first in the plane: a quarter would be right for whole bodies, a half for those cut at a plane of symmetry.
+#: [convention; width of the overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
+HALF_WIDTH = 1 / 3
 #: Contactors as wrong as the worst, but for this part, are exchanged with it: rounding does not choose between equals.
 #: [convention; the worst violation; test_active_set.py::test_equals_are_exchanged_together]
 TIED = 1e-6
-#: So many exchanges in a row may bring no fewer wrong contactors before the worst is exchanged alone.
+#: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the worst is exchanged alone.
 #: [convention; exchanges; test_active_set.py::test_when_the_worst_goes_alone]
-PATIENCE = 3
+PATIENCE = 30
 
 
 @dataclass(frozen=True)
@@ -59,10 +64,22 @@ class Wrong:
         """Largest violation, a force."""
         return float(self.violation.max(initial=0.0))
 
+    @property
+    def which(self) -> Bools:
+        """All of them ``(n,)``."""
+        return self.enter | self.release
+
+    def among(self, kept: Bools) -> Wrong:
+        """Those alone that are ``kept (n,)``."""
+        return Wrong(self.enter & kept, self.release & kept, np.where(kept, self.violation, 0.0))
+
     def among_the_worst(self, worst: float) -> Wrong:
         """Those alone whose violation equals the ``worst`` of all."""
-        kept = self.violation >= (1.0 - TIED) * worst
-        return Wrong(self.enter & kept, self.release & kept, self.violation)
+        return self.among(self.violation >= (1.0 - TIED) * worst)
+
+    def of_contact(self) -> Wrong:
+        """Those alone that break the conditions of contact."""
+        return self
 
     def on_first_touch(self, gap: Array, depth: float) -> Wrong:
         """Those alone that enter by so much at least, a length, besides all that are released; ``gap (n,)`` decides on contact."""
@@ -74,8 +91,7 @@ def deep_enough(span: float, gdim: int) -> float:
 
     In the plane a cylinder touches within a half width ``a`` where bodies of size L have given way by
     ``a^2 / (2 R) (log(4 L / a) - 1/2)`` (Johnson, Contact Mechanics, 1985, 5.6): the smaller the contact, the less of the overlap.
-    The overlap is some twice as wide. Taken are a quarter of the model's size for L, which is a body's radius, and for a a third of
-    the width of the overlap: a quarter would be right for whole bodies, a half for those cut at a plane of symmetry.
+    The overlap is some twice as wide. Taken are ``GIVING_WAY`` for L, which is a body's radius, and ``HALF_WIDTH`` for a.
 
     Args:
         span: width of the overlap over the model's size; zero where a single contactor overlaps.
@@ -83,7 +99,7 @@ def deep_enough(span: float, gdim: int) -> float:
     """
     if gdim == 3 or span == 0.0:
         return DEEP_ENOUGH
-    return max(DEEP_ENOUGH, 1.0 - 1.0 / (np.log(3.0 / min(span, 1.0)) - 0.5))
+    return max(DEEP_ENOUGH, 1.0 - 1.0 / (np.log(4.0 * GIVING_WAY / (HALF_WIDTH * min(span, 1.0))) - 0.5))
 
 
 def find_wrong(
@@ -133,55 +149,63 @@ def slide_off(state: PairState, off: Bools) -> PairState:
     return replace(state, active=active, slips=state.slips + gone, passed=(state.passed | gone) & ~active)
 
 
-class Pivoting:
-    """Whether all wrong contactors are exchanged, or the worst alone, from exchange to exchange of one linearised problem.
+class Rule:
+    """Which of the wrong contactors are exchanged, from fast to sure."""
 
-    All at once is fast but may go in circles; the worst alone does not, as a rule.
+    #: All of them: fast, but it may go in circles.
+    ALL = 0
+    #: The worst alone, with those that tie with it: seldom goes in circles.
+    WORST = 1
+    #: The first alone in an order that stays: never does where gaps and forces belong together (a P-matrix; Murty, 1974,
+    #: doi:10.1007/BF01580244).
+    FIRST = 2
+    #: None: even so a state has come again.
+    NONE = 3
+
+
+class Pivoting:
+    """Which wrong contactors are exchanged, from exchange to exchange of one linearised problem.
+
+    A rule that leads to a state that it has been in already would lead there for ever: the next one takes over, until fewer are wrong
+    than ever before, which cannot go on without end either.
     """
 
     def __init__(self) -> None:
         self._fewest: float = np.inf
         self._tries = PATIENCE
+        self._rule = Rule.ALL
+        self._seen: set[Hashable] = set()
+        #: States in which the worst has been exchanged alone, and whether it has been twice in one.
+        self._alone: set[Hashable] = set()
         self._again = False
-        self._seen: set[tuple[int, ...]] = set()
-        #: How often each has come since fewer were wrong than ever before.
-        self._times: dict[tuple[int, ...], int] = {}
 
     @property
     def ahead(self) -> bool:
-        """Whether others that are not wrong yet may be exchanged with the worst: in a pattern that it went alone in before they may not."""
-        return self._tries < 0 and not self._again
+        """Whether others that are not wrong yet may be exchanged with the worst: not in a state that it went alone in before."""
+        return self._rule == Rule.WORST and not self._again
 
     def start_again(self) -> None:
         """Exchange all wrong contactors again, after others have been exchanged with them."""
-        self._fewest, self._tries = np.inf, PATIENCE
+        self._fewest = np.inf
 
-    def all_at_once(self, count: int) -> bool:
-        """Whether all ``count`` wrong contactors are exchanged."""
-        if count < self._fewest:
-            self._fewest, self._tries, self._times = count, PATIENCE, {}
-            return True
-        self._tries -= 1
-        return self._tries >= 0
-
-    def repeats(self, pattern: Sequence[int], told: bool = False) -> bool:
-        """Whether the worst has been exchanged alone among such contactors before.
+    def choose(self, count: int, state: Hashable) -> int:
+        """The rule for the next exchange.
 
         Args:
-            pattern: what tells the contactors' states, a number of each rank.
-            told: whether they tell all there is, so that what has come three times will come for ever.
-
-        Raises:
-            ConvergenceError: if it will.
+            count: number of wrong contactors.
+            state: what tells this state of all contactors from others.
         """
-        key = tuple(pattern)
-        self._times[key] = self._times.get(key, 0) + 1
-        if told and self._times[key] > 2:
-            raise ConvergenceError("the active set goes in a circle: take smaller load steps, or a target of finer facets")
-        again = key in self._seen
-        self._seen.add(key)
-        self._again = self._again or again
-        return again
+        if count < self._fewest:
+            self._fewest, self._tries, self._rule, self._seen = count, PATIENCE, Rule.ALL, set()
+        elif self._rule == Rule.ALL:
+            self._tries -= 1
+        if self._rule < Rule.NONE and (state in self._seen or self._tries < 0):
+            self._rule, self._tries, self._seen = self._rule + 1, PATIENCE, set()
+        self._seen.add(state)
+        if self._rule == Rule.WORST:
+            self._again = self._again or state in self._alone
+            self._alone.add(state)
+        return self._rule
 
 
 def touching(state: PairState, gap: Array, size: float, allowed: Bools) -> PairState:

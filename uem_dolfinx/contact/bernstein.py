@@ -15,7 +15,7 @@ add up to the resultant.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,7 @@ import numpy as np
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.coupling import Placement
-from uem_dolfinx.contact.node_to_surface import Feet, NodeToSurface
+from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
@@ -177,19 +176,10 @@ class ControlGaps:
         return f.config.to_owners(f.parent, amounts)[f.nodes]
 
 
-@dataclass(frozen=True)
-class ControlFeet(Feet):
-    """``Feet`` with the control gaps there."""
-
-    control: ControlGaps
-
-
 class Bernstein(NodeToSurface):
-    """Implements ``Coupling`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
+    """Implements ``Discretisation`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
 
-    nodal = False
-    #: Whether there is friction, so that the gap of a parent matters whether it has closed or not.
-    _rubs = False
+    pointwise = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -197,60 +187,66 @@ class Bernstein(NodeToSurface):
         # one in the middle of a facet follows those in the middles of edges
         self.chained = bool(config.comm.allreduce(int(self.family.of_facet.sum())))
 
-    def rub(self, mu: Array) -> None:
-        """Keep all terms; see ``Coupling``."""
-        super().rub(mu)
-        self._rubs = self.chained = True
+    def with_friction(self, mu: Array) -> None:
+        """Keep all terms: with friction the gap of a parent matters whether it has closed or not."""
+        super().with_friction(mu)
+        self.chained = True
 
-    def weights(self, placement: Placement) -> tuple[Ints, Ints, Array]:
+    def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
+        """The kinematics with control gaps (collective)."""
+        k, gap = kinematics, kinematics.projection.gap
+        usable = ~k.off(state) & ~state.in_corner
+        control = self.family.control_gaps(k.projection, usable, state.active & (not self.frictional))
+        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left)
+        return ControlKinematics(*plain, control=control)
+
+
+@dataclass(frozen=True)
+class ControlKinematics(NodalKinematics):
+    """``NodalKinematics`` with control gaps.
+
+    Attributes:
+        control: the terms that lead to them.
+    """
+
+    control: ControlGaps = field(kw_only=True)
+
+    def weights(self) -> tuple[Ints, Ints, Array]:
         """Those of the feet, and what leads from the control gaps to the nodal ones."""
-        row, followed, weight = super().weights(placement)
-        control: ControlGaps = placement.details.control
-        f, k = self.family, np.flatnonzero(control.shared)
-        t, a = np.nonzero(control.targets[k] >= 0)
+        row, followed, weight = super().weights()
+        c = self.control
+        f, k = c.family, np.flatnonzero(c.shared)
+        t, a = np.nonzero(c.targets[k] >= 0)
         return (
             np.concatenate([row, f.child[k], f.child[k][t]]),
-            np.concatenate([followed, self.config.to_global(f.parent[k]), control.targets[k][t, a]]),
-            np.concatenate([weight, f.weight[k], -f.weight[k][t] * control.weights[k][t, a]]),
+            np.concatenate([followed, f.config.to_global(f.parent[k]), c.targets[k][t, a]]),
+            np.concatenate([weight, f.weight[k], -f.weight[k][t] * c.weights[k][t, a]]),
         )
 
-    def shares(self, placement: Placement, state: PairState) -> Array:
+    @property
+    def force_per_multiplier(self) -> Array:
         """Bernstein's basis functions over those that belong to the scaled gaps."""
-        control: ControlGaps = placement.details.control
-        return control.scale
+        return self.control.scale
 
-    def _measured(self, projection: Projection, moves: Bools | None, feet: Feet, state: PairState) -> Placement:
-        plain = Placement(projection, projection.gap, moves, feet)
-        active = state.active & (not self._rubs)
-        control = self.family.control_gaps(projection, ~self.off(plain, state) & ~state.in_corner, active)
-        details = ControlFeet(feet.nearest, feet.corners, feet.left, control)
-        return replace(plain, gap=control.of(projection.gap), details=details)
-
-    def foreseen(self, placement: Placement, du: Array) -> Array:
+    def predicted(self, du: Array) -> Array:
         """Control gaps after an increment (collective)."""
-        control: ControlGaps = placement.details.control
-        gap = super().foreseen(placement, du)
-        f = self.family
-        return replace(control, gap=f.config.from_owners(f.nodes, gap[:, None], f.parent)[:, 0]).of(gap)
+        gap, f = super().predicted(du), self.control.family
+        return replace(self.control, gap=f.config.from_owners(f.nodes, gap[:, None], f.parent)[:, 0]).of(gap)
 
-    def with_active(self, placement: Placement, state: PairState) -> Placement:
+    def with_active(self, state: PairState) -> ControlKinematics:
         """The gap of a parent that has closed no longer counts (collective)."""
-        control = placement.details.control.with_active(state.active & (not self._rubs))
-        details = replace(placement.details, control=control)
-        return replace(placement, gap=control.of(placement.projection.gap), details=details)
+        control = self.control.with_active(state.active & (not self.of.frictional))
+        return replace(self, control=control, gap=control.of(self.projection.gap))
 
-    def _normal_rows(self, placement: Placement, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
-        plain = super()._normal_rows(placement, state, which, weights)
-        return placement.details.control.extend(plain, which, state.active)
+    def _normal_rows(self, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
+        return self.control.extend(super()._normal_rows(state, which, weights), which, state.active)
 
-    def _nodal(self, placement: Placement, state: PairState, multipliers: Array) -> tuple[Array, Array]:
-        control: ControlGaps = placement.details.control
-        return control.forces(multipliers, state.active)
+    def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
+        return self.control.forces(multipliers, state.active)
 
-    def areas(self, placement: Placement, areas: Array) -> Array:
+    def areas(self, areas: Array, current: bool) -> Array:
         """Integrals of Bernstein's basis (collective)."""
-        control: ControlGaps = placement.details.control
-        return control.areas(areas)
+        return self.control.areas(areas)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:

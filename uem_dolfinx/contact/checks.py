@@ -5,17 +5,21 @@ Every check speaks on all ranks or on none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
-from uem_dolfinx.contact.pair import ContactPair
-from uem_dolfinx.errors import ConflictError, FrictionError, PenetrationError
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.errors import ConflictError, PenetrationError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.tags import Tag
@@ -23,23 +27,24 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree
 
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
-#: [heuristic; the model's size; -]
+#: [heuristic; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
 LEFT_OUT = 1e-6
-#: A contactor is driven over the target if its prescribed components move by more than this part of the model's size in a step.
-#: [convention; the model's size; test_friction_prescribed.py::test_contactors_that_are_driven]
-DRIVEN = 1e-9
 #: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
 #: [convention; slope; test_warnings.py::test_corners_are_no_curves]
 CORNER = 0.5
 #: Surfaces that come nearer than their facets sag on more facets than this, in every direction, conform.
 #: [convention; facets; test_warnings.py::test_surfaces_that_conform]
 CONFORMING = 4
+#: With mortar a contactor's node holds off all of its facets in their mean if their areas sum up to less than this, over the length of
+#: their vector sum: facets of a tip that meet at 39 degrees.
+#: [convention; areas; test_warnings.py::test_slim_tips]
+SLIM = 3.0
 #: Contactors that have slid off the target's end are told of if they have more than this part of the surface in contact.
 #: [convention; area; test_warnings.py::test_contactors_that_slip_off]
 SLIPPED = 0.05
 
 
-def check_initial(pair: ContactPair) -> None:
+def check_initial(pair: Interface) -> None:
     """Refuse an initial penetration beyond the bound, and tell about any other (collective).
 
     Raises:
@@ -66,7 +71,7 @@ def check_initial(pair: ContactPair) -> None:
         )  # fmt: skip
 
 
-def check_prescribed(pair: ContactPair) -> None:
+def check_prescribed(pair: Interface) -> None:
     """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
 
     Raises:
@@ -82,29 +87,6 @@ def check_prescribed(pair: ContactPair) -> None:
             f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
             f"{-pair.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
-        )
-    agree(pair.config.comm, error)
-
-
-def check_driven(pair: ContactPair, way: Array, pressed: Bools) -> None:
-    """Refuse contactors that are driven over the target by Dirichlet conditions, which friction cannot act on (collective).
-
-    Args:
-        pair: with friction.
-        way: of prescribed components along the target in this step ``(n, gdim)``.
-        pressed: contactors that friction would act on ``(n,)``.
-
-    Raises:
-        FrictionError: naming the first such contactor of the first rank that has one.
-    """
-    driven = np.linalg.norm(way, axis=1) > DRIVEN * pair.config.size
-    i = np.flatnonzero(driven & pressed)
-    error = None
-    if len(i):
-        error = FrictionError(
-            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i[0]]))} is driven over the target by a Dirichlet "
-            "condition, and friction cannot act on a prescribed component: drive other nodes of the body, or make the other surface "
-            "the contactor"
         )
     agree(pair.config.comm, error)
 
@@ -151,7 +133,7 @@ def facet_curvatures(target: MeshTarget) -> Array:
     return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)
 
 
-def warn_of_sagging_facets(pair: ContactPair) -> None:
+def warn_of_sagging_facets(pair: Interface) -> None:
     """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
     target, p = pair.target, pair.projection
     if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
@@ -171,7 +153,27 @@ def warn_of_sagging_facets(pair: ContactPair) -> None:
         )  # fmt: skip
 
 
-def warn_of_slipped(pair: ContactPair, before: Bools, areas: Array) -> bool:
+def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -> None:
+    """Tell that mortar has one equation for facets of a tip that all but face each other (collective).
+
+    Args:
+        config: configuration of the displacement.
+        name: of the contact.
+        surface: of the contactor.
+    """
+    comm, spread = config.comm, surface.spread()
+    slim = surface.dofs[spread > SLIM]
+    slim = slim[slim < config.n_owned]
+    (place,) = [p for p in comm.allgather(config.describe(int(slim.min())) if len(slim) else None) if p][:1] or [None]
+    if place is not None:
+        logger.warning(
+            "%s: the contactor's facets at %s meet at less than 40 degrees, and mortar has one equation for all of them, along their mean "
+            "normal: such a tip may pass into a target on one of its sides; take coupling = 'node_to_surface'",
+            name, place,
+        )  # fmt: skip
+
+
+def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
     """Tell that contactors have slid off the end of the target, and their share of the surface with them (collective).
 
     Args:
@@ -196,3 +198,26 @@ def warn_of_slipped(pair: ContactPair, before: Bools, areas: Array) -> bool:
         pair.name, int(count), 100.0 * lost / (lost + held),
     )  # fmt: skip
     return True
+
+
+def check_new(contacts: Sequence[Any]) -> None:
+    """Refuse contacts that belong to a problem already, or stand in the list twice.
+
+    Raises:
+        SpaceError: naming the first such contact.
+    """
+    for i, contact in enumerate(contacts):
+        if contact.taken or any(contact is other for other in contacts[:i]):
+            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and stands in the list before"
+            raise SpaceError(f"contact '{contact.name}' {where}: expected new ones; make a new Contact for every problem")
+
+
+def check_moved(pair: Interface) -> None:
+    """Refuse a rigid target that is not in the same place on all ranks by an InputError (collective)."""
+    if pair.target.n_nodes or pair.config.comm.size == 1:
+        return
+    m = pair.target.motion
+    where = "not moved" if m is None else " ".join(f"{x:.9g}" for x in np.concatenate([m.translation, m.Q.ravel(), m.about]))
+    given.alike(
+        pair.config.comm, f"contact '{pair.name}', move() of its rigid target", **{"translation, rotation and point": where}
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -16,26 +16,34 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices
-from uem_dolfinx.contact.bernstein import Bernstein
-from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped, warn_of_straight_facets
-from uem_dolfinx.contact.coupling import Coupling
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.kinematics import Discretisation
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, values_at
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
-from uem_dolfinx.errors import InputError, SpaceError, SurfaceError
+from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes, tributary_areas
+from uem_dolfinx.geometry.surfaces import Areas, check_distinct, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import agreed
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.target_corners import CornerInside
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
 MAX_PENETRATION = 0.05
 BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
+#: What there is to be set; the first two are the contact's own.
+SETTINGS = (
+    "taken", "config", "contactor", "target", "coupling", "sliding", "normals", "max_penetration", "thickness", "chords", "friction",
+    "measure", "name",
+)  # fmt: skip
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
@@ -45,23 +53,27 @@ class Contact:
     Args:
         contactor: facets whose nodes are the contactors, or points, which have forces but no pressures: a tag, a list of tags,
             ``(meshtags, value)``, or facet indices.
-        target: facets of the other body, named alike, or a rigid surface.
+        target: facets of the other body, specified in the same way, or a rigid surface.
         coupling: ``"node_to_surface"``, the paper's, or ``"mortar"``, from integrals over both surfaces: exact on any pair of meshes;
-            a contactor of points keeps nodal equations.
+            a contactor of points keeps nodal equations. Or a class of ``contact.kinematics.Discretisation``, made as ``NodeToSurface`` is.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
             than this lies behind the body, not in it. None takes the body to have no back.
         friction: Coulomb's coefficient, a number, or a function of place that is given points ``(3, n)`` of the reference
-            configuration and returns ``(n,)``. With 0 the contact is the one without friction.
+            configuration and returns ``(n,)``; or a law of friction, such as ``Tresca``. With 0 the contact is the one without friction.
+            It may be set anew between steps, of a contact that was made with friction, by the same law; all else is settled once a
+            problem has been made.
+        measure: what pressures and tractions are forces per area of: ``"reference"``, the surface as it was drawn, the only one that
+            small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
 
     Raises:
         InputError, InputTypeError: for an unknown word, a bound or thickness out of its range, a rigid contactor; on all ranks where
-            a tag tells which they are.
+            a tag tells which they are. Also where an attribute is set that there is not, or that the problem would not take any more.
     """
 
     def __init__(
@@ -69,20 +81,22 @@ class Contact:
         contactor: Part,
         target: Part | Target,
         *,
-        coupling: str = "node_to_surface",
+        coupling: str | Callable[..., Discretisation] = "node_to_surface",
         sliding: str = "finite",
         normals: str = "facet",
         max_penetration: float | None = None,
         thickness: float | None = None,
         chords: bool = False,
-        friction: float | Callable[[Array], npt.ArrayLike] = 0.0,
+        friction: Field | FrictionLaw = 0.0,
+        measure: str = "reference",
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
             rigid = hasattr(target, "project")
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
-            coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
+            if not callable(coupling):
+                coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
             normals = given.word("normals", normals, ("facet", "averaged"))
             if max_penetration is not None:
@@ -90,8 +104,8 @@ class Contact:
             if thickness is not None:
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
-            if not callable(friction):
-                friction = given.number("friction", friction, given.NOT_NEGATIVE)
+            self._friction = given_friction(friction)
+            measure = given.word("measure", measure, ("reference", "current"))
             if coupling == "mortar" and (chords or normals != "facet"):
                 what = "chords = True" if chords else f"normals = '{normals}'"
                 raise InputError(
@@ -101,16 +115,54 @@ class Contact:
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.coupling = coupling
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
-        self.friction = friction
+        self.measure = measure
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
         #: Whether a problem has been made of it.
         self.taken = False
-        self._pair: ContactPair | None = None
+        self._pair: Interface | None = None
         self._fields: dict[str, fem.Function] = {}
 
-    def attach(self, config: Configuration, free: Bools) -> ContactPair:
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_"):
+            called = f"contact '{self.name}'" if "name" in self.__dict__ else "a Contact"
+            if name not in SETTINGS:
+                raise InputError(f"{called} has no '{name}' to be set: expected one of {', '.join(SETTINGS[2:])}")
+            if self.__dict__.get("taken") and name not in ("taken", "friction"):
+                raise InputError(
+                    f"{called}: {name} = {given.shown(value)} comes too late, its problem has been made: make a new Contact, and a new "
+                    "problem of it; only friction may be set between steps"
+                )
+        super().__setattr__(name, value)
+
+    @property
+    def friction(self) -> Field | FrictionLaw:
+        """Coulomb's coefficient, or a law; set anew between steps it counts from the next step on (collective)."""
+        return self._friction
+
+    @friction.setter
+    def friction(self, value: Field | FrictionLaw) -> None:
+        if not self.taken:
+            self._friction = given_friction(value)
+            return
+        before = as_law(self._friction)
+        with agreed(self.config.comm):
+            value = given_friction(value)
+            law = as_law(value)
+            given.kind("friction", value, type(law) is type(before), f"a value for the law {type(before).__name__}")
+        given.alike(self.config.comm, f"contact '{self.name}'", friction=law.field)
+        mu = values_at(law, self.config, self.pair.nodes, self.name)
+        if mu is not None and not self.pair.frictional:
+            raise InputError(
+                f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
+                "the friction that it is to have, and set friction = 0 until then"
+            )
+        if self.pair.frictional:
+            self.pair.set_friction(np.zeros(len(self.pair.nodes)) if mu is None else mu)
+        self._friction = value
+
+    def attach(self, config: Configuration, free: Bools) -> Interface:
         """Build the pair of this contact in a problem (collective).
 
         Args:
@@ -126,11 +178,12 @@ class Contact:
         """
         self.config, facets = config, config.tdim - 1
         # of a problem that could not be made
-        self._fields, _ = {}, self.__dict__.pop("_areas", None)
+        self._fields, _ = {}, self.__dict__.pop("_surface", None)
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
-            max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__, coupling=self.coupling,
-            friction=self.friction,
+            max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
+            coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
+            friction=as_law(self.friction).field, measure=self.measure,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
@@ -144,46 +197,48 @@ class Contact:
             target = MeshTarget(surface, averaged=self.normals == "averaged")
         thickness = np.inf if self.thickness is None else self.thickness
         how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
-        coupling: Coupling
+        discretisation: Discretisation
         # points have no facets to integrate over
         if self.coupling == "mortar" and self.contactor.dim > 0:
             from uem_dolfinx.contact.mortar import Mortar
 
-            coupling = Mortar(
-                config, nodes, target, surface=TargetFacets(config, self.contactor, "contactor"), chords=False, **how
-            )
+            surface = TargetFacets(config, self.contactor, "contactor")
+            warn_of_slim_tips(config, self.name, surface)
+            discretisation = Mortar(config, nodes, target, surface=surface, **how)
         else:
+            from uem_dolfinx.contact.bernstein import Bernstein
+            from uem_dolfinx.contact.node_to_surface import NodeToSurface
+
             kind = Bernstein if config.degree == 2 else NodeToSurface
-            coupling = kind(config, nodes, target, chords=self.chords and config.degree == 2, **how)
+            own = self.coupling if callable(self.coupling) else kind
+            discretisation = own(config, nodes, target, chords=self.chords and config.degree == 2, **how)
         bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
-        mu = self._coefficients(nodes)
-        if mu is None:
-            self._pair = ContactPair(config, nodes, coupling, **of)
-        else:
-            from uem_dolfinx.contact.friction_pair import FrictionalPair
+        law, friction = as_law(self.friction), None
+        value = values_at(law, config, nodes, self.name)
+        if value is not None:
+            from uem_dolfinx.contact.sliding import Sliding
 
-            self._pair = FrictionalPair(config, nodes, coupling, mu=mu, free=free[nodes], **of)
+            if law.per_area and self.contactor.dim == 0:
+                raise InputError(f"contact '{self.name}': {type(law).__name__} needs areas, and points have none: give facets")
+
+            friction = Sliding(
+                config, nodes, discretisation, law=law, value=value, areas=lambda: self._surface.reference[nodes], free=free[nodes],
+                keeps_feet=self.sliding != "finite",
+            )  # fmt: skip
+        self._pair = Interface(config, nodes, discretisation, friction, **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
-
-    def _coefficients(self, nodes: Indices) -> Array | None:
-        """Coefficients of friction at contactors ``(n,)``; None if there is no friction anywhere (collective)."""
-        if not callable(self.friction):
-            return np.full(len(nodes), self.friction) if self.friction > 0 else None
-        places = np.zeros((3, len(nodes)))
-        places[: self.config.gdim] = self.config.X[nodes].T
-        words = f"contact '{self.name}': friction"
-        mu = np.array(ask_together(self.config.comm, words, self.friction, places), dtype=float)
-        with agreed(self.config.comm):
-            if mu.shape != (len(nodes),) or not given.NOT_NEGATIVE.holds(mu).all():
-                raise InputError(f"{words}(x) has shape {mu.shape}: expected {len(nodes)} numbers, 0 or positive and finite")
-        return mu if self.config.comm.allreduce(int((mu > 0).any())) else None
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
         self.taken, self._slipped = True, False
+        self._entered: CornerInside | None = None
         self._off_at_start = self.pair.off.copy()
+        nodes_on_facets = self.pair.discretisation.at_feet and self.contactor.dim > 0
+        from uem_dolfinx.contact.target_corners import TargetCorners
+
+        self._corners = TargetCorners(self.pair, self.contactor) if nodes_on_facets else None
         warn_of_sagging_facets(self.pair)
 
     def look_at_ends(self) -> None:
@@ -192,8 +247,24 @@ class Contact:
         if not self._slipped and self.pair.target.n_nodes and self.config.comm.allreduce(gone.any(), op=MPI.LOR):
             self._slipped = warn_of_slipped(self.pair, self._off_at_start, self._areas)
 
+    def corner_inside(self, stiffness: Array | None) -> CornerInside | None:
+        """A convex corner of the target inside the contactor by which the contact lacks force, or lacked it before (collective).
+
+        Args:
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None where it is not known yet.
+        """
+        found = None if self._corners is None or stiffness is None else self._corners.find(stiffness)
+        return found or self._entered
+
+    def look_at_corners(self, stiffness: Array | None) -> None:
+        """Warn, once, if a convex corner of the target is inside the contactor; argument as of ``corner_inside`` (collective)."""
+        if self._entered is None:
+            self._entered = self.corner_inside(stiffness)
+            if self._entered is not None:
+                logger.warning("%s: %s", self.name, self._entered)
+
     @property
-    def pair(self) -> ContactPair:
+    def pair(self) -> Interface:
         """The pair behind this contact."""
         if self._pair is None:
             raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
@@ -216,9 +287,20 @@ class Contact:
         return self.pair.largest_gap()
 
     @cached_property
+    def _surface(self) -> Areas:
+        """Integrals of the shape functions over the contactor."""
+        return Areas(self.config, self.contactor)
+
+    @property
     def _areas(self) -> Array:
-        """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (collective)."""
-        return tributary_areas(self.config, self.contactor)[self.pair.nodes]
+        """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (first time: collective)."""
+        return self._surface.reference[self.pair.nodes]
+
+    def _measured(self) -> Array:
+        """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
+        current = self.measure == "current"
+        areas = self._surface.current[self.pair.nodes] if current else self._areas
+        return self.pair.kinematics.areas(areas, current)
 
     @property
     def nodes(self) -> Indices:
@@ -234,10 +316,10 @@ class Contact:
     def pressures(self) -> Array:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
-        The normal force over the node's tributary reference area; with ``coupling="mortar"`` the multiplier, a pressure on what the
-        target covers of the facets as they are now.
+        The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
+        whether of the surface as it was drawn or as it is now.
         """
-        areas = self.pair.coupling.areas(self.pair.placement, self._areas)
+        areas = self._measured()
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
@@ -276,7 +358,7 @@ class Contact:
     @property
     def traction(self) -> fem.Function:
         """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
-        pair, areas = self.pair, self.pair.coupling.areas(self.pair.placement, self._areas)[:, None]
+        pair, areas = self.pair, self._measured()[:, None]
         tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
@@ -355,18 +437,6 @@ class Contact:
         table[self.pair.nodes] = values
         f.x.scatter_forward()
         return f
-
-
-def check_new(contacts: list[Contact]) -> None:
-    """Refuse contacts that belong to a problem already, or stand in the list twice.
-
-    Raises:
-        SpaceError: naming the first such contact.
-    """
-    for i, contact in enumerate(contacts):
-        if contact.taken or any(contact is other for other in contacts[:i]):
-            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and stands in the list before"
-            raise SpaceError(f"contact '{contact.name}' {where}: expected new ones; make a new Contact for every problem")
 
 
 def _identifier(text: str) -> str:

@@ -24,6 +24,9 @@ ON_PLANE = 1e-9
 #: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
 #: [heuristic; slope; -]
 STEEP = 0.05
+#: Facets hold what is in their corner by friction up to this part of what would hold it against any pull.
+#: [heuristic; coefficient of friction; -]
+WEDGED = 0.99
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,17 @@ class Corners:
         """Facets that lie in one plane, between which nothing changes ``(k,)``."""
         return np.abs(self.rising) <= ON_PLANE
 
+    @property
+    def summing(self) -> Array:
+        """Vectors whose products with all normals of a corner are one, so that those with forces add up the facets' ``(k, gdim)``."""
+        return np.linalg.pinv(self.normals).sum(axis=2)
+
+    def axes_of(self, n: int) -> Array:
+        """Axes of the space that the normals span, of all ``n`` contactors; the others' are zero ``(n, gdim, gdim)``."""
+        axes = np.zeros((n, *self.axes.shape[1:]))
+        axes[self.which] = np.where((np.arange(axes.shape[1]) < self.count[:, None])[:, :, None], self.axes, 0.0)
+        return axes
+
     def gaps(self, points: Array) -> Array:
         """Distances of ``points (k, gdim)`` from the shared place along the axes ``(k, gdim)``."""
         return np.einsum("krg,kg->kr", self.axes, points - self.foot)
@@ -92,7 +106,11 @@ class Corners:
             space, to the part of it in their span; of those possible the least in norm. A facet whose coefficient is negative pulls.
             They are infinite beyond ``count``, where there is no facet.
         """
-        along = self.normals - np.reshape(mu, (-1, 1, 1)) * self.away
+        mean = self.axes[:, 0]
+        over, out = (np.einsum("kjg,kg->kj", v, mean) for v in (self.normals, self.away))
+        # facets that would hold by themselves whatever is between them still let go of what is pulled out
+        least = np.where(out > 0, over / np.where(out > 0, out, 1.0), np.inf).min(axis=1)
+        along = self.normals - np.minimum(mu, WEDGED * least)[:, None, None] * self.away
         shares = np.einsum("kgr,kg->kr", np.linalg.pinv(along.transpose(0, 2, 1)).transpose(0, 2, 1), force)
         shares[np.arange(shares.shape[1])[None, :] >= self.count[:, None]] = np.inf
         return shares

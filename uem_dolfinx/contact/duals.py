@@ -22,8 +22,12 @@ from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.geometry.shapes import FacetShape
 
 #: The dual function of a node is added to another's where less than this part of the node's share of a facet is covered.
-#: [convention; part of the integral; test_mortar.py::test_what_is_hardly_covered]
+#: [convention; part of the integral; test_duals.py::test_what_is_hardly_covered]
 HARDLY_COVERED = 0.05
+#: One that had its own before keeps it as long as more than this part is covered: where the target ends on what moves with the forces,
+#: it would else be added and taken back for ever.
+#: [convention; part of the integral; test_mortar.py::test_dual_functions_are_kept]
+STILL_COVERED = 0.01
 
 
 class Basis:
@@ -132,7 +136,8 @@ class Duals:
     Attributes:
         A: combinations of the functions b ``(m, nn, nn)``.
         C: their integrals with the functions b ``(m, nn, nn)``.
-        own: nodes with a dual function of their own, the foremost not among them ``(m, nn)``.
+        kept: nodes of whose share enough is covered for a dual function of their own ``(m, nn)``.
+        own: nodes with one, the foremost not among them ``(m, nn)``.
         foremost: node whose dual function makes their sum one ``(m,)``.
         inverse: of the integrals of the functions' products; zero where no node has a function of its own ``(m, nn, nn)``.
         gap: coefficients of the gap's projection onto the functions b ``(m, nn)``.
@@ -140,6 +145,7 @@ class Duals:
 
     A: Array
     C: Array
+    kept: Bools
     own: Bools
     foremost: Ints
     inverse: Array
@@ -182,15 +188,16 @@ class Duals:
         return grown
 
 
-def dual_functions(covered: Covered, precedence: Array) -> Duals:
+def dual_functions(covered: Covered, precedence: Array, before: Bools) -> Duals:
     """Dual functions of facets.
 
     Args:
         covered: integrals over the facets.
         precedence: of the facets' nodes ``(m, nn)``; what is hardly covered goes to the foremost node of the facet.
+        before: nodes that had a dual function of their own before ``(m, nn)``.
     """
     m, nn = covered.D.shape
-    kept: Bools = HARDLY_COVERED * covered.full <= covered.D
+    kept: Bools = np.where(before, STILL_COVERED, HARDLY_COVERED) * covered.full <= covered.D
     row, foremost = np.arange(m), np.argmax(precedence, axis=1)
     # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
     own = kept & (np.arange(nn) != foremost[:, None])
@@ -206,4 +213,4 @@ def dual_functions(covered: Covered, precedence: Array) -> Duals:
     C[:, j, j] = np.where(own, covered.D, 0.0)
     C[row, foremost] = np.where(own, 0.0, covered.D)
     A[covered.D.sum(axis=1) <= 0.0] = 0.0
-    return Duals(A, C, own, foremost, inverse, np.einsum("mij,mj->mi", inverse, covered.G))
+    return Duals(A, C, kept & (covered.D > 0.0), own, foremost, inverse, np.einsum("mij,mj->mi", inverse, covered.G))

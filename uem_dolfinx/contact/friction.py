@@ -1,7 +1,8 @@
-"""Coulomb friction by elimination: who sticks, who slips and where to. Pure functions of arrays, without mesh and without communication.
+"""Friction by elimination: who sticks, who slips and where to. Pure functions of arrays, without mesh and without communication.
 
 A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
-the direction s moves as without friction, and hands on a force along ``n - mu s``: its test row is tilted,
+the direction s moves as without friction. Where its limit is ``b + mu lambda``, b hands on a force along -s that is known, and the rest
+goes along ``n - mu s``: its test row is tilted,
 
     trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
 
@@ -18,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.active_set import TIED, Wrong
+from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.state import FrictionState
 
 #: A tangential direction of which prescribed components leave less than this part is prescribed.
@@ -33,31 +34,62 @@ LEAST_TURN = 0.99
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What friction decides by, where the bodies are or as predicted.
+
+    Attributes:
+        lam: force along the normal ``(n,)``.
+        tau: force along the target ``(n, gdim)``.
+        bound: its limit ``(n,)``.
+        slip: relative motion along the target since the last step ``(n, gdim)``.
+        forced: how far what is prescribed moves contactors over the target, a length ``(n,)``.
+    """
+
+    lam: Array
+    tau: Array
+    bound: Array
+    slip: Array
+    forced: Array
+
+
+@dataclass(frozen=True)
 class FrictionWrong(Wrong):
     """Contactors that break the conditions of contact or of friction, each ``(n,)``.
 
     Attributes:
-        slide: those that stick with more force than the cone holds.
+        slide: those that stick with more force than the limit.
         hold: those whose slip turns against its direction.
+        driven: those that what is prescribed moves over the target.
+        seen: by what that was decided.
     """
 
     slide: Bools
     hold: Bools
+    driven: Bools
+    seen: Seen
 
     @property
     def count(self) -> int:
         """Number of wrong contactors."""
         return super().count + int(self.slide.sum() + self.hold.sum())
 
-    def among_the_worst(self, worst: float) -> FrictionWrong:
-        """Those alone whose violation equals the ``worst`` of all."""
-        kept = self.violation >= (1.0 - TIED) * worst
-        return FrictionWrong(self.enter & kept, self.release & kept, self.violation, self.slide & kept, self.hold & kept)
+    @property
+    def which(self) -> Bools:
+        """All of them ``(n,)``."""
+        return super().which | self.slide | self.hold
+
+    def among(self, kept: Bools) -> FrictionWrong:
+        """Those alone that are ``kept (n,)``."""
+        own = super().among(kept)
+        return replace(self, **vars(own), slide=self.slide & kept, hold=self.hold & kept)
+
+    def of_contact(self) -> FrictionWrong:
+        """Those alone that break the conditions of contact: they enter or are released."""
+        return self.among(self.enter | self.release)
 
     def on_first_touch(self, gap: Array, depth: float) -> FrictionWrong:
         """As that of ``Wrong``; friction changes with what is there."""
-        first = super().on_first_touch(gap, depth)
-        return FrictionWrong(first.enter, first.release, self.violation, self.slide, self.hold)
+        return replace(self, **vars(super().on_first_touch(gap, depth)))
 
 
 def tangents(normals: Array, free: Bools) -> Array:
@@ -80,11 +112,8 @@ def along(directions: Array, vectors: Array) -> Array:
 def find_wrong(
     wrong: Wrong,
     state: FrictionState,
-    rubbing: Bools,
-    mu: Array,
-    lam: Array,
-    tau: Array,
-    slip: Array,
+    frictional: Bools,
+    seen: Seen,
     stiffness: Array,
     *,
     force_rounding: Array | float,
@@ -95,22 +124,21 @@ def find_wrong(
     Args:
         wrong: contactors that break the conditions of contact.
         state: of the contactors.
-        rubbing: those that friction acts on ``(n,)``.
-        mu: coefficients of friction ``(n,)``.
-        lam: contact force along the normal, here or foreseen ``(n,)``.
-        tau: contact force along the target ``(n, gdim)``.
-        slip: relative motion along the target since the last step ``(n, gdim)``.
+        frictional: those that friction acts on ``(n,)``.
+        seen: forces and slips.
         stiffness: of the contactors, a force per length ``(n,)``.
         force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
         gap_rounding: lengths below it are zero.
     """
-    staying = rubbing & ~wrong.release
-    excess = np.linalg.norm(tau, axis=1) - mu * np.maximum(lam, 0.0)
-    slide = staying & state.stick & (excess > force_rounding)
-    forward = np.einsum("ng,ng->n", slip, state.direction)
+    staying = frictional & ~wrong.release
+    excess = np.linalg.norm(seen.tau, axis=1) - seen.bound
+    driven = seen.forced > gap_rounding
+    slide = staying & state.stick & ((excess > force_rounding) | driven)
+    forward = np.einsum("ng,ng->n", seen.slip, state.direction)
     hold = staying & ~state.stick & ((forward < -gap_rounding) | ~state.direction.any(axis=1))
+    excess = np.where(driven, seen.forced * stiffness, excess)
     violation = np.where(slide, excess, np.where(hold, -forward * stiffness, wrong.violation))
-    return FrictionWrong(wrong.enter, wrong.release, violation, slide, hold)
+    return FrictionWrong(wrong.enter, wrong.release, violation, slide, hold, driven, seen)
 
 
 def exchange(state: FrictionState, wrong: FrictionWrong, tau: Array) -> FrictionState:
@@ -127,16 +155,16 @@ def exchange(state: FrictionState, wrong: FrictionWrong, tau: Array) -> Friction
     return replace(state, stick=(state.stick | wrong.hold) & ~wrong.slide, direction=direction)
 
 
-def come_and_go(state: FrictionState, before: Bools, now: Bools, rough: Bools) -> FrictionState:
+def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:
     """The state in another active set: who comes sticks, who goes forgets.
 
     Args:
         state: of the contactors.
         before: active so far ``(n,)``.
         now: active from now on ``(n,)``.
-        rough: contactors with friction ``(n,)``.
+        frictional: contactors with friction ``(n,)``.
     """
-    stick = (state.stick & now) | (now & ~before & rough)
+    stick = (state.stick & now) | (now & ~before & frictional)
     return replace(state, stick=stick, direction=np.where((now & ~stick)[:, None], state.direction, 0.0))
 
 
@@ -151,11 +179,11 @@ def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
 def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
     """What holds the direction of slip back: a stiffness across it, and the part of the force across it that is taken away ``(k,)``.
 
-    With ``a = mu lambda / |q|`` these are ``c a / (1 - a)`` and ``a / (1 - a)``.
+    With ``a = bound / |q|`` these are ``c a / (1 - a)`` and ``a / (1 - a)``.
 
     Args:
         size: ``|q|`` ``(k,)``.
-        bound: ``mu lambda`` ``(k,)``.
+        bound: limit of friction ``(k,)``.
         c: stiffness c ``(k,)``.
     """
     a = np.clip(bound / np.where(size > 0, size, np.inf), 0.0, LEAST_TURN)

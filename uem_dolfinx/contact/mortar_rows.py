@@ -1,30 +1,47 @@
-"""Rows of weighted gaps as lists of terms, and how contactors whose gaps depend on each other are eliminated each for itself."""
+"""Rows of weighted gaps as lists of terms, at the owners of their nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.algebra.entries import entries_of
-from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import FADED, MOST_ROUND
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.parallel import Exchange
 
 #: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
 #: little is covered there, far from the target, and the end of what covers it moves faster than the contactor.
 #: [heuristic; part of the component; -]
 MOSTLY_OWN = 0.5
+#: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
+#: [bound; bits; -]
+MOST_BITS = 52
 
 
 #: Rows that terms belong to, the nodes they follow and the coefficients.
 Terms: TypeAlias = tuple[Ints, Ints, Array]
+
+
+class Pieces(NamedTuple):
+    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``."""
+
+    segments: Segments
+    facet: Ints
+    to_gap: Array
+    N: Array
+    opposite: Ints
+    y: Array
+    bend: Array | None
 
 
 @dataclass(frozen=True)
@@ -33,34 +50,41 @@ class WeightedRows:
 
     Attributes:
         equations: in the order of the contactors; none is active. Their left sides are the derivatives of the gaps.
+        length: what these were divided by ``(n,)``.
         plain: the same, along the normals of the contactor's facets alone.
-        beside: terms that the derivatives have beside the plain rows'; none where all facets are parallel.
         points: quadrature points of the segments, where the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
         ratio: part of the contactor's share of its facets that is covered ``(n,)``.
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
+        stretch: areas of the facets around the contactor over those they were drawn with ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
         weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
         normal: directions of the gaps' derivatives with the contactors' own displacements, across which friction acts ``(n, gdim)``;
             None without.
         slope: lengths of these derivatives, over those of the plain rows ``(n,)``; None without friction.
+        push: sum of the lengths of what each facet has of these derivatives, over those of the plain rows ``(n,)``: what the facets push
+            with together, each along its own normal; None without friction.
+        parts: of the facets' nodes, what the facet has of their own derivatives ``(m, nc, gdim)``.
         whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
             without friction.
     """
 
     equations: UnitingEquations
+    length: Array
     plain: UnitingEquations
-    beside: Terms
     points: SegmentPoints
     facets: Ints
     covered: Bools
     ratio: Array
     area: Array
+    stretch: Array
     share: Array
     weights: Terms | None = None
     normal: Array | None = None
     slope: Array | None = None
+    push: Array | None = None
+    parts: Array | None = None
     whole: Array | None = None
 
 
@@ -78,8 +102,6 @@ class Elimination:
         self._place = np.full(config.n_owned, -1, dtype=np.int64)
         self._place[nodes] = np.arange(len(nodes))
         self._own = config.to_global(nodes)
-        #: Rows and active contactors of the last call of ``apart``, and what it returned.
-        self._last: tuple[WeightedRows, Bools, UnitingEquations, Array] | None = None
 
     def at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
         """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
@@ -88,16 +110,48 @@ class Elimination:
         row = self._place[node - int(self.config.index_map.local_range[0])]
         return add_up_terms((row, term, value / scale[row, None]))
 
-    def beside(self, at: SegmentPoints, scale: Array, direction: Array) -> Terms:
-        """What the derivatives of the gaps have beside the plain rows of ``direction (n, gdim)``, over ``scale (n,)`` (collective)."""
+    def beside(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
+        """What the derivatives of the gaps have beside the ``plain`` rows, over ``scale (n,)`` (collective).
+
+        Nothing for contactors whose derivative is not mostly their own, or that follow others in circles which do not fade: all others
+        can be eliminated whoever is active.
+
+        Returns:
+            Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.
+        """
         on_facet, on_target = at.gap_derivatives()
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
-        row, term, value = self.at_owners(terms, scale)
-        own = np.zeros(len(scale))
-        itself = term == self._own[row]
-        own[row[itself]] = -np.einsum("kg,kg->k", value[itself], direction[row[itself]])
-        kept = (own > MOSTLY_OWN - 1)[row]
-        return row[kept], term[kept], value[kept]
+        beside = row, term, value = self.at_owners(terms, scale)
+        own = np.einsum("ng,ng->n", self.of_themselves(plain, beside), plain.direction)
+        lone = own < MOSTLY_OWN
+        while True:
+            kept = ~lone[beside[0]]
+            row, term, value = beside = row[kept], term[kept], value[kept]
+            left = self._left_of_circles(plain, beside)
+            most = self.config.comm.allreduce(float(left.max(initial=0.0)), op=MPI.MAX)
+            if most <= FADED:
+                return beside, np.einsum("mjjg->mjg", on_facet)
+            lone = left > 0.5 * most
+
+    def _left_of_circles(self, plain: UnitingEquations, beside: Terms) -> Array:
+        """How much is left of a unit displacement after as many rounds as circles may take, if all were active ``(n,)`` (collective)."""
+        made, _ = self.derivatives(plain, beside)
+        follows = np.zeros(len(made.row))
+        for direction in (made.direction, plain.direction):
+            left, at_nodes = direction * self.free, np.zeros((self.config.n_owned, self.config.gdim))
+            size = np.einsum("ng,ng->n", left, left)
+            at_nodes[self.nodes] = left / np.where(size > 0, size, np.inf)[:, None]
+            part = np.einsum("kg,kg->k", made.coefficients, self.config.ask_owners(made.followed, at_nodes))
+            follows = np.maximum(follows, np.abs(part))
+        on = follows > 0
+        row, term, follows = made.row[on], made.followed[on], follows[on]
+        at = np.zeros((self.config.n_owned, 1))
+        at[self.nodes] = 1.0
+        for _ in range(MOST_ROUND):
+            at[self.nodes, 0] = np.bincount(row, follows * self.config.ask_owners(term, at)[:, 0], minlength=len(self.nodes))
+            if self.config.comm.allreduce(float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
+                break
+        return at[self.nodes, 0]
 
     def of_themselves(self, plain: UnitingEquations, beside: Terms) -> Array:
         """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
@@ -107,54 +161,51 @@ class Elimination:
         direction[row[itself]] -= value[itself]
         return direction
 
-    def apart(self, rows: WeightedRows, active: Bools) -> tuple[UnitingEquations, Array]:
-        """The equations without what those of other ``active (n,)`` contactors eliminate, as they would follow in circles (collective).
+    def derivatives(self, plain: UnitingEquations, beside: Terms) -> tuple[UnitingEquations, Array]:
+        """Equations whose left sides are the derivatives of the gaps, and what each was divided by ``(n,)``.
 
-        Such parts, of second order in the angles between facets, are taken out with the plain rows of these contactors: those leave
-        neither force nor moment behind either.
-
-        Returns:
-            The equations, and what each was divided by ``(n,)``.
+        They follow other contactors, and these them, by parts of second order in the angles between facets.
         """
-        if rows.equations is rows.plain:
-            return rows.plain, np.ones(len(self.nodes))
-        kept = self._last
-        same = kept is not None and kept[0] is rows and np.array_equal(kept[1], active)
-        if self.config.comm.allreduce(same, op=MPI.LAND):
-            assert kept is not None
-            return kept[2], kept[3]
-        plain, own, free = rows.plain, self._own, self.free & (rows.covered & active)[:, None]
-        beside, gap, at_nodes = rows.beside, plain.gap.copy(), np.zeros((self.config.n_owned, self.config.gdim + 1))
-        while True:
-            row, term, value = beside
-            itself, direction = term == own[row], self.of_themselves(plain, beside)
-            left = direction * free
-            along = np.einsum("ng,ng->n", left, plain.direction)[:, None]
-            at_nodes[self.nodes] = np.column_stack([left / np.where(along > 0, along, np.inf), plain.gap])
-            there = self.config.ask_owners(term, at_nodes)
-            follows = np.einsum("kg,kg->k", value, there[:, :-1])
-            i = np.flatnonzero((np.abs(follows) > NEGLIGIBLE) & ~itself)
-            if not self.config.comm.allreduce(len(i)):
-                break
-            beside = add_up_terms(beside, self._times_rows(plain, own[row[i]], term[i], follows[i]))
-            np.add.at(gap, row[i], follows[i] * there[i, -1])
+        row, term, value = beside
+        other, direction = term != self._own[row], self.of_themselves(plain, beside)
         by = np.linalg.norm(direction, axis=1)
-        made = with_terms(plain, (row[~itself], term[~itself], value[~itself]))
-        made = replace(made, direction=direction / by[:, None], gap=gap / by, coefficients=made.coefficients / by[made.row, None])
-        self._last = rows, active.copy(), made, by
-        return made, by
+        made = with_terms(plain, (row[other], term[other], value[other]))
+        gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]
+        return replace(made, direction=direction / by[:, None], gap=gap, coefficients=coefficients), by
 
-    def _times_rows(self, plain: UnitingEquations, node: Ints, other: Ints, factor: Array) -> Terms:
-        """Terms that rows of ``node (k,)`` get where ``factor (k,)`` times the row of ``other (k,)`` is added to them (collective)."""
-        config, own = self.config, np.arange(len(self.nodes))
-        node, other, factor = Exchange.to(config.comm, config.owner_of(other)).send(node, other, factor)
-        row = np.concatenate([own, plain.row])
-        order = np.argsort(row, kind="stable")
-        term = np.concatenate([self._own, plain.followed])[order]
-        value = np.concatenate([-plain.direction, plain.coefficients])[order]
-        first = np.searchsorted(row[order], np.arange(len(own) + 1))
-        k, i = entries_of(self._place[other - int(config.index_map.local_range[0])], first)
-        return self.at_owners([(node[i], term[k], factor[i, None] * value[k])], np.ones(len(own)))
+
+class Remembered:
+    """Bits of contactors that tell some of their shares of the facets around them from others, alike in any partition (collective).
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        surface: the contactor's facets.
+    """
+
+    def __init__(self, config: Configuration, nodes: Indices, surface: TargetFacets):
+        self.config, self.nodes, self.dofs = config, nodes, surface.dofs
+        node, key = config.to_global(self.dofs.ravel()), np.repeat(surface.keys, self.dofs.shape[1])
+        meeting = Exchange.to(config.comm, config.owner_of(node))
+        node, key = meeting.send(node, key)
+        order = np.lexsort((key, node))
+        number = np.empty(len(node), dtype=np.int64)
+        number[order] = np.arange(len(node)) - np.searchsorted(node[order], node[order])
+        place = np.empty(self.dofs.size, dtype=np.int64)
+        (place[meeting.rows],) = meeting.back(number)
+        #: Bits of the facets at each of their nodes; numbers of type float hold no more.
+        self._place = place.reshape(self.dofs.shape)
+        self._has = self._place < MOST_BITS
+
+    def of(self, which: Bools) -> Ints:
+        """Bits ``(n,)`` of nodes of facets ``which (m, nn)``, or all of a facet's ``(m, 1)`` (collective)."""
+        bits = np.ldexp((self._has & which).astype(float), np.minimum(self._place, MOST_BITS))
+        return self.config.to_owners(self.dofs.ravel(), bits.ravel())[self.nodes].astype(np.int64)
+
+    def shares(self, bits: Ints) -> Bools:
+        """The nodes of facets ``(m, nn)`` of which ``of`` returned these (collective)."""
+        there = self.config.from_owners(self.nodes, bits[:, None].astype(float), self.dofs.ravel()).astype(np.int64)
+        return np.asarray(self._has & (there.reshape(self.dofs.shape) >> np.minimum(self._place, MOST_BITS) & 1 > 0))
 
 
 def terms_of(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> Terms:

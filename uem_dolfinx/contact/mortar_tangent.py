@@ -7,7 +7,7 @@ minus its product with n, there is ``t . dy/deta = 0`` and ``t . n = -1``, so th
     d gap = t . (dx - dy + gamma da) + gamma n . da.
 
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
-in the second derivatives. The ends of the target move too, and dual functions with them; in 3D they are left out. Parts of quadratic
+in the second derivatives. The ends of the target move too, and dual functions with them (``mortar_ends``). Parts of quadratic
 facets do not all grow as these do, and change dual functions as ends do; second derivatives have what is of first order in them.
 """
 
@@ -27,15 +27,13 @@ from uem_dolfinx.contact.segment_motions import (
     dual_tangents,
     edges,
     ends,
-    outer,
     ring_of,
-    side_rule,
     skew,
     sum_of_products,
     to_gap,
 )  # fmt: skip
 from uem_dolfinx.geometry.overlaps import SLIVER, Planes, Segments, locate
-from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, tangents
+from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, facet_shape, tangents
 
 
 @dataclass(frozen=True)
@@ -146,23 +144,25 @@ class SegmentPoints:
             grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap)
             stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
             by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
-        if self.other is not None and self.other.dim == 1:
+        if self.other is not None:
             self._add_ends(self.other, by_node, by_pair)
         return by_node, by_pair
 
     def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
         """Add how weighted gaps change where the target, with facets of such a ``shape``, ends over contactor facets."""
-        which = self._partly_covered()
-        sides = self._sides(shape, which).at_ends()
+        which = self.partly_covered()
+        sides = self.sides(shape, which).at_ends()
         e = self.facet[which][sides.pair]
-        way = -self.duals.at_end(e, sides.b, sides.gap)[:, :, None, None] * sides.way[:, None]
+        force = sides.weight[:, None] * self.duals.at_end(e, sides.b, sides.gap)
+        way = -force[:, :, None, None] * sides.way[:, None]
         nc = self.nodes.shape[1]
         np.add.at(on_facet, e, way[:, :, :nc])
         np.add.at(on_target, which[sides.pair], way[:, :, nc:])
 
-    def _partly_covered(self) -> Ints:
+    def partly_covered(self) -> Ints:
         """Pairs whose contactor facets are not covered altogether ``(p,)``."""
-        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.planes.size)[self.facet])
+        some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
+        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.planes.size)[self.facet] & some)
 
     # -- second derivatives ----------------------------------------------------------------------------------------------
 
@@ -188,7 +188,7 @@ class SegmentPoints:
             tab = self.other.tabulate(eta)
             for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
                 half += sum_of_products(pair, force, slide, change, k)
-            sides = self._sides(self.other, pressing).between()
+            sides = self.sides(self.other, pressing).between()
             step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
             half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
         elif self.bend is not None:
@@ -206,13 +206,7 @@ class SegmentPoints:
             e[first], add_up(of_facet[pair], np.column_stack([force * gap, (force * gap)[:, None] * turned]), len(first))
         )
         nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
-        if self.other is None or self.other.dim > 1:
-            return nodes, -blocks
-        more_nodes, more_blocks = self._curvature_of_ends(self.other, pressure)
-        # the blocks of ends have the nodes of two target facets
-        room = more_nodes.shape[1] - nodes.shape[1]
-        nodes = np.concatenate([np.pad(nodes, ((0, 0), (0, room)), constant_values=-1), more_nodes])
-        return nodes, -np.concatenate([np.pad(blocks, ((0, 0), (0, room * g), (0, room * g))), more_blocks])
+        return nodes, -blocks
 
     def _stretched(self, pressing: Ints, pair: Ints, pressure: Array, gaps: Array) -> Array:
         """Half of the second derivatives with the parts of the plane that points stand for and with their ``gaps (q, nc + nt, gdim)``."""
@@ -270,82 +264,6 @@ class SegmentPoints:
             out[:, :c, :, :c] -= 0.5 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
         return np.asarray(out)
 
-    def _curvature_of_ends(self, shape: FacetShape, pressure: Array) -> tuple[Ints, Array]:
-        """Second derivatives with the places where the target ends over contactor facets, in 2D.
-
-        With multipliers l, and f the foremost node, the weighted gaps grow with the end's coordinate s by
-
-            h = l_f gap + sum_j (l_j - l_f) (b_j G_j + psi_j (gap - sum_k b_k G_k)).
-
-        Its changes with the displacement, at s, and with s times those of s are what is to be added.
-
-        Args:
-            shape: of the target's facets.
-            pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
-
-        Returns:
-            Global nodes ``(p, nc + 2 nt)`` and blocks.
-        """
-        nc, nt = self.nodes.shape[1], self.opposite.shape[1]
-        which = self._partly_covered()
-        which = which[(pressure[self.facet[which]] != 0).any(axis=1)]
-        sides = self._sides(shape, which).at_ends()
-        pair = which[sides.pair]
-        e = self.facet[pair]
-        fore = pressure[e, self.duals.foremost[e]]
-        more = np.where(self.duals.own[e], pressure[e] - fore[:, None], 0.0)
-        A, D, size, mean, b = self.duals.A[e], self.covered.D[e], self.planes.size[e], self.duals.gap[e], sides.b
-        inverse = self.duals.inverse[e]
-        # quadratic functions' differences are derivatives
-        forward = np.sign(np.einsum("qg,qg->q", sides.outward, self.x[e, 1] - self.x[e, 0])) / size
-        ahead, behind = (basis_of(self.shape).at(sides.xi + half) for half in (0.5, -0.5))
-        b_s = forward[:, None] * (ahead - behind)
-        psi = np.einsum("qjb,qb->qj", A, b)
-        c, c_s = np.einsum("qij,qj->qi", inverse, b), np.einsum("qij,qj->qi", inverse, b_s)
-        left = sides.gap - np.einsum("qb,qb->q", b, mean)
-        bc = np.einsum("qb,qb->q", b, c)
-        psi_s = b * c + D * (c_s - c * bc[:, None])
-        mean_slope = np.einsum("qb,qb->q", b_s, mean) + bc * left
-        h_s = b_s * mean + (b * c + psi_s) * left[:, None] + psi * (sides.slope - mean_slope)[:, None]
-        h_s = fore * sides.slope + np.einsum("qj,qj->q", more, h_s)
-        h = np.einsum("qj,qj->q", pressure[e], self.duals.at_end(e, b, sides.gap))
-        # changes of h with the gap at the end, and with its projection
-        with_gap = fore + np.einsum("qj,qj->q", more, psi)
-        with_mean = more * b - np.einsum("qj,qj->q", more, psi)[:, None] * b
-        n, way, motions = self.planes.normal[e], -sides.way, sides.motions
-        change = with_gap[:, None, None] * (motions.along(sides.t) + motions.of_area(2 * (sides.gap / size)[:, None] * n))
-        change += 0.5 * h_s[:, None, None] * way
-        # the coordinate's own second derivative
-        tab = self.shape.tabulate(sides.xi)
-        stretch = np.zeros(way.shape)
-        stretch[:, :nc] = (forward[:, None] * tab.dN[:, :, 0])[:, :, None] * sides.outward[:, None]
-        change -= h[:, None, None] * stretch
-        half = outer(way, change)
-        half += outer(h[:, None, None] * motions.along(n) / size[:, None, None], motions.of_area(sides.outward))
-        nodes = [np.concatenate([self.nodes[e], self.opposite[pair], np.full((len(pair), nt), -1)], axis=1)]
-        blocks = [np.pad(half, ((0, 0), (0, nt * 2), (0, nt * 2)))]
-        # the projection of the gap has to do with all that is opposite of the facet
-        i, j = np.nonzero(e[:, None] == self.facet[None, :])
-        s = self.segments
-        q = np.flatnonzero(np.isin(s.pair, j))
-        at = Motions(
-            self.phi[q], self.N[q], s.gap[q] / self.planes.size[self.facet[s.pair[q]]], self.turning[self.facet[s.pair[q]]]
-        )
-        normal, extent = self.planes.normal[self.facet[s.pair[q]]], self.planes.size[self.facet[s.pair[q]]]
-        gaps = at.along(self.to_gap[q]) + at.of_area(2 * (s.gap[q] / extent)[:, None] * normal)
-        weighted = (s.weight[q, None] * self.b[q])[:, :, None, None] * gaps[:, None]
-        total = add_up(s.pair[q], weighted.reshape(len(q), nc * (nc + nt) * 2), len(self.facet))
-        total = total.reshape(len(self.facet), nc, (nc + nt), 2)
-        factor = np.einsum("qj,qji->qi", with_mean, inverse)
-        its = np.einsum("qi,qiag->qag", factor[i], total[j])
-        wide, wide_way = np.zeros((len(i), nc + 2 * nt, 2)), np.zeros((len(i), nc + 2 * nt, 2))
-        wide[:, :nc], wide[:, nc + nt :] = its[:, :nc], its[:, nc:]
-        wide_way[:, : nc + nt] = way[i]
-        nodes.append(np.concatenate([self.nodes[e[i]], self.opposite[pair[i]], self.opposite[j]], axis=1))
-        blocks.append(outer(wide_way, wide))
-        out = np.concatenate(blocks)
-        return np.concatenate(nodes), out + out.transpose(0, 2, 1)
-
     def _slides(
         self, motions: Motions, shape: FacetShape, tab: Tabulated, y: Array, n: Array, t: Array
     ) -> Iterator[tuple[Array, Array]]:
@@ -361,28 +279,39 @@ class SegmentPoints:
                 change -= 0.5 * sum(bend[:, e, None, None] * other for e, other in enumerate(slides))
             yield slide, change
 
-    def _sides(self, shape: FacetShape, which: Ints) -> Sides:
-        """Sides of target facets over contactor facets.
+    def sides(self, shape: FacetShape, which: Ints, cuts: bool = False) -> Sides:
+        """Points on sides of target facets over contactor facets.
 
         Args:
             shape: of the target's facets.
             which: pairs ``(p,)``.
+            cuts: where sides leave contactor facets, rather than quadrature points.
         """
         e, y = self.facet[which], self.y[which]
         planes = self.planes.take(e)
         own, its = planes.coordinates(self.x[e]), planes.coordinates(y)
-        pair, at, eta, out, weight, corners = (ends if shape.dim == 1 else edges)(self.shape, own, shape, its)
+        s = ends(own, shape, its) if shape.dim == 1 else edges(self.shape, own, shape, its, cuts)
+        pair = s.pair
         # a side that two facets of the target share is found twice over a contactor facet
-        code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], corners], axis=1)])
-        _, same, count = np.unique(code, axis=0, return_inverse=True, return_counts=True)
-        alone = count[same.ravel()] == len(side_rule(self.shape)[1])
-        xi = locate(self.shape, own[pair, :, :-1], at)
-        tab, phi = shape.tabulate(eta), self.shape.functions(xi)
-        outward = np.einsum("qf,qfg->qg", out, planes.axes[pair, :-1])
+        code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], s.corners], axis=1)])
+        _, first, same = np.unique(code, axis=0, return_index=True, return_inverse=True)
+        same = same.ravel()
+        alone = ~np.isin(np.arange(len(first)), same[pair != pair[first][same]])[same]
+        xi = locate(self.shape, own[pair, :, :-1], s.at)
+        # segments end at the chord of a curved side, which moves with its corners; gaps are those of the target there
+        linear = facet_shape(shape.cell, 1)
+        eta = s.eta if shape.degree == 1 else locate(shape, its[pair, :, :-1], s.at)
+        tab, phi, nc = shape.tabulate(eta), self.shape.functions(xi), linear.nodes.shape[0]
+        chord, shift = np.zeros((2, *tab.N.shape))
+        chord[:, :nc] = linear.functions(s.eta)
+        shift[:, :nc] = np.einsum("qaf,qf->qa", linear.tabulate(s.eta).dN, s.stride)
+        above = np.einsum("qa,qa->q", phi, own[pair, :, -1])
+        outward, ahead, cut = (np.einsum("qf,qfg->qg", v, planes.axes[pair, :-1]) for v in (s.outward, s.ahead, s.cut))
         t = to_gap(area_vectors(tab, y[pair]), planes.normal[pair])
-        gap = np.einsum("qa,qa->q", tab.N, its[pair, :, -1]) - np.einsum("qa,qa->q", phi, own[pair, :, -1])
-        motions = Motions(phi, tab.N, gap / planes.size[pair], self.turning[e][pair])
-        slope = np.einsum("qg,qg->q", t, outward)
+        gap, height = (np.einsum("qa,qa->q", N, its[pair, :, -1]) - above for N in (tab.N, chord))
+        motions = Motions(phi, chord, height / planes.size[pair], self.turning[e][pair])
         return Sides(
-            pair, xi, basis_of(self.shape).at(xi), gap, t, slope, outward, motions, motions.along(outward), weight, alone
-        )
+            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), gap=gap, t=t, slope=np.einsum("qg,qg->q", t, outward),
+            outward=outward, motions=motions, way=motions.along(outward), ahead=ahead,
+            shift=shift, cut=cut, weight=s.weight, end=alone,
+        )  # fmt: skip

@@ -3,7 +3,7 @@
 The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes get
 other shares. The traction turns with the derivative of the weighted gap with the contactor's own displacement, and grows with its size;
 these are the second derivatives of the gap of this contactor alone. Parts of quadratic facets do not all grow as these do. How dual
-functions change where the target ends is left out, as in the second derivatives of gaps in space.
+functions change where the target ends is left out in what tractions are handed to.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.duals import add_up, basis_of, products
+from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import Motions, dual_tangents, sum_of_products
@@ -26,7 +27,7 @@ class Slips:
 
     Attributes:
         which: places among the contactors, ascending ``(k,)``.
-        push: multipliers of their equations along ``normal``, positive ``(k,)``.
+        push: multipliers of their plain rows, positive ``(k,)``.
         pressure: multipliers of their weighted gaps ``(k,)``.
         normal: directions of their equations ``(k, gdim)``.
         tau: friction, handed on by the weights that they follow other nodes with ``(k, gdim)``.
@@ -119,7 +120,7 @@ def turning(
     """
     at, config, (which, normal, tau) = rows.points, elimination.config, (slips.which, slips.normal, slips.tau)
     n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
-    assert rows.whole is not None
+    assert rows.whole is not None and rows.slope is not None and rows.push is not None and rows.parts is not None
     whole = rows.whole[which, None]
     mine = np.zeros((n, 1 + g))
     mine[which] = np.column_stack([slips.pressure, tau / whole])
@@ -132,16 +133,20 @@ def turning(
         stretched = products(s.weight[:, None] * at.b, at.stretching.reshape(len(at.b), nc * g))
         on_facet = add_up(at.facet[s.pair], stretched, m).reshape(m, nc, nc, g)
         grown += np.einsum("mjb,bj,mbag->mjag", (at.duals.C != 0).astype(float), basis_of(at.shape).T, on_facet)
-    parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g)), grown], axis=3))]
+    parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g + g)), grown], axis=3))]
+    length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
+    outward = rows.parts / np.where(length > 0, length, 1.0)
     for j in range(nc):
         alone = np.zeros((m, nc))
         alone[:, j] = there[:, j, 0]
-        nodes, blocks = at.curvature(alone)
-        p, width = nodes.shape
-        own = -blocks[:, j * g : (j + 1) * g].reshape(p, g, width, g).swapaxes(1, 2).reshape(p, 1, width, g * g)
-        parts.append(terms_of(nodes[:, j : j + 1], nodes, np.concatenate([own, np.zeros((p, 1, width, g))], axis=3)))
+        for nodes, blocks in curvature(at, alone):
+            p, width = nodes.shape
+            own = -blocks[:, j * g : (j + 1) * g].reshape(p, g, width, g).swapaxes(1, 2)
+            longer = np.einsum("pg,pwgh->pwh", outward[_places(at.nodes, nodes[:, :nc]), j], own)
+            columns = [own.reshape(p, width, g * g), longer, np.zeros((p, width, g))]
+            parts.append(terms_of(nodes[:, j : j + 1], nodes, np.concatenate(columns, axis=2)[:, None]))
     row, term, value = elimination.at_owners(parts, np.ones(n))
-    values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + g))
+    values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + 2 * g))
     values[: len(row), 1:] = value
     values[len(row) :, 0] = np.concatenate([-weights[2], np.ones(len(which))])
     who, terms = (
@@ -150,11 +155,20 @@ def turning(
     )
     nodes, values = _table(add_up_terms((who, terms, values)), which, n)
     k, c = nodes.shape
-    gradient, of_whole = values[:, :, 1 : 1 + g * g].reshape(k, c, g, g), values[:, :, 1 + g * g :] / whole[:, None]
-    along, across = (np.einsum("kg,kcgh->kch", v, gradient) / slips.push[:, None, None] for v in (normal, tau))
-    change = np.einsum("kg,kch->kgch", tau, along - of_whole) - np.einsum("kg,kch->kgch", normal, across)
+    gradient, longer, of_whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
+    along = longer / (slips.push * rows.push[which])[:, None, None]
+    across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / (slips.push * rows.slope[which])[:, None, None]
+    change = np.einsum("kg,kch->kgch", tau, along - of_whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
     blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
     return [handing_on(at, there[:, :, 1:]), (nodes, blocks)]
+
+
+def _places(facets: Ints, which: Ints) -> Ints:
+    """Places in ``facets (m, nc)`` of facets told by the same nodes ``(p, nc)``."""
+    _, number = np.unique(np.concatenate([facets, which]), axis=0, return_inverse=True)
+    place = np.zeros(len(number), dtype=np.int64)
+    place[number[: len(facets)]] = np.arange(len(facets))
+    return place[number[len(facets) :]]
 
 
 def _table(terms: Terms, which: Ints, n: int) -> tuple[Ints, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.geometry.overlaps import cross
+from uem_dolfinx.geometry.overlaps import SLIVER, cross
 from uem_dolfinx.geometry.shapes import FacetShape, area_vectors
 
 
@@ -65,6 +65,9 @@ class Sides:
         outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
         motions: of the points past the target.
         way: of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
+        ahead: along the side in that plane; zero in 2D ``(q, gdim)``.
+        shift: change of the target's shape functions on this way ``(q, nt)``.
+        cut: way along the side of the place where it leaves the contactor facet, per motion; zero elsewhere ``(q, gdim)``.
         weight: of the quadrature, a length in 3D ``(q,)``.
         end: whether the target ends there ``(q,)``.
     """
@@ -78,6 +81,9 @@ class Sides:
     outward: Array
     motions: Motions
     way: Array
+    ahead: Array
+    shift: Array
+    cut: Array
     weight: Array
     end: Bools
 
@@ -93,58 +99,114 @@ class Sides:
         return Sides(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
-def ends(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
-    """Ends of target facets over contactor facets: pairs ``(q,)``, places in the plane and on the target, outward directions, weights.
+@dataclass(frozen=True)
+class SidePoints:
+    """Points on straight sides of target facets over contactor facets, in the planes of these.
+
+    Attributes:
+        pair: ascending ``(q,)``.
+        at: places ``(q, fdim)``.
+        eta: on the target facets ``(q, fdim)``.
+        outward: out of the target facet ``(q, fdim)``.
+        ahead: along the side, zero in 2D ``(q, fdim)``.
+        stride: change of ``eta`` on this way ``(q, fdim)``.
+        weight: of the quadrature, a length in 3D; 1 in 2D ``(q,)``.
+        cut: how far the place where the side leaves the contactor facet goes along the side where it moves, zero elsewhere ``(q, fdim)``.
+        corners: the side's, among those of the target facet ``(q, gdim - 1)``.
+    """
+
+    pair: Ints
+    at: Array
+    eta: Array
+    outward: Array
+    ahead: Array
+    stride: Array
+    weight: Array
+    cut: Array
+    corners: Ints
+
+
+def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:
+    """Ends of target facets over contactor facets in 2D.
+
+    Args:
+        own: nodes of the contactor's facets in their planes ``(p, nc, 2)``.
+        other: shape of the target's.
+        its: their nodes ``(p, nt, 2)``.
+    """
+    size, margin = own[:, 1, 0], SLIVER * own[:, 1, 0]
+    pair, corner = np.nonzero((its[:, :2, 0] > margin[:, None]) & (its[:, :2, 0] < (size - margin)[:, None]))
+    at = its[pair, corner, :1]
+    out = np.sign(at - its[pair, 1 - corner, :1])
+    none = np.zeros((len(pair), 1))
+    return SidePoints(pair, at, other.nodes[corner], out, none, none, np.ones(len(pair)), none, corner[:, None])
+
+
+def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bool = False) -> SidePoints:
+    """Quadrature points on the straight sides of target facets over contactor facets; as ``ends``.
 
     Args:
         shape: of the contactor's facets.
-        own: their nodes in their planes ``(p, nc, 2)``.
-        other: of the target's facets.
-        its: their nodes ``(p, nt, 2)``.
+        own: their nodes in their planes ``(p, nc, 3)``.
+        other: shape of the target's.
+        its: their nodes ``(p, nt, 3)``.
+        cuts: the places where sides leave contactor facets instead, with weight 1 at the end and -1 at the beginning.
     """
-    size = own[:, 1, 0]
-    pair, corner = np.nonzero((its[:, :2, 0] > 0) & (its[:, :2, 0] < size[:, None]))
-    at = its[pair, corner, :1]
-    out = np.sign(at - its[pair, 1 - corner, :1])
-    return pair, at, other.nodes[corner], out, np.ones(len(pair)), corner[:, None]
-
-
-def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array) -> tuple[Ints, Array, Array, Array, Array, Ints]:
-    """Points on the straight sides of target facets over contactor facets; as ``ends``, with weights that are lengths."""
     ring = np.array(other.ring)
     start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
     low, high = np.zeros(start.shape[:2]), np.ones(start.shape[:2])
+    # sides of the contactor facet that cut them off, -1 for none
+    none: Ints = np.full(low.shape, -1, dtype=np.int64)
+    cut_low, cut_high = none, none
     frame = own[:, shape.ring, :2]
     turn = np.sign(cross(frame[:, 1] - frame[:, 0], frame[:, 2] - frame[:, 0]))[:, None]
+    borders = np.roll(frame, -1, axis=1) - frame
     for j in range(frame.shape[1]):
-        corner, along = frame[:, None, j], (frame[:, (j + 1) % frame.shape[1]] - frame[:, j])[:, None]
+        corner, along = frame[:, None, j], borders[:, None, j]
         before, after = turn * cross(along, start - corner), turn * cross(along, end - corner)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            met = before / (before - after)
-        low = np.where((before < 0) & (after >= 0), np.maximum(low, met), low)
-        high = np.where((before >= 0) & (after < 0), np.minimum(high, met), high)
-        high = np.where((before < 0) & (after < 0), -1.0, high)
+        # one that coincides with a side of the contactor facet is not over it
+        least = SLIVER * np.einsum("pkf,pkf->pk", along, along)
+        comes, goes = (before <= least) & (after > least), (before > least) & (after <= least)
+        met = before / np.where(comes | goes, before - after, 1.0)
+        later, sooner = comes & (met > low), goes & (met < high)
+        low, cut_low = np.where(later, met, low), np.where(later, j, cut_low)
+        high, cut_high = np.where(sooner, met, high), np.where(sooner, j, cut_high)
+        high = np.where((before <= least) & (after <= least), -1.0, high)
     pair, side = np.nonzero(high > low)
-    points, weights = side_rule(shape)
-    k = len(weights)
     low, high = low[pair, side], high[pair, side]
-    part = (low[:, None] + (high - low)[:, None] * points[:, 0]).ravel()
-    pair, side, first = np.repeat(pair, k), np.repeat(side, k), np.repeat(high - low, k)
+    points, weights = side_rule(shape)
+    # parts of sides, weights there, and the sides of contactor facets where they leave these
+    part, first = low[:, None] + (high - low)[:, None] * points[:, 0], (high - low)[:, None] * weights
+    border: Ints = np.zeros(part.shape, dtype=np.int64)
+    if cuts:
+        part, first = np.stack([low, high], axis=1), np.tile([-1.0, 1.0], (len(low), 1))
+        border = np.stack([cut_low[pair, side], cut_high[pair, side]], axis=1)
+    row, which = np.nonzero(border >= 0)
+    part, first, border = part[row, which], first[row, which], border[row, which]
+    pair, side = pair[row], side[row]
     a, b = start[pair, side], end[pair, side]
     length = np.linalg.norm(b - a, axis=1)
-    out = np.stack([(b - a)[:, 1], -(b - a)[:, 0]], axis=1) / length[:, None]
+    ahead = (b - a) / length[:, None]
+    out = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
     middle = its[:, ring, :2].mean(axis=1)[pair]
     out = out * np.sign(np.einsum("qf,qf->q", out, a - middle))[:, None]
-    eta = other.nodes[ring[side]] * (1 - part[:, None]) + other.nodes[np.roll(ring, -1)[side]] * part[:, None]
+    from_, to = other.nodes[ring[side]], other.nodes[np.roll(ring, -1)[side]]
+    cut, weight = np.zeros(a.shape), first * length
+    if cuts:
+        across = np.stack([borders[pair, border, 1], -borders[pair, border, 0]], axis=1)
+        lean = np.einsum("qf,qf->q", across, ahead)
+        cut, weight = -across / lean[:, None], first
+    eta = from_ * (1 - part[:, None]) + to * part[:, None]
     corners = np.stack([ring[side], np.roll(ring, -1)[side]], axis=1)
-    return pair, a + part[:, None] * (b - a), eta, out, first * length * np.tile(weights, len(pair) // k), corners
+    return SidePoints(pair, a + part[:, None] * (b - a), eta, out, ahead, (to - from_) / length[:, None], weight, cut, corners)
 
 
 def side_rule(shape: FacetShape) -> tuple[Array, Array]:
     """Quadrature on sides over contactor facets of a ``shape`` in 3D; the one end that a side has in 2D."""
     if shape.dim == 1:
         return np.zeros((1, 0)), np.ones(1)
-    return forms.quadrature_rule("interval", 2 * shape.degree + 2)
+    # bilinear functions are of degree 2 across
+    return forms.quadrature_rule("interval", 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1) + 2)
 
 
 def outer(left: Array, right: Array) -> Array:

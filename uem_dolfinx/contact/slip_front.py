@@ -10,10 +10,10 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.geometry.search import box_distances, nearest_of
 
 #: Others go along this times as far ahead as the last time.
-#: [convention; how far they last went along; test_friction_states.py::test_slip_that_eats_its_way_goes_ahead]
+#: [convention; how far they last went along; test_slip_front.py::test_slip_that_eats_its_way_goes_ahead]
 FARTHER = 2.0
 #: And by this part of it where some of those that went along have been held again.
-#: [convention; how far they last went along; test_friction_states.py::test_slip_that_eats_its_way_goes_ahead]
+#: [convention; how far they last went along; test_slip_front.py::test_slip_that_eats_its_way_goes_ahead]
 NEARER = 0.25
 
 

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array, Bools, Ints
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.slip_front import Front
+    from uem_dolfinx.contact.ties import Ties
+    from uem_dolfinx.geometry.rigid import Motion
 
 Renumber = Callable[[Ints], Ints]
 
@@ -62,6 +67,52 @@ class FrictionState:
 
 
 @dataclass(frozen=True)
+class Pivot:
+    """What the exchanges of one linearised problem have done, and what directions of slip come from, ``(n,)`` each or as told.
+
+    Attributes:
+        released: contactors that have been let go of.
+        turned: those whose slip has been turned back.
+        taken: those that slip ahead of others.
+        stiffness: c.
+        q: forces that the directions of slip have ``(n, gdim)``.
+        tau: of these the part that is force ``(n, gdim)``.
+        front: where contactors begin to slip.
+    """
+
+    released: Bools
+    turned: Bools
+    taken: Bools
+    stiffness: Array
+    q: Array
+    tau: Array
+    front: Front
+
+    @classmethod
+    def begin(cls, front: Front, stiffness: Array, q: Array, tau: Array) -> Pivot:
+        """Nothing is done yet."""
+        none = np.zeros(len(stiffness), dtype=bool)
+        return cls(none, none, none, stiffness, q, tau, front)
+
+
+@dataclass(frozen=True)
+class LastStep:
+    """What contactors that follow others in a mean did at the end of the last step.
+
+    Attributes:
+        ties: by what they followed.
+        x: positions of the owned nodes ``(n_owned, gdim)``.
+        motion: of a rigid target; None if it had not moved.
+        force_per_multiplier: see ``Kinematics``.
+    """
+
+    ties: Ties
+    x: Array
+    motion: Motion | None
+    force_per_multiplier: Array
+
+
+@dataclass(frozen=True)
 class PairState:
     """What is known of ``n`` contactors; frozen so that trial and committed never share an array by accident.
 
@@ -76,6 +127,8 @@ class PairState:
         slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
         passed: has been past the target's end since it was last in front of it ``(n,)``.
         at_end: came to the target, or was drawn, at its end, which has held it since ``(n,)``.
+        cover: which of its facets a rigid target covers, or where a mesh leaves it a dual function, one bit each in an order that no
+            partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
     """
 
@@ -89,6 +142,7 @@ class PairState:
     slips: Ints
     passed: Bools
     at_end: Bools
+    cover: Ints
     friction: FrictionState | None = None
 
     @property
@@ -110,6 +164,7 @@ class PairState:
             slips=np.zeros(n, np.int64),
             passed=np.zeros(n, bool),
             at_end=np.zeros(n, bool),
+            cover=np.zeros(n, np.int64),
         )
 
     def to_checkpoint(self, keys_of: Renumber) -> dict[str, npt.NDArray[Any]]:

@@ -20,6 +20,9 @@ from uem_dolfinx.geometry.search import MeshTarget
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
 #: [heuristic; changes in a step; -]
 HOLD_AFTER = 2
+#: A concave bend whose facets rise above each other by more holds a contactor at once: nothing slides on across it.
+#: [heuristic; slope; test_concave_corners.py::test_a_block_pressed_into_a_corner]
+SHARP = 0.5
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
 #: [heuristic; changes in a step; -]
 MOST_CHANGES = 8
@@ -147,7 +150,8 @@ class Valleys:
             c = self._corners_of(state, points, i[ask], others[ask])
             if c is None:
                 continue
-            hold = c.concave & self._can_be_held(c) & (state.changes[c.which] >= HOLD_AFTER)
+            at_once = (state.changes[c.which] >= HOLD_AFTER) | (c.rising > SHARP)
+            hold = c.concave & self._can_be_held(c) & at_once
             held[c.which[hold]] = others[ask[hold]]
             taken[ask[hold]] = True
             changes[c.which[~c.flat]] += 1

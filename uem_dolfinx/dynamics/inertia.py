@@ -17,12 +17,12 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
-from uem_dolfinx.errors import LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.errors import InputTypeError, LinearSolveError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agree, agreed, ask_together
@@ -50,13 +50,16 @@ class Dynamics:
 
     Attributes:
         velocity: a Function; at components without mass it is the mean over the last step.
-        acceleration: a Function; zero at components without mass.
+        acceleration: a Function; zero at components without mass, at prescribed ones the mean over the last step.
+        mean_velocity: a Function, increments of the last step over its length; at the start the velocity.
+        driven: what this rank's prescribed components have given its mass of kinetic energy by being prescribed.
         time: of the committed state.
         start: time at the start.
         accelerated: whether the acceleration fits the forces yet.
         moving: whether a step has begun that is neither kept nor left.
         massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
         resumed: how often a checkpoint has been read into them.
+        dt: length of the step that has begun last.
     """
 
     def __init__(
@@ -83,6 +86,10 @@ class Dynamics:
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
+        #: Length of the last step.
+        self._last = 0.0
+        self.driven = 0.0
+        self.dt = 0.0
         #: Factor of M in the tangent.
         self.factor = 0.0
         #: Virtual work of the damping forces.
@@ -100,11 +107,18 @@ class Dynamics:
                 f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
                 "function space of the displacement"
             )
+        elif not compat.is_on(self.mass.config.V, config.mesh):
+            error = SpaceError(
+                "the mass is of another mesh than the displacement: make it with the function space of the displacement"
+            )
         # on other ranks the parts may be equally large by chance
         agree(config.comm, error)
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
+        self.mean_velocity = fem.Function(config.V, name="mean_velocity")
         self._set_velocity()
+        self.mean_velocity.x.array[:] = self.velocity.x.array
+        self._held = np.zeros(self._n, dtype=bool)
         with agreed(config.comm):
             self._down = np.zeros(g) if self.gravity is None else given.vector("gravity", self.gravity, g)
         given.alike(
@@ -116,23 +130,35 @@ class Dynamics:
         if self.damping is not None:
             self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
             self._past.x.array[:] = self.velocity.x.array
-            self.damping_form = ask_together(config.comm, "damping", self.damping, self._rate * config.u + self._past)
+            form = ask_together(config.comm, "damping", self.damping, self._rate * config.u + self._past)
+            with agreed(config.comm):
+                if form is None:
+                    raise InputTypeError("damping(v) = None: expected a UFL form, linear in the test function; return it")
+            self.damping_form = form
         return self.damping_form
 
     def _set_velocity(self) -> None:
         v, g = self.start_velocity, self.config.gdim
         if isinstance(v, fem.Function):
-            other = v.function_space.dofmap.index_map_bs != g or len(v.x.array) != len(self.velocity.x.array)
+            own = v.function_space
+            other = own.dofmap.index_map_bs != g or compat.lagrange_degree(own) != self.config.degree
+            other |= not compat.is_on(own, self.config.mesh)
             words = "the velocity belongs to another space: make it with the function space of the displacement"
             agree(self.config.comm, SpaceError(words) if other else None)
             self.velocity.x.array[:] = v.x.array
         elif v is not None:
             with agreed(self.config.comm):
                 expected = f"a Function of the displacement's space or {g} numbers"
-                given.kind("velocity", v, np.shape(v) == (g,), expected)
-                self.velocity.x.array.reshape(-1, g)[:] = v
+                given.kind(
+                    "velocity", v, not callable(v) and np.shape(v) == (g,), expected, "of a form of its own, interpolate one"
+                )
+                self.velocity.x.array.reshape(-1, g)[:] = given.vector("velocity", v, g)
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
+
+    def hold(self, held: Bools) -> None:
+        """Take which owned components are prescribed ``(n_owned, gdim)``: their velocities are those of what is prescribed."""
+        self._held = held.ravel()
 
     def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
         """Hand the mass of contact surfaces on as ``massless.without_surfaces`` does, or warn that contactors keep it (collective).
@@ -161,7 +187,7 @@ class Dynamics:
     def begin(self, dt: float) -> None:
         """Begin a step of length ``dt`` from the committed state."""
         s, u, v, a = self.scheme, self._u, self._velocity, self._acceleration
-        self._until, self.moving = self.time + dt, True
+        self._until, self.moving, self.dt = self.time + dt, True, dt
         # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
         self._a_rate = 1.0 / (s.beta * dt**2)
         self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
@@ -171,6 +197,46 @@ class Dynamics:
         if self.damping is not None:
             self._rate.value = self._v_rate
             self._past.x.array[:] = self._v_past - self._v_rate * u
+
+    def _prescribed(self) -> tuple[Array, Array, Array]:
+        """Velocity at the end, mean acceleration, and that in the equation of motion, of prescribed components, from what is prescribed.
+
+        Neither rule takes them from displacements without an echo of every jump for ever: v(n+1) = 2 du/dt - v(n). With w the mean
+        velocity of the step, v(n+1) = w + dt/2 times the smaller of two slopes, that of w and that of v in the step before, and 0 where
+        their signs differ. That is of second order where the motion is smooth, and w at once behind a jump, which so is an impact
+        within the step. Accelerations are differences of v, carried on to the instant of the equation.
+        """
+        i, dt, last = self._held, self.dt, self._last
+        v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
+        w = (self.config.u.x.array - self._u)[: self._n][i] / dt
+        slope = 2.0 * (w - self.mean_velocity.x.array[: self._n][i]) / (dt + last)
+        slope = np.where(slope * before > 0.0, np.where(np.abs(slope) < np.abs(before), slope, before), 0.0)
+        end = w + 0.5 * dt * slope
+        mean = (end - v) / dt
+        on = (0.5 - self.scheme.alpha_f) * 2.0 * dt / (dt + (last or dt))
+        return end, mean, mean + on * (mean - before)
+
+    def update_rates(self) -> None:
+        """Bring the velocity of prescribed components in the damping form up to the present displacement (collective)."""
+        if self.damping is None or not self.moving:
+            return
+        i = np.flatnonzero(self._held)
+        self._past.x.array[i] = self._prescribed()[0] - self._v_rate * self.config.u.x.array[i]
+        self._past.x.scatter_forward()
+
+    def memory(self) -> tuple[float, float, float, Array, list[Array]]:
+        """What the next step begins with."""
+        fields = self.velocity, self.acceleration, self.mean_velocity, self.forces
+        return self.time, self._last, self.driven, self._u, [np.array(field.x.array) for field in fields]
+
+    def remember(self, memory: tuple[float, float, float, Array, list[Array]]) -> None:
+        """Go on from what ``memory`` returned."""
+        self.time, self._last, self.driven, displacement, kept = memory
+        for field, values in zip((self.velocity, self.acceleration, self.mean_velocity, self.forces), kept):
+            field.x.array[:] = values
+        self.restore()
+        self._copy_committed()
+        self._u = displacement
 
     def restore(self) -> None:
         """Leave a step that has begun; the forces are those of the committed state again."""
@@ -188,6 +254,7 @@ class Dynamics:
         s, n = self.scheme, self._n
         du = self.config.u.x.array - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
+        a[:n][self._held] = self._prescribed()[2]
         inertia = self.mass.M * self._like(a[:n])
         if s.alpha_f:
             inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
@@ -234,15 +301,22 @@ class Dynamics:
     def commit(self) -> None:
         """Keep velocity and acceleration that belong to the present displacement."""
         if self.moving:
-            n, dt = self._n, self._until - self.time
+            n, dt, held = self._n, self.dt, self._held
+            end, mean, _ = self._prescribed()
             du, massy = (self.config.u.x.array - self._u)[:n], self.massy.ravel()
             self.forces.x.array[:n] = self._inertia().array_r
-            self.acceleration.x.array[:n] = np.where(massy, self._a_rate * du + self._a_past[:n], 0.0)
+            a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
+            a[held], v[held] = mean, end
+            self.acceleration.x.array[:n] = np.where(massy, a, 0.0)
             # what has no mass has no velocity of its own
-            self.velocity.x.array[:n] = np.where(massy, self._v_rate * du + self._v_past[:n], du / dt)
-            for field in (self.forces, self.acceleration, self.velocity):
+            self.velocity.x.array[:n] = np.where(massy, v, du / dt)
+            self.mean_velocity.x.array[:n] = du / dt
+            change = self.velocity.x.array[:n] - self._velocity[:n]
+            given = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)
+            self.driven += float(given[held].sum())
+            for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
-            self.time, self.moving = self._until, False
+            self.time, self._last, self.moving = self._until, dt, False
         self._copy_committed()
 
     def _copy_committed(self) -> None:
@@ -252,14 +326,19 @@ class Dynamics:
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers that a run goes on from beside the Functions, by name."""
-        return {"time": self.time, "start": self.start, "accelerated": self.accelerated}
+        return {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Go on from the Functions as they are and what ``to_checkpoint`` returned; other numbers may stand beside it."""
-        self.time, self.start, self.accelerated = (kept[name] for name in self.to_checkpoint())
+        self.time, self.start, self.accelerated, self._last = (kept[name] for name in self.to_checkpoint())
         self.resumed += 1
         self.restore()
         self._copy_committed()
+
+    @property
+    def weight_of_one(self) -> Array:
+        """Acceleration of free fall ``(gdim,)``."""
+        return self._down
 
     def weight(self) -> PETSc.Vec:
         """Forces of gravity."""

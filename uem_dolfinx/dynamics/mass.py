@@ -19,14 +19,14 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
-from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
+from uem_dolfinx.geometry.configuration import Configuration, configuration_of
 from uem_dolfinx.geometry.search import EQUALLY_NEAR
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, agreed, ask_together
 
 #: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]
@@ -97,7 +97,7 @@ class Mass:
         block holds masses, the last one moments of inertia.
         """
         body, count = self._bodies
-        sums = _body_sums(self.config.comm, np.column_stack([np.ones(len(body)), self._X]), body, count)
+        sums = body_sums(self.config.comm, np.column_stack([np.ones(len(body)), self._X]), body, count)
         modes = rigid_velocities(self._X - (sums[:, 1:] / sums[:, :1])[body]).transpose(0, 2, 1)
         return self._moments(modes, np.ones(modes.shape[:2]))[0].sum(axis=1)
 
@@ -250,7 +250,9 @@ class Mass:
         return MassError(
             f"the body with its middle at ({where}) cannot keep its mass, centre and inertia without the mass of "
             f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
-            f"{part}refine the mesh behind its contact surface, or give nodal masses that are zero at the contactors"
+            f"{part}refine the mesh behind its contact surface, to five layers of cells of degree 1 or six between two surfaces that may "
+            "touch, declare fewer facets as contactors, or keep their mass by Dynamics(..., contactors='massy'), which lets impact set "
+            "them in vibration"
         )
 
     def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:
@@ -322,7 +324,7 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
         SpaceError: if V is no space of displacements, or rho lives on another mesh.
         MassError: if rho is not scalar, not finite, or negative.
     """
-    config = Configuration(fem.Function(V))
+    config = configuration_of(V)
     with timed("assemble mass"):
         density = _density(config, rho)
         _cell_masses(config, density)
@@ -346,7 +348,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     Raises:
         SpaceError, MassError: as ``consistent_mass``.
     """
-    config = Configuration(fem.Function(V))
+    config = configuration_of(V)
     with timed("assemble mass"):
         density = _density(config, rho)
         rows = forms.assemble_array(V, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx)).reshape(-1, config.gdim)[:, 0]
@@ -359,7 +361,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
         scaled = config.to_owners(cells.ravel(), np.outer(of_cells, shares / shares.sum()).ravel())[: config.n_owned]
         body, count = find_bodies(config)
         body = body[: config.n_owned]
-        refused = _body_sums(config.comm, (rows < LEAST_ROW_SUM * scaled).astype(float), body, count) > 0
+        refused = body_sums(config.comm, (rows < LEAST_ROW_SUM * scaled).astype(float), body, count) > 0
         m = np.where(refused[body], scaled, rows)
     return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True)
 
@@ -375,12 +377,21 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
 
     Raises:
         SpaceError: if V is no space of displacements.
+        UserFunctionError: if the function raises.
         MassError: naming what has the wrong shape, or a node whose mass is negative or not finite.
     """
-    config = Configuration(fem.Function(V))
+    config = configuration_of(V)
     n, g = config.n_owned, config.gdim
-    m = np.asarray(values(config.X[:n]) if callable(values) else values, dtype=float)
-    error = None
+    m, error = np.zeros(0), None
+    if callable(values):
+        values = ask_together(config.comm, "the function of nodal masses", values, config.X[:n])
+    with agreed(config.comm):
+        try:
+            m = np.asarray(values, dtype=float)
+        except (TypeError, ValueError):
+            raise MassError(
+                given.sentence("nodal masses", values, "numbers", "or a function of places that returns them")
+            ) from None
     if m.shape not in ((n,), (n, g)):
         error = MassError(f"nodal masses have shape {m.shape}: expected ({n},) or ({n}, {g}) for the {n} nodes of this rank")
     else:
@@ -402,6 +413,8 @@ def _density(config: Configuration, rho: Any) -> Any:
         raise MassError(f"the density {rho!r} is neither a number nor a Function nor a UFL expression: give one of them")
     if rho.ufl_shape != ():
         raise MassError(f"the density {rho} has shape {rho.ufl_shape}: give a scalar")
+    if ufl.algorithms.extract_arguments(rho):
+        raise MassError(f"the density {rho} holds a test or trial function: give one that is known")
     if any(domain != config.mesh.ufl_domain() for domain in ufl.domain.extract_domains(rho)):
         raise SpaceError("the density lives on another mesh than the displacement: build both on one mesh")
     return rho
@@ -435,10 +448,3 @@ def _diagonal(config: Configuration, values: Array) -> PETSc.Mat:
     M.setValuesCSR(rows - first, rows[:-1], values)
     M.assemble()
     return M
-
-
-def _body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
-    """Sums of nodal values ``(n, ...)`` over the bodies ``(n,)`` of the nodes, over all ranks ``(count, ...)`` (collective)."""
-    out = np.zeros((count, *values.shape[1:]))
-    np.add.at(out, body, values)
-    return np.asarray(comm.allreduce(out))

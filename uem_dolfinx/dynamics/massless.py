@@ -70,7 +70,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
 
 def _followed(config: Configuration, contact: Contact) -> Bools:
     """Local nodes of a contact's target ``(n_local,)`` (collective)."""
-    return followed_nodes(config, contact.pair.coupling.followed)
+    return followed_nodes(config, contact.pair.discretisation.followed)
 
 
 def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:

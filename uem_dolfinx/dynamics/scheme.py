@@ -19,6 +19,9 @@ class Scheme:
         v(n+1) = v(n) + dt ((1 - gamma) a(n) + gamma a(n+1))
 
     Contact conditions hold at n + 1.
+
+    Raises:
+        InputError, InputTypeError: if beta is not positive, gamma below 1/2, or not ``alpha_m <= alpha_f <= 1/2``.
     """
 
     beta: float
@@ -33,6 +36,11 @@ class Scheme:
             raise InputError(
                 f"beta = {self.beta:g}, gamma = {self.gamma:g}: beta must be positive, since contact needs an implicit rule, and gamma "
                 "at least 1/2, since less makes every motion grow"
+            )
+        if not self.alpha_m <= self.alpha_f <= 0.5:
+            raise InputError(
+                f"alpha_m = {self.alpha_m:g}, alpha_f = {self.alpha_f:g}: expected alpha_m <= alpha_f <= 1/2, since others make motions "
+                "grow; generalised_alpha(rho_inf) finds good ones"
             )
 
 

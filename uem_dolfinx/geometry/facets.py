@@ -22,11 +22,21 @@ FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": 
 
 @dataclass(frozen=True)
 class FacetData:
-    """Target facets of one rank now: their nodes' positions, global block numbers and averaged outward unit normals."""
+    """Target facets of one rank now.
 
-    x: Array  # (m, nn, gdim)
-    nodes: Ints  # (m, nn)
-    nodal_normals: Array  # (m, nn, gdim)
+    Attributes:
+        x: positions of their nodes ``(m, nn, gdim)``.
+        nodes: global block numbers of these ``(m, nn)``.
+        nodal_normals: averaged outward unit normals there ``(m, nn, gdim)``.
+        corner_normals: sums of the outward unit normals of the facets around each corner, each times the angle that the facet has
+            there ``(m, n_corners, gdim)``. Of a point whose closest point is the corner they tell whether it is outside (Baerentzen
+            and Aanaes, 2005, doi:10.1109/TVCG.2005.49).
+    """
+
+    x: Array
+    nodes: Ints
+    nodal_normals: Array
+    corner_normals: Array
 
 
 class TargetFacets:
@@ -115,19 +125,42 @@ class TargetFacets:
         return np.stack([self.sign[:, None] * unit_normals(tab, x) for tab in at_nodes], axis=1)
 
     def current(self) -> FacetData:
-        """Facets where they are now (collective: the nodal normals are summed over ranks)."""
-        gdim, x = self.config.gdim, self.x
+        """Facets where they are now (collective: normals are summed over ranks)."""
+        x = self.x
+        at_nodes = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
         # every node sees its facet under the angle-free area weight
-        field = self._normal_field
+        vectors = np.stack([self.sign[:, None] * area_vectors(tab, x) for tab in at_nodes], axis=1)
+        angles = self.shape.corner_angles(x)
+        corners = vectors[:, : angles.shape[1]]
+        return FacetData(x, self.nodes, _unit(self._summed(vectors)), self._summed(angles[:, :, None] * _unit(corners)))
+
+    def _summed(self, vectors: Array) -> Array:
+        """Sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, seen from each of them (collective)."""
+        field, dofs = self._normal_field, self.dofs[:, : vectors.shape[1]]
         field.x.array[:] = 0.0
-        nodal = field.x.array.reshape(-1, gdim)
-        for a, xi in enumerate(self.shape.nodes):
-            tab = self.shape.tabulate(np.tile(xi, (len(x), 1)))
-            np.add.at(nodal, self.dofs[:, a], self.sign[:, None] * area_vectors(tab, x))
+        nodal = field.x.array.reshape(-1, self.config.gdim)
+        for a in range(vectors.shape[1]):
+            np.add.at(nodal, dofs[:, a], vectors[:, a])
         forms.sum_ghosts(field)
-        normals = nodal[self.dofs]
-        length = np.linalg.norm(normals, axis=2, keepdims=True)
-        return FacetData(x, self.nodes, normals / np.where(length > 0, length, 1.0))
+        return np.asarray(nodal[dofs])
+
+    def spread(self) -> Array:
+        """Areas of the facets around each node, over the length of their sum as vectors: 1 where all is flat ``(m, nn)`` (collective)."""
+        x = self.x
+        tabs = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
+        vectors = self.sign[:, None, None] * np.stack([area_vectors(tab, x) for tab in tabs], axis=1)
+        parts = np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2).reshape(
+            -1, self.config.gdim + 1
+        )
+        sums = np.column_stack([self.config.to_owners(self.dofs.ravel(), part) for part in parts.T])[self.dofs]
+        length = np.linalg.norm(sums[:, :, :-1], axis=2)
+        return np.asarray(np.where(length > 0, sums[:, :, -1] / np.where(length > 0, length, 1.0), 1.0))
+
+
+def _unit(vectors: Array) -> Array:
+    """The vectors ``(..., gdim)`` with length one; those without length stay."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, 1.0))
 
 
 def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:

@@ -15,11 +15,12 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Indices
-from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError, UEMError
+from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agreed
 
 CELLS = {
     2: ("triangle", 1), 3: ("quadrilateral", 1), 4: ("tetrahedron", 1), 5: ("hexahedron", 1),
@@ -29,6 +30,9 @@ CELLS = {
 
 N_VERTICES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 8: 2, 9: 3, 10: 4, 11: 4, 12: 8, 15: 1}
 """Vertices of Gmsh's element types, which always come first among an element's nodes."""
+
+#: Files that a .geo file names relative to its own folder.
+INCLUDED = r'\b((?:Include|Merge|ShapeFromFile)\s*\(?\s*)"([^"\n]+)"'
 
 #: A 2D body whose z varies by less than this is plane.
 #: [convention; size of the model; test_gmsh.py::test_how_plane_a_body_must_be]
@@ -54,22 +58,23 @@ def read_gmsh(
         The mesh and its tags.
 
     Raises:
+        InputError, InputTypeError: no communicator, or parameters that are no numbers by name.
         MissingBackendError: Gmsh cannot be imported.
         MissingFileError: there is no such file.
         MeshError: Gmsh refuses the file, a parameter is unknown, or the model has no cells this package can use.
     """
     with timed("read gmsh"):
-        raw, error = None, None
-        if comm.rank == 0:
-            try:
+        given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
+        raw = None
+        with agreed(comm):
+            known = parameters is None or isinstance(parameters, Mapping)
+            given.kind("parameters", parameters, known, "numbers by name, as {'h': 0.1}, or None")
+            for name, value in (parameters or {}).items():
+                given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
+            if comm.rank == 0:
                 raw = _read(source, gdim, dict(parameters or {}))
-            except UEMError as e:
-                error = e
         header = None if raw is None else (raw.cell, raw.degree, raw.points.shape[1], raw.cells.shape[1], raw.groups)
-        error, header = comm.bcast((error, header), root=0)
-        if error is not None:
-            raise error
-        cell, degree, gdim, nodes_per_cell, groups = header
+        cell, degree, gdim, nodes_per_cell, groups = comm.bcast(header, root=0)
         cells = np.empty((0, nodes_per_cell), dtype=np.int64) if raw is None else raw.cells
         points = np.empty((0, gdim)) if raw is None else raw.points
         mesh = compat.create_mesh(comm, cells, points, cell, degree)
@@ -157,15 +162,55 @@ def _constants(path: Path) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def _text(path: Path) -> str:
+    """A file's text; what is not UTF-8 in it stays what it is when it is written again."""
+    return path.read_text(encoding="utf-8", errors="surrogateescape")
+
+
+def _included(path: Path, known: tuple[Path, ...] = ()) -> list[Path]:
+    """A .geo file and the files that it includes, each as often as it is included, but for those that include themselves."""
+    files = [path]
+    for how, name in re.findall(INCLUDED, _text(path)):
+        file = path.parent / name
+        if how.startswith("Include") and file.is_file() and file not in (path, *known):
+            files += _included(file, (path, *known))
+    return files
+
+
+def _whole(path: Path, folder: Path, copies: dict[Path, Path]) -> Path:
+    """A copy of a .geo file and of those it includes whose last lines end, since Gmsh loses statements on lines that do not.
+
+    Args:
+        path: of the file.
+        folder: of the copies, which name other files by their places.
+        copies: that there are already, by the files.
+    """
+    if path in copies:
+        return copies[path]
+    copies[path] = folder / f"{len(copies)} {path.name}"
+
+    def place(found: re.Match[str]) -> str:
+        file = path.parent / found[2]
+        if found[1].startswith("Include") and file.is_file():
+            file = _whole(file, folder, copies)
+        return f'{found[1]}"{file}"'
+
+    text = re.sub(r"\bCurrentDir(ectory)?\b", lambda _: f'"{path.parent}/"', re.sub(INCLUDED, place, _text(path)))
+    copies[path].write_text(text + "\n", encoding="utf-8", errors="surrogateescape")
+    return copies[path]
+
+
 def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
     """Open and mesh a file in a session of our own, or in a model of our own in the user's session."""
     with _session(gmsh) as errors, tempfile.TemporaryDirectory() as folder:
         # constants set before the file is included win over its DefineConstant, in this model only
-        wrapper = Path(folder) / f"{path.stem}.geo"
+        wrapper, source, copies = Path(folder) / f"{path.stem}.geo", path, dict[Path, Path]()
+        if path.suffix == ".geo" and not all(_text(file).endswith("\n") for file in _included(path)):
+            source = _whole(path, Path(folder), copies)
         lines = [f"{name} = {float(value)!r};" for name, value in parameters.items()]
-        wrapper.write_text("\n".join([*lines, f'Include "{path}";', ""]))
+        wrapper.write_text("\n".join([*lines, f'Include "{source}";', ""]))
         try:
-            gmsh.open(str(wrapper if parameters else path))
+            gmsh.open(str(wrapper if parameters else source))
             dim = gdim or (3 if gmsh.model.getDimension() == 3 else 2)
             if not errors() and not len(gmsh.model.mesh.getElements(dim)[0]):
                 gmsh.model.mesh.generate(dim)
@@ -174,6 +219,8 @@ def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float])
             found = [*errors(), str(error)]
         if found:
             values = ", ".join(f"{name} = {value}" for name, value in parameters.items())
+            for file, copy in copies.items():
+                found[0] = found[0].replace(str(copy), str(file))
             raise MeshError(f"Gmsh cannot read or mesh {path}{' with ' + values if values else ''}: {found[0]}")
         return _extract(gmsh.model, gdim, str(path))
 

@@ -16,7 +16,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
 
 #: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
-#: [convention; cosine; test_overlaps.py::test_facets_that_face_each_other]
+#: [convention; cosine; test_opposite.py::test_facets_that_face_each_other]
 FACING = 0.6
 
 
@@ -79,10 +79,37 @@ def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reac
     centre = y.mean(axis=1)
     size = np.linalg.norm(y - centre[:, None], axis=2).max(axis=1)
     outward = Planes.of(target.shape, y, target.facets.sign).normal
-    i, f = balls_that_meet(middle, radius + reach, centre, size)
+    ball, row, within = _balls_along(middle, radius, reach, normal, y.reshape(-1, y.shape[2]))
+    if not len(ball):
+        return none, none
+    b, f = balls_that_meet(ball, within, centre, size)
+    i, f = np.divmod(np.unique(row[b] * len(y) + f), len(y))
     away = centre[f] - middle[i]
     height = np.einsum("kg,kg->k", away, normal[i])
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
     both = radius[i] + size[f]
     kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -FACING) & (beside < both) & (np.abs(height) < reach[i] + both)
     return i[kept], f[kept]
+
+
+def _balls_along(middle: Array, radius: Array, reach: Array, normal: Array, places: Array) -> tuple[Array, Ints, Array]:
+    """Balls that together cover the places within ``reach`` of facets along their normals.
+
+    Each facet of ``radius (m,)`` sees a tube. A single ball around the tube would hold the more facets beside it, the farther the
+    target is away. Of the tube only the part is covered that the box around all ``places (k, gdim)`` reaches into.
+
+    Returns:
+        Middles ``(k, gdim)``, the facet of each ``(k,)`` and radii ``(k,)``.
+    """
+    box = np.stack([places.min(axis=0), places.max(axis=0)])
+    centre, arm = box.mean(axis=0), 0.5 * (box[1] - box[0])
+    height = np.einsum("mg,mg->m", normal, centre - middle)
+    depth = np.abs(normal) @ arm
+    half = radius + reach
+    low, high = np.maximum(height - depth - radius, -half), np.minimum(height + depth + radius, half)
+    length = np.maximum(high - low, 0.0)
+    count = np.ceil(length / (2.0 * np.where(radius > 0, radius, 1.0))).astype(np.int64)
+    row = np.repeat(np.arange(len(count)), count)
+    part = length / np.maximum(count, 1)
+    at = low[row] + (np.arange(len(row)) - (np.cumsum(count) - count)[row] + 0.5) * part[row]
+    return middle[row] + at[:, None] * normal[row], row, np.hypot(radius, 0.5 * part)[row]

@@ -26,9 +26,12 @@ LEAST_LEAN = 0.1
 #: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
 #: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
-#: Facets whose distances or heights differ by less are equally near.
+#: Facets whose distances differ by less are equally near, and those whose heights do are faced alike.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
 EQUALLY_NEAR = 1e-9
+#: A point whose height over a facet is less than this part of its distance from a corner at the surface's end lies past the end.
+#: [convention; the distance; test_thresholds_geometry.py::test_points_past_an_end]
+SIDEWAYS = 0.1
 
 
 class Feet(NamedTuple):
@@ -44,6 +47,7 @@ class Feet(NamedTuple):
         sign: that turns the parametrisation's normal outwards ``(n,)``.
         open_sides: which sides bound the surface ``(n, n_sides)``.
         open_nodes: which nodes lie on such a side ``(n, nn)``.
+        facing: how squarely the point is in front of the facet, or behind it, a length ``(n,)``; not known of facets that were asked for.
     """
 
     facet: Ints
@@ -55,6 +59,7 @@ class Feet(NamedTuple):
     sign: Array
     open_sides: Bools
     open_nodes: Bools
+    facing: Array
 
 
 class MeshTarget:
@@ -137,6 +142,11 @@ class MeshTarget:
         own = unit_normals(Tabulated(projection.weights, projection.dN, projection.ddN), projection.x)
         return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
 
+    def spread(self, projection: FacetProjection) -> Array:
+        """What facets that meet at the feet push with together, over the force along their averaged normal ``(n,)`` (collective)."""
+        at_nodes = self.of_facets(projection.facet, self.facets.spread())
+        return np.asarray(np.einsum("na,na->n", projection.weights, at_nodes))
+
     def keys_of(self, facet: Ints) -> Ints:
         """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
         return self.of_facets(facet, self.facets.keys)
@@ -188,33 +198,55 @@ class MeshTarget:
         feet = self._project_here(p, data, *rest)
         if self.comm.size == 1:
             return self._evaluate(points, feet), feet
-        # the answers of several ranks are judged as those of one: by distance, then by height over the facet's own plane
+        # the answers of several ranks are judged as those of one
         rows, feet = exchange.rows, Feet._make(exchange.back(*feet))
         if found is not None:
             rows, feet = np.append(rows, np.arange(len(points))), Feet._make(map(np.concatenate, zip(feet, found)))
         answer = self._evaluate(points[rows], feet)
-        away = points[rows] - answer.foot
-        height = np.einsum("ng,ng->n", away, self.outward(answer))
-        best = _nearest(rows, np.linalg.norm(away, axis=1), height, feet.key, ON_SIDE * self.stride)
+        distance = np.linalg.norm(points[rows] - answer.foot, axis=1)
+        best = _nearest(rows, distance, feet.facing, feet.key, ON_SIDE * self.stride)
         return FacetProjection(*(getattr(answer, f.name)[best] for f in fields(answer))), Feet._make(a[best] for a in feet)
 
     def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> Feet:
         """Project onto this rank's facets."""
+        facing = np.zeros(len(points))
         if facet is None:
             pairs, candidates = candidate_pairs(self.shape, data.x, points)
             xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
             tab = self.shape.tabulate(xi)
             away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
-            height = np.einsum("ng,ng->n", away, unit_normals(tab, x)) * self.facets.sign[candidates]
-            best = _nearest(pairs, np.sqrt(d2), height, self.facets.keys[candidates], ON_SIDE * self.stride)
-            facet, xi = candidates[best], xi[best]
+            facing = self._facing(tab, away, candidates, data)
+            best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride)
+            facet, xi, facing = candidates[best], xi[best], facing[best]
         elif xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
         of = self.facets
         return Feet(
             facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],
-            of.sign[facet], of.open_sides[facet], of.open_nodes[facet],
+            of.sign[facet], of.open_sides[facet], of.open_nodes[facet], facing,
         )  # fmt: skip
+
+    def _facing(self, tab: Tabulated, away: Array, facet: Ints, data: FacetData) -> Array:
+        """How squarely points are in front of facets, or behind them if they are inside the body, a length ``(n,)``.
+
+        It is the height over the facet's plane, from outside, and the depth below it from inside. With an edge or an inner place for its
+        closest point, the point is on that side of the surface on which it is of the facet that it is farther from. With a corner, where
+        facets may hide each other, all of them tell it together, unless the surface ends there.
+
+        Args:
+            tab: shape functions at the closest points of the facets.
+            away: ways from there to the points ``(n, gdim)``.
+            facet: this rank's numbers of the facets ``(n,)``.
+            data: this rank's facets.
+        """
+        n_corners = data.corner_normals.shape[1]
+        height = np.einsum("ng,ng->n", away, unit_normals(tab, data.x[facet])) * self.facets.sign[facet]
+        corner, is_open = tab.N[:, :n_corners] > 1 - ON_SIDE, self.facets.open_nodes[facet, :n_corners]
+        at_corner = corner & ~is_open
+        above = np.einsum("nc,ncg,ng->n", at_corner, data.corner_normals[facet], away)
+        # past the surface's end facets that share a corner there are faced alike
+        past = (corner & is_open).any(axis=1) & (np.abs(height) < SIDEWAYS * np.linalg.norm(away, axis=1))
+        return np.where(at_corner.any(axis=1), np.copysign(1.0, above) * height, np.where(past, 0.0, np.abs(height)))
 
     def _evaluate(self, points: Array, feet: Feet) -> FacetProjection:
         """Gap, normal and geometry at the feet of ``points (n, gdim)``."""
@@ -251,21 +283,22 @@ class MeshTarget:
         )
 
 
-def _nearest(points: Ints, distance: Array, height: Array, key: Ints, rounding: float) -> Ints:
+def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: float) -> Ints:
     """The nearest of several candidates for each point, as indices.
 
-    Outside a convex edge the facets that share it are equally near; the point is then above the one over which it is highest,
-    so that it cannot hover in the plane of another. What is still tied goes by the facets' keys, which no partition changes.
-    Lengths that differ by no more than ``rounding``, or by a small part of the distance, are equal.
+    The facets that share an edge are equally near to a point outside a convex edge, and to one behind a concave edge. The one that the
+    point faces most squarely counts: no point hovers in the plane of another one, and none is hidden there. What is still tied goes by
+    the facets' keys, which no partition changes. Lengths that differ by no more than ``rounding``, or by a small part of the distance,
+    are equal.
     """
     n = points.max(initial=-1) + 1
-    closest, highest = np.full(n, np.inf), np.full(n, -np.inf)
+    closest, most = np.full(n, np.inf), np.full(n, -np.inf)
     np.minimum.at(closest, points, distance)
     band = (EQUALLY_NEAR * closest + rounding)[points]
     farther = distance > closest[points] + band
-    np.maximum.at(highest, points, np.where(farther, -np.inf, height))
-    lower = height < highest[points] - band
-    order = np.lexsort((key, lower, farther, points))
+    np.maximum.at(most, points, np.where(farther, -np.inf, facing))
+    aslant = facing < most[points] - band
+    order = np.lexsort((key, aslant, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
 

@@ -90,6 +90,21 @@ class FacetShape:
         """Corners of a facet with an area in their order around it, in the sense of its parametrisation."""
         return [0, 1, 3, 2] if self.cell == "quadrilateral" else [0, 1, 2]
 
+    def corner_angles(self, x: Array) -> Array:
+        """Angles of facets ``x (n, nn, gdim)`` at their corners, 1 at either end of an interval ``(n, n_corners)``."""
+        if self.dim == 1:
+            return np.ones((len(x), 2))
+        ring, corners = self.ring, facet_shape(self.cell, 1).nodes
+        angles = np.empty((len(x), len(ring)))
+        for i, corner in enumerate(ring):
+            dN = self.tabulate(corners[corner][None]).dN[0]
+            ahead, back = (
+                x.transpose(0, 2, 1) @ (dN @ (corners[ring[j]] - corners[corner])) for j in ((i + 1) % len(ring), i - 1)
+            )
+            across = np.linalg.norm(np.cross(ahead, back), axis=1)
+            angles[:, corner] = np.arctan2(across, np.einsum("ng,ng->n", ahead, back))
+        return angles
+
     @property
     def middle(self) -> Array:
         """Reference midpoint ``(fdim,)``."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -23,17 +26,53 @@ def surface_nodes(config: Configuration, tag: Tag) -> Indices:
     return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
 
 
+class Areas:
+    """Integrals of the shape functions over a surface, before and after it was deformed.
+
+    Args:
+        config: configuration of the displacement.
+        tag: of the surface, or of points, which have no area.
+    """
+
+    def __init__(self, config: Configuration, tag: Tag):
+        self._config, self._tag = config, tag
+
+    def _integrals(self, stretch: Any, metadata: dict[str, int] | None = None) -> Any:
+        """Integrals of the shape functions times a factor, compiled."""
+        v = ufl.TestFunction(compat.function_space(self._config.mesh, self._config.degree))
+        return forms.form(v * stretch * forms.surface_measure(self._config.mesh, self._tag.entities, metadata))
+
+    def _assembled(self, form: Any) -> Array:
+        b = compat.create_vector(compat.function_space(self._config.mesh, self._config.degree))
+        forms.assemble_vector(b, form)
+        areas = np.array(b.array_r)
+        b.destroy()
+        return areas
+
+    @cached_property
+    def reference(self) -> Array:
+        """Over the surface as it was drawn, per local node ``(n_local,)`` (first call: collective)."""
+        if self._tag.dim == 0:
+            return np.zeros(self._config.n_local)
+        return self._assembled(self._integrals(1.0))
+
+    @cached_property
+    def _stretched(self) -> Any:
+        F = ufl.Identity(self._config.gdim) + ufl.grad(self._config.u)
+        # an area turns and stretches by the cofactors of F (Nanson)
+        n = ufl.cofac(F) * ufl.FacetNormal(self._config.mesh)
+        # which is no polynomial
+        return self._integrals(ufl.sqrt(ufl.dot(n, n)), {"quadrature_degree": 2 * self._config.degree + 1})
+
+    @property
+    def current(self) -> Array:
+        """Over the surface where it is now, per local node ``(n_local,)`` (collective)."""
+        return self.reference if self._tag.dim == 0 else self._assembled(self._stretched)
+
+
 def tributary_areas(config: Configuration, tag: Tag) -> Array:
     """Integral of each shape function over the reference surface, per local node; zero for points ``(n_local,)`` (collective)."""
-    if tag.dim == 0:
-        return np.zeros(config.n_local)
-    S = compat.function_space(config.mesh, config.degree)
-    v = ufl.TestFunction(S)
-    b = compat.create_vector(S)
-    forms.assemble_vector(b, forms.form(v * forms.surface_measure(config.mesh, tag.entities)))
-    areas = np.array(b.array_r)
-    b.destroy()
-    return areas
+    return Areas(config, tag).reference
 
 
 def followed_nodes(config: Configuration, dofs: Indices) -> npt.NDArray[np.bool_]:

@@ -63,7 +63,7 @@ class Elastic(ABC):
 
     def _check(self, u: Any) -> Any:
         """Identity of the displacement's dimension, which must fit the kind."""
-        gdim = len(u)
+        gdim = len(given.kind("u", u, isinstance(u, Expr) and len(u.ufl_shape) == 1, "a displacement, as a Function"))
         if (gdim == 3) != (self.kind == "3d"):
             fitting = "'3d'" if gdim == 3 else "'plane_strain' or 'plane_stress'"
             raise InputError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components: expected {fitting}")
@@ -143,6 +143,7 @@ class LinearElastic(Elastic):
 
     def strain(self, u: Any) -> Expr:
         """Symmetric gradient."""
+        self._check(u)
         return ufl.sym(ufl.grad(u))
 
     def _energies(self, u: Any) -> tuple[Expr, Expr]:
@@ -215,6 +216,8 @@ def check_parameter(what: str, value: Any, within: given.Range) -> None:
     Raises:
         InputTypeError, InputError: naming it and the first bad value.
     """
+    if isinstance(value, Expr):
+        given.kind(what, value, value.ufl_shape == (), "a scalar expression", "take a component, or make a scalar Function")
     if isinstance(value, fem.Function):
         values, comm = value.x.array, value.function_space.mesh.comm
         bad = values[~within.holds(values)] if values.any() else values[:0]
@@ -222,9 +225,7 @@ def check_parameter(what: str, value: Any, within: given.Range) -> None:
         agree(comm, InputError(f"the Function {words}") if len(bad) else None)
     elif isinstance(value, fem.Constant):
         given.number(what, np.asarray(value.value)[()], within)
-    elif isinstance(value, Expr):
-        given.kind(what, value.ufl_shape, value.ufl_shape == (), "a scalar expression")
-    else:
+    elif not isinstance(value, Expr):
         given.number(what, value, within)
 
 
@@ -234,8 +235,17 @@ def green_lagrange(u: Any) -> Expr:
     return (G + G.T + G.T * G) / 2
 
 
+def material_of(f: Any) -> Any:
+    """The law with history that a Function is a field of, its reference if the law is gone; None if it is a field of none."""
+    law = getattr(f, "material", None)
+    return law if law is None else law() or law
+
+
 class HistoryMaterial(Protocol):
-    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity."""
+    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity.
+
+    The Functions that its forms hold may refer to it, weakly, by an attribute ``material``, and it to its displacement by ``u``.
+    """
 
     #: Committed Functions that the stress depends on, by name.
     history: dict[str, Any]

@@ -5,6 +5,7 @@ Stress and tangent enter forms as Functions known at quadrature points.
 
 from __future__ import annotations
 
+import weakref
 from functools import cached_property
 from typing import Any
 
@@ -155,6 +156,11 @@ class VonMises:
         )
         self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
 
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """Parameters at this rank's quadrature points, by name, each ``(n_points,)``."""
+        return {"E": self._E, "nu": self._nu, "yield_stress": self._yield_stress, "hardening": self._hardening}
+
     def _cellwise(self, name: str, value: Any, within: given.Range) -> Array:
         """Values of a parameter in ``cells``, refused on all ranks if they are out of range on any (collective)."""
         if not isinstance(value, fem.Function):
@@ -185,6 +191,9 @@ class VonMises:
         self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
         self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
         self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
+        # by which a problem that gets them in F knows that it needs this law
+        for f in (self.stress, self._s, self._a, self._c, self._m, *self.history.values()):
+            f.material = weakref.ref(self)
 
     def _lagrangian(self, u: Any) -> Expr:
         return ufl.sym(ufl.grad(u)) if self.strain == "small" else green_lagrange(u)

@@ -11,10 +11,12 @@ import ufl
 
 from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.form_checks import check_functional, check_linear
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
 
@@ -61,7 +63,7 @@ class EnergyBook(Closing):
 
     Raises:
         InputError, InputTypeError: for what is no problem, or no form of its kind.
-        SpaceError: if the problem has no dynamics.
+        SpaceError: if the problem has no dynamics, or a form is of another displacement, space or mesh.
         CheckpointError, OSError: see ``CsvTable``.
     """
 
@@ -78,11 +80,13 @@ class EnergyBook(Closing):
         if problem.dynamics is None:
             raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
         self.problem, self.dynamics = problem, problem.dynamics
-        for what, work, arguments in (("stored", stored, 0), ("external", external, 1)):
-            given.kind(what, work, work is None or isinstance(work, ufl.Form), "a UFL form, or None", "multiply it by ufl.dx")
-            if work is not None and len(work.arguments()) != arguments:
-                expected = "a functional, without" if arguments == 0 else "a form linear in a"
-                raise InputError(f"{what} has {len(work.arguments())} argument(s): expected {expected} test function")
+        with agreed(problem.comm):
+            if external is not None:
+                check_linear("external", external, problem.config.V)
+            if stored is not None:
+                check_functional("stored", stored, problem.config.mesh)
+            if stored is not None and problem.u not in stored.coefficients():
+                raise SpaceError("stored does not depend on the problem's displacement: expected the energy of its u")
         works = stored, external, self.dynamics.damping_form
         self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
         #: Rows written, in order.
@@ -119,10 +123,12 @@ class EnergyBook(Closing):
     def _read_forces(self) -> None:
         """Read the forces and the displacement of this instant (collective)."""
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
-        self._u, self._time = np.array(problem.u.x.array[:n]), self.dynamics.time
+        self._u, self._time, self._driven = np.array(problem.u.x.array[:n]), self.dynamics.time, self.dynamics.driven
         contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
         problem.forces.assemble()
-        reaction = (problem.forces.residual.array_r - contact) * ~problem.forces.free[: problem.config.n_owned].ravel()
+        # the work of supports on mass, where velocities jump, is what the mass has got
+        driving = problem.forces.residual.array_r - self.dynamics.forces.x.array[:n]
+        reaction = (driving - contact) * ~problem.forces.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])
@@ -149,9 +155,11 @@ class EnergyBook(Closing):
         Returns:
             The new row.
         """
-        u, forces, resultants, time = self._u, self._forces, self._resultants, self._time
+        u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
         self._read_forces()
-        self._works += self.problem.comm.allreduce(0.5 * (forces + self._forces) @ (self._u - u))
+        works = 0.5 * (forces + self._forces) @ (self._u - u)
+        works[1] += self._driven - driven
+        self._works += self.problem.comm.allreduce(works)
         self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
         return self._append(self._energies())
 

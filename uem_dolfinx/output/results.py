@@ -12,10 +12,11 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.files import aside, keep_aside, on_rank_0
-from uem_dolfinx.log import timed
-from uem_dolfinx.output.tables import Closing, CsvTable, given_path
-from uem_dolfinx.output.xdmf import XdmfSeries, geometry_degree
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
+from uem_dolfinx.form_checks import check_expression
+from uem_dolfinx.log import logger, timed
+from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -52,6 +53,8 @@ class HistoryWriter(Closing):
             columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
         self._progress = problem.progress
         self.table = CsvTable(path, problem.comm, columns, problem.progress if resume else None, key="step")
+        #: Time of the last row.
+        self._last = self.table.last.get(columns[0], -np.inf)
         #: Steps of the problem that the file knew all about when it was gone on with.
         self._known = problem.progress.steps if self.table.last else -1
 
@@ -61,11 +64,35 @@ class HistoryWriter(Closing):
         Args:
             step: a converged step; or its factor or time alone, which leaves the number of iterations empty.
         """
+        self.append(step, self.clock(step))
+
+    def clock(self, step: LoadStep | TimeStep | float) -> float:
+        """Factor or time of a step that is to be written (collective).
+
+        Raises:
+            InputError, InputTypeError: if it has none, it is not finite, differs from rank to rank, or is a time before the last one.
+            ValueError, CheckpointError: see ``CsvTable.check``.
+        """
         self.table.check()
+        what = self.table.columns[0]
+        with agreed(self.problem.comm):
+            time = given.number(what, clock(step))
+        given.alike(self.problem.comm, "write", **{what: time})
+        if self._progress.steps > self._known and time < self._last:
+            words = f"{what} = {time:.6g} is written after {self._last:.6g}"
+            if self.problem.dynamics is not None:
+                raise InputError(f"{words}: expected times that do not fall; write each step once, in the order of time")
+            if not isinstance(step, LoadStep):
+                logger.warning("%s: pictures over time need times that do not fall", words)
+        return time
+
+    def append(self, step: LoadStep | TimeStep | float, time: float) -> None:
+        """Append the row of a step, unless the file that is gone on with has it (collective)."""
         if self._progress.steps <= self._known:
             return
+        self._last = time
         iterations = step.newton_iterations if isinstance(step, (LoadStep, TimeStep)) else ""
-        row: list[object] = [clock(step), self._progress.steps, iterations]
+        row: list[object] = [time, self._progress.steps, iterations]
         for contact in self.problem.contacts:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
@@ -84,7 +111,8 @@ class ResultsWriter(Closing):
     names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree 2 is interpolated.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
-    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``::
+    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
+    writes them goes on there, and keeps others from going on with them until it has closed them or ended::
 
         with uem.Checkpoint("out/run.uem") as checkpoint:
             checkpoint.begin(problem.state())
@@ -104,7 +132,7 @@ class ResultsWriter(Closing):
     Raises:
         InputError, InputTypeError: for no path, no problem, or fields that are no UFL expressions by name.
         MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
-        OutputError: if the files cannot be written; the steps before stay.
+        OutputError: if the files cannot be written, the steps before stay; or if another run writes those to go on with.
         CheckpointError: if the files to go on with are of another run.
     """
 
@@ -121,13 +149,15 @@ class ResultsWriter(Closing):
         self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
         self._stem = given_path("path", path, comm)
         with agreed(comm):
-            _check_fields(fields)
+            _check_fields(fields, mesh)
             vtx = None if vtx is None else given.flag("vtx", vtx)
         if vtx:
             compat.require_vtx(path)
         self._expressions = dict(fields or {})
         spaces = {name: compat.function_space(mesh, ("DG", 0), e.ufl_shape) for name, e in self._expressions.items()}
         self._cellwise = {name: fem.Function(space, name=name) for name, space in spaces.items()}
+        from uem_dolfinx.output.xdmf import geometry_degree
+
         degree, sources = geometry_degree(mesh), self._sources()
         shapes = {u.ufl_shape: compat.function_space(mesh, degree, u.ufl_shape) for u in sources.values()}
         self._nodal = {name: fem.Function(shapes[u.ufl_shape], name=name) for name, u in sources.items()}
@@ -150,7 +180,8 @@ class ResultsWriter(Closing):
             begin = tuple(f"{self._stem.name}_{ending}." for ending in ENDINGS)
             own += [f for f in sorted(self._stem.parent.iterdir()) if f.name.startswith(begin) and f.suffix == ".bp"]
             xdmf, csv = self._name(".xdmf"), self._name(".csv")
-            if (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1):
+            written = (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1)
+            if written or in_use(xdmf) or in_use(csv):
                 keep_aside(self._stem, own)
 
         on_rank_0(self.problem.comm, f"the results {self._stem} cannot be written", move)
@@ -161,7 +192,13 @@ class ResultsWriter(Closing):
         self.history = HistoryWriter(self._name(".csv"), self.problem, resume=resume)
         nodal, cellwise = list(self._nodal.values()), list(self._cellwise.values())
         until = progress.steps if resume else None
-        self._xdmf = XdmfSeries(self._name(".xdmf"), self.problem.config.mesh, nodal, cellwise, until)
+        try:
+            from uem_dolfinx.output.xdmf import XdmfSeries
+
+            self._xdmf = XdmfSeries(self._name(".xdmf"), self.problem.config.mesh, nodal, cellwise, until)
+        except Exception:
+            self.history.close()
+            raise
         self._known = progress.steps if self._xdmf.n_steps else -1
         self._vtx: list[Any] | None = None
 
@@ -197,17 +234,20 @@ class ResultsWriter(Closing):
 
         Raises:
             OutputError: if it cannot be written.
+            InputError, InputTypeError: if ``step`` has no time, or one that is not finite, differs from rank to rank, or falls.
             CheckpointError: if a checkpoint was read after the writer had been made with ``resume=True``.
             ValueError: after ``close``.
         """
-        self.history.table.check()
+        time = self.history.clock(step)
         if self._undecided:
             self._undecided = False
+            self.history.close()
+            self._xdmf.close()
             self._make_way()
             self._open(False)
         if self._vtx is None:
             self._vtx = self._open_vtx()
-        time, steps = clock(step), self.problem.progress.steps
+        steps = self.problem.progress.steps
         if steps > self._known:
             with timed("write fields"):
                 for name, u in self._sources().items():
@@ -219,26 +259,28 @@ class ResultsWriter(Closing):
                 self._xdmf.write(time, steps)
                 for writer in self._vtx:
                     writer.write(time)
-        self.history.write(step)
+        self.history.append(step, time)
 
     def close(self) -> None:
         """Close all files (collective where there are VTX files)."""
         self.history.close()
+        self._xdmf.close()
         for writer in self._vtx or []:
             writer.close()
         self._vtx = []
 
 
-def _check_fields(fields: Any) -> None:
-    """Refuse fields that are no UFL expressions by name.
+def _check_fields(fields: Any, mesh: Any) -> None:
+    """Refuse fields that are no UFL expressions by name, on a mesh.
 
     Raises:
-        InputTypeError, InputError: naming the first bad one.
+        InputTypeError, InputError, SpaceError: naming the first bad one.
     """
     given.kind("fields", fields, fields is None or isinstance(fields, Mapping), "UFL expressions by name, as a dict, or None")
     for name, field in (fields or {}).items():
         given.name("the name of a field", name, "write _ for a blank")
         given.kind(f"fields[{name!r}]", field, hasattr(field, "ufl_shape"), "a UFL expression")
+        check_expression(f"fields[{name!r}]", field, mesh.ufl_domain(), "the displacement's mesh")
 
 
 def clock(step: LoadStep | TimeStep | float) -> float:

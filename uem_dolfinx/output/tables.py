@@ -4,30 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
-import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 from mpi4py import MPI
 
-from uem_dolfinx import given
-from uem_dolfinx.errors import CheckpointError, InputError
-from uem_dolfinx.files import aside, keep_aside, on_rank_0, replace_end
+from uem_dolfinx.errors import CheckpointError, UEMError
+from uem_dolfinx.files import OwnFile, begin_file, given_path, in_use, keep_aside, new_folder, on_rank_0
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agreed
-
-
-def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
-    """A path, the same on all ranks; InputTypeError or InputError if it is none (collective)."""
-    with agreed(comm):
-        given.kind(what, value, isinstance(value, (str, PathLike)), "the path of a file", "None is none")
-        if not Path(value).name:
-            raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
-    given.alike(comm, "files", **{what: str(value)})
-    return Path(value)
 
 
 class Clock(Protocol):
@@ -60,8 +46,8 @@ class CsvTable(Closing):
     """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
 
     A file that is gone on with stays as it is until the first row is written. A file that a new one would replace is kept in a folder
-    beside it, ``NAME.1`` or the next number, if it has any rows; so is a copy of one that would lose rows although no checkpoint was
-    read.
+    beside it, ``NAME.1`` or the next number, if it has any rows or another run still writes it, which goes on there; so is a copy of
+    one that would lose rows although no checkpoint was read.
 
     Args:
         path: name of the file; its folder is made.
@@ -72,7 +58,7 @@ class CsvTable(Closing):
         key: column that grows from row to row, by default the first.
 
     Raises:
-        OutputError: of rank 0, on all ranks, if the file cannot be written.
+        OutputError: of rank 0, on all ranks, if the file cannot be written, or another run writes the one to go on with.
         ValueError, CheckpointError: likewise, if the file to go on with holds what is no number, or has other columns.
     """
 
@@ -91,6 +77,8 @@ class CsvTable(Closing):
         self._resumed = 0 if self._clock is None else self._clock.resumed
         until: Any = resume_at if self._clock is None else self._clock.time
         self._closed = False
+        #: On rank 0.
+        self._file: OwnFile | None = None
         #: Where in the file the rows kept end, and whether later ones follow that would be lost.
         self._end, self._later = 0, False
         kept = self._on_rank_0(lambda: self._begin(until))
@@ -106,12 +94,16 @@ class CsvTable(Closing):
         """First and last row of a file to go on with; without one, begin a new file."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if until is not None and self.path.exists():
-            with self.path.open("r+", newline="", encoding="utf-8") as file:
-                kept = self._read(file, until)
+            self._file = OwnFile(self.path)
+            try:
+                kept = self._read(io.StringIO(self._file.read().decode(), newline=""), until)
+            except (UEMError, ValueError):
+                self.close()
+                raise
             return [*kept[:1], *kept[-1:]]
-        if self.path.is_file() and self.path.read_bytes().count(b"\n") > 1:
+        if self.path.is_file() and (self.path.read_bytes().count(b"\n") > 1 or in_use(self.path)):
             keep_aside(self.path.with_suffix(""), [self.path])
-        self.path.write_bytes(b"")
+        self._file = begin_file(self.path)
         self._put(self.columns)
         return []
 
@@ -144,7 +136,8 @@ class CsvTable(Closing):
         text = io.StringIO(newline="")
         csv.writer(text).writerow([repr(float(v)) if isinstance(v, float) else v for v in row])
         data = text.getvalue().encode()
-        replace_end(self.path, self._end, data)
+        assert self._file is not None
+        self._file.replace_end(self._end, data)
         self._end += len(data)
 
     def check(self) -> None:
@@ -168,9 +161,9 @@ class CsvTable(Closing):
 
         def append() -> None:
             if self._later and self._clock is not None and self._resumed == 0:
-                folder = aside(self.path.with_suffix(""))
-                folder.mkdir()
-                shutil.copy2(self.path, folder)
+                assert self._file is not None
+                folder = new_folder(self.path.with_suffix(""))
+                (folder / self.path.name).write_bytes(self._file.read())
                 logger.warning("%s: rows of an earlier run are kept in %s", self.path, folder)
             self._later = False
             if self._end == 0:
@@ -182,3 +175,5 @@ class CsvTable(Closing):
     def close(self) -> None:
         """Take no more rows."""
         self._closed = True
+        if self._file is not None:
+            self._file.close()

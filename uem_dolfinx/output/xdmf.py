@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import AnyArray
-from uem_dolfinx.errors import CheckpointError
-from uem_dolfinx.files import REMEDY, Trouble, on_rank_0, read_at, replace_end, write_at
+from uem_dolfinx.errors import CheckpointError, OutputError, UEMError
+from uem_dolfinx.files import REMEDY, OwnFile, Trouble, begin_file, on_rank_0
 from uem_dolfinx.restart.numbering import Numbering, n_cells, node_numbering
 
 #: XDMF's names of cells, by name and number of nodes.
@@ -77,7 +75,7 @@ class XdmfSeries:
             the first step is written. None begins new ones.
 
     Raises:
-        OutputError: if the files cannot be written.
+        OutputError: if the files cannot be written, or another run writes those to go on with.
         CheckpointError: if those to go on with hold other fields or another mesh.
     """
 
@@ -91,6 +89,9 @@ class XdmfSeries:
     ):
         self.path, self.comm, self._mesh = path, mesh.comm, mesh
         self._numbers = path.with_suffix(".bin")
+        #: The XDMF file on rank 0, and that of numbers on every rank.
+        self._text: OwnFile | None = None
+        self._bin: OwnFile | None = None
         S = compat.function_space(mesh, geometry_degree(mesh))
         known: dict[int, Numbering] = {}
         self._fields: list[tuple[fem.Function, str, Table]] = []
@@ -105,10 +106,20 @@ class XdmfSeries:
         self.n_steps = 0
         #: Where the last one ends in the XDMF file, and whether the files go on behind it.
         self._end, self._more = 0, False
-        if resume_at is None or not on_rank_0(self.comm, self._trouble, path.exists):
-            self._begin()
-        else:
-            self._go_on(resume_at)
+        try:
+            if resume_at is None or not on_rank_0(self.comm, self._trouble, path.exists):
+                self._begin()
+            else:
+                self._go_on(resume_at)
+        except Exception:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the files; others may go on with them."""
+        for file in (self._text, self._bin):
+            if file is not None:
+                file.close()
 
     @property
     def _trouble(self) -> str:
@@ -177,12 +188,24 @@ class XdmfSeries:
 
     # -- writing and going on ------------------------------------------------------------------------------------------
 
+    def _open(self, kind: type[UEMError] = OutputError, *, begin: bool = False) -> None:
+        """Open the file of numbers on every rank, a new one before others can see it (collective)."""
+        path = self._numbers.with_name(f".{self._numbers.name}.{self.comm.bcast(os.getpid())}") if begin else self._numbers
+        trouble = Trouble(self.comm, self._trouble, REMEDY, kind)
+        for first in (True, False):
+            with trouble:
+                if (self.comm.rank == 0) == first:
+                    self._bin = OwnFile(path, new=begin and first, locked=False)
+            trouble.agree()
+
     def _begin(self) -> None:
         """Begin new files with the mesh (collective)."""
+        self._open(begin=True)
 
         def begin() -> None:
-            self._numbers.write_bytes(b"")
-            self.path.write_bytes((HEAD_OF_FILE + TAIL).encode())
+            os.replace(self._bin.path, self._numbers)  # type: ignore[union-attr]
+            self._text = begin_file(self.path)
+            self._text.replace_end(0, (HEAD_OF_FILE + TAIL).encode())
 
         on_rank_0(self.comm, self._trouble, begin)
         self._end = len(HEAD_OF_FILE.encode())
@@ -190,17 +213,15 @@ class XdmfSeries:
 
     def _write(self, offset: int, tables: Sequence[Table]) -> None:
         """Write tables one after the other (collective)."""
+        assert self._bin is not None
         trouble = Trouble(self.comm, self._trouble)
-        with trouble:
-            file = MPI.File.Open(self.comm, str(self._numbers), MPI.MODE_CREATE | MPI.MODE_WRONLY)
-        trouble.agree()
         for table in tables:
             part = table.numbering.to_table(table.rows())
             with trouble:
-                write_at(file, offset + 8 * table.width * table.numbering.first, part)
+                self._bin.write_at(offset + 8 * table.width * table.numbering.first, part)
             offset += table.size
         with trouble:
-            file.Close()
+            self._bin.hand_over()
         trouble.agree()
 
     def _go_on(self, last: int) -> None:
@@ -209,7 +230,8 @@ class XdmfSeries:
         remedy = "choose another name, or move them away to start anew"
 
         def read() -> tuple[int, int, bool]:
-            text = self.path.read_text(encoding="utf-8")
+            self._text = OwnFile(self.path)
+            text = self._text.read().decode()
             steps = list(STEP.finditer(text))
             kept = [s for s in steps if int(s[2]) <= last]
             if not text.startswith(HEAD_OF_FILE) or any(
@@ -225,27 +247,28 @@ class XdmfSeries:
             return len(kept), len(known.encode()), text != known + TAIL
 
         self.n_steps, self._end, self._more = on_rank_0(self.comm, f"the results {self.path} cannot be gone on with", read)
+        self._open(CheckpointError)
+        assert self._bin is not None
         trouble = Trouble(self.comm, f"the results {self.path} cannot be read", REMEDY, CheckpointError)
-        with trouble:
-            file = MPI.File.Open(self.comm, str(self._numbers), MPI.MODE_RDONLY)
-        trouble.agree()
         offset = 0
         for table in (self._cells, self._nodes):
             part = table.numbering.to_table(table.rows())
             found = np.zeros_like(part)
             with trouble:
-                read_at(file, offset + 8 * table.width * table.numbering.first, found)
+                self._bin.read_at(offset + 8 * table.width * table.numbering.first, found)
                 if not np.array_equal(part, found):
                     raise CheckpointError(f"{other}: expected the mesh of this one, found another; {remedy}")
             offset += table.size
-        with trouble:
-            file.Close()
         trouble.agree()
 
-    def _cut(self) -> None:
-        """Cut the files behind the steps kept."""
-        replace_end(self.path, self._end, TAIL.encode())
-        os.truncate(self._numbers, self._start(self.n_steps))
+    def _make_ready(self) -> None:
+        """See, on rank 0, that the files are still this run's, and cut them behind the steps kept."""
+        assert self._text is not None and self._bin is not None
+        self._text.check()
+        self._bin.check(sized=False)
+        if self._more:
+            self._text.replace_end(self._end, TAIL.encode())
+            self._bin.truncate(self._start(self.n_steps))
 
     @property
     def _names(self) -> str:
@@ -266,12 +289,11 @@ class XdmfSeries:
             OutputError: if they cannot be written; the steps before stay.
         """
         k = self.n_steps
-        if self._more:
-            on_rank_0(self.comm, self._trouble, self._cut)
-            self._more = False
+        on_rank_0(self.comm, self._trouble, self._make_ready)
+        self._more = False
         self._write(self._start(k), [table for _, _, table in self._fields])
         text = self._describe(k, time, step).encode()
-        on_rank_0(self.comm, self._trouble, lambda: replace_end(self.path, self._end, text + TAIL.encode()))
+        on_rank_0(self.comm, self._trouble, lambda: self._text.replace_end(self._end, text + TAIL.encode()))  # type: ignore[union-attr]
         self._end += len(text)
         self.n_steps += 1
 

@@ -18,19 +18,21 @@ from typing import Any, NoReturn
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError
-from uem_dolfinx.files import REMEDY, Trouble, flush, read_at, write_at
+from uem_dolfinx.files import REMEDY, Trouble, flush, given_path, read_at, write_at
 from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.interruption import Interruption, end_run
 from uem_dolfinx.restart.numbering import DIGEST, fingerprint, hashes
 from uem_dolfinx.restart.state import State
 
 #: Version of the file's layout and of the names in it.
 #: [format; -; test_checkpoint_refused.py::test_another_format]
-FORMAT = 3
+FORMAT = 5
 #: What a checkpoint begins with.
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
@@ -50,9 +52,9 @@ def write_checkpoint(path: str | Path, state: State) -> None:
     Raises:
         CheckpointError: if the disk or the system refuses, or the state holds what a checkpoint cannot; an earlier file stays.
     """
-    path, comm = Path(path), state.comm
+    path, comm = _of_state(path, state)
     for hook in state.collect:
-        hook()
+        ask_together(comm, "a function in State.collect", hook)
     with timed("write checkpoint"):
         described, beside = state.describe(), _beside(path)
         trouble = _trouble(comm, f"the checkpoint {path} cannot be written", REMEDY)
@@ -74,7 +76,7 @@ def write_checkpoint(path: str | Path, state: State) -> None:
             end += width * entry.numbering.total
         content = {
             "state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers,
-            "steps": state.steps,
+            "steps": state.steps, "settings": state.settings,
         }  # fmt: skip
         with trouble:
             if comm.rank == 0:
@@ -107,9 +109,9 @@ def read_checkpoint(path: str | Path, state: State) -> None:
     Raises:
         CheckpointError: naming the file, what was expected of it, what was found and what to do.
     """
-    path, comm = Path(path), state.comm
+    path, comm = _of_state(path, state)
     for hook in state.collect:
-        hook()
+        ask_together(comm, "a function in State.collect", hook)
     with timed("read checkpoint"):
         trouble = _trouble(comm, f"the checkpoint {path} cannot be read", "check its rights, or go on from another one")
         content: dict[str, Any] = {}
@@ -118,6 +120,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         trouble.agree()
         content = comm.bcast(content)
         _compare(path, content["state"], state.describe())
+        _compare_settings(path, content["settings"], state.settings)
         with trouble:
             file = MPI.File.Open(comm, str(path), MPI.MODE_RDONLY)
         trouble.agree()
@@ -139,7 +142,16 @@ def read_checkpoint(path: str | Path, state: State) -> None:
     for contact in state.contacts:
         contact.pair.project()
     for hook in state.restore:
-        hook()
+        ask_together(comm, "a function in State.restore", hook)
+
+
+def _of_state(path: Any, state: Any) -> tuple[Path, MPI.Comm]:
+    """The path of a checkpoint, and the communicator of its state; InputTypeError or InputError if they are none (collective)."""
+    given.kind("state", state, isinstance(state, State), "a State, as problem.state()")
+    with agreed(state.comm):
+        for name, f in state.functions.items():
+            given.kind(f"functions[{name!r}]", f, isinstance(f, fem.Function), "a Function", "numbers belong to numbers")
+    return given_path("path", path, state.comm), state.comm
 
 
 def _beside(path: Path) -> Path:
@@ -235,6 +247,20 @@ def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> Non
             )
 
 
+def _compare_settings(path: Path, found: dict[str, str], expected: dict[str, str]) -> None:
+    """Refuse a checkpoint of a run that was made with something else by a CheckpointError that names all that differs."""
+    others = [
+        f"{name} (now {expected.get(name)}, then {found.get(name)})"
+        for name in [*expected, *found]
+        if found.get(name) != expected.get(name)
+    ]
+    if found and expected and others:
+        raise CheckpointError(
+            f"the checkpoint {path} belongs to a run with other settings: {'; '.join(dict.fromkeys(others))}; go on with those that it "
+            "was written with, or remove it to start anew; to change them on purpose, clear the settings of problem.state()"
+        )
+
+
 class Checkpoint:
     """Keeps a run's state in a file, so that the same script goes on where it was killed.
 
@@ -257,6 +283,7 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | Path, *, every: int = 100):
+        given.kind("path", path, isinstance(path, (str, os.PathLike)), "the path of a file")
         self.path, self.every = Path(path), given.count("every", every)
         self._state: State | None = None
         #: Signals that ask the run to end.
@@ -269,8 +296,12 @@ class Checkpoint:
             Whether the state is that of the file now.
 
         Raises:
-            CheckpointError: if there is a file that is damaged or belongs to another run.
+            CheckpointError: if there is a file that is damaged or belongs to another run, or if the checkpoint has begun with the
+                state of another problem.
         """
+        given.kind("state", state, isinstance(state, State), "a State, as problem.state()")
+        if self._state is not None:
+            self.check(*state.functions.values())
         self._state, comm, found = state, state.comm, False
         trouble = _trouble(comm, f"what a killed run left beside {self.path} cannot be removed", "check the rights of the folder")
         with trouble:
@@ -283,6 +314,14 @@ class Checkpoint:
         read_checkpoint(self.path, state)
         logger.warning("going on from the checkpoint %s; remove it to start anew", self.path)
         return True
+
+    def check(self, *functions: Any) -> None:
+        """Refuse Functions none of which is in the state that is kept, by a CheckpointError: those of another problem."""
+        kept = [] if self._state is None else list(self._state.functions.values())
+        if functions and not any(f is known for f in functions for known in kept):
+            raise CheckpointError(
+                f"{self.path} keeps the state of another problem: make one Checkpoint, with a name of its own, for each problem"
+            )
 
     @property
     def begun(self) -> bool:

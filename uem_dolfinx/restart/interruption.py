@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
-from types import FrameType
-from typing import Any, NoReturn, Self
+from collections.abc import Callable
+from functools import wraps
+from types import FrameType, TracebackType
+from typing import Any, NoReturn, ParamSpec, Self, TypeVar
 
 from mpi4py import MPI
 
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import is_agreed, mark_as_agreed
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 #: Exit status of a run that has ended on SIGTERM, as shells have it.
 #: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
 TERMINATED = 128 + signal.SIGTERM
+#: Exit status of a run that Ctrl-C to one rank has ended between what is collective, as shells have it.
+#: [format; exit status; test_signals.py::test_one_rank_is_interrupted_before_the_steps]
+INTERRUPTED = 128 + signal.SIGINT
 #: What is noted, unless it is ignored.
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -94,8 +104,47 @@ class Interruption:
 
 
 def end_run(number: int, kept: str) -> NoReturn:
-    """End a run on a signal, with a word about what is kept: KeyboardInterrupt, or SystemExit with status 143."""
+    """End a run on a signal that all ranks know of, with a word about what is kept: KeyboardInterrupt, or SystemExit with status 143."""
     logger.warning("ended by %s; %s", signal.Signals(number).name, kept)
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt from None
-    raise SystemExit(TERMINATED) from None
+    raise mark_as_agreed(KeyboardInterrupt() if number == signal.SIGINT else SystemExit(TERMINATED)) from None
+
+
+def end_together(comm_of: Callable[..., MPI.Comm | None]) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorate what is collective and takes long, so that a signal to any rank within ends the run on all at its end.
+
+    Args:
+        comm_of: the communicator, from the same arguments; None if they are not what they should be.
+    """
+
+    def decorate(f: Callable[P, T]) -> Callable[P, T]:
+        @wraps(f)
+        def decorated(*args: P.args, **kwargs: P.kwargs) -> T:
+            try:
+                comm = comm_of(*args, **kwargs)
+            except TypeError:
+                comm = None
+            if comm is None:
+                return f(*args, **kwargs)
+            with Interruption() as noted:
+                result = f(*args, **kwargs)
+                number = noted.agreed(comm)
+            if number:
+                end_run(number, "no step has been made")
+            return result
+
+        return decorated
+
+    return decorate
+
+
+def _end_all_ranks(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Tell of an error that ends the script; where it is Ctrl-C on one rank, end the others, which would wait for it for ever."""
+    _tell(kind, error, trace)
+    if isinstance(error, KeyboardInterrupt) and not is_agreed(error) and not MPI.Is_finalized():
+        sys.stderr.flush()
+        MPI.COMM_WORLD.Abort(INTERRUPTED)
+
+
+_tell = sys.excepthook
+if MPI.COMM_WORLD.size > 1:
+    sys.excepthook = _end_all_ranks

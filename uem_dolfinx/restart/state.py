@@ -108,6 +108,7 @@ class State:
         numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
         collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
         restore: called on all ranks after reading, to go on from them.
+        settings: what the run is made with, by name; a file of other settings is refused, unless there are none on either side.
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """
 
@@ -118,6 +119,7 @@ class State:
     collect: list[Callable[[], None]] = field(default_factory=list)
     restore: list[Callable[[], None]] = field(default_factory=list)
     steps: int = 0
+    settings: dict[str, str] = field(default_factory=dict)
 
     @property
     def comm(self) -> MPI.Comm:

@@ -112,6 +112,11 @@ class ArcLength:
         return False
 
     @property
+    def convex(self) -> bool:
+        """The load follows: forces do not drive the bodies downhill."""
+        return False
+
+    @property
     def tolerant(self) -> bool:
         """The load increment changes with the tangent."""
         return True

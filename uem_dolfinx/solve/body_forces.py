@@ -72,6 +72,8 @@ class BodyForces:
         for bc in self.bcs:
             free[compat.bc_dofs(bc)[0]] = False
         self.free: Bools = free.reshape(-1, config.gdim)
+        if dynamics is not None:
+            dynamics.hold(~self.free[: config.n_owned])
         self.wanted: Array = np.array(config.displacement)
         self.stiffness: Array | None = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
@@ -93,6 +95,8 @@ class BodyForces:
                 material.update()
         except NotFiniteError:
             return False
+        if self.dynamics is not None:
+            self.dynamics.update_rates()
         with timed("assemble residual"):
             forms.assemble_vector(self._b, self._F)
             if self.dynamics is not None:

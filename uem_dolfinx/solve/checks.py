@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
 from ufl.constantvalue import ScalarValue
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
@@ -20,11 +19,13 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
+from uem_dolfinx.form_checks import check_linear
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
-    """Refuse what is no residual: no form, an energy, one of another space, or not linear in its test function.
+    """Refuse what is no residual: no form, an energy, one of another space or mesh, or not linear in its test function.
 
     Args:
         F: a UFL form.
@@ -34,29 +35,42 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
     Raises:
         InputTypeError, InputError, SpaceError: each with the remedy.
     """
-    if not isinstance(F, ufl.Form):
-        remedy = "integrate it: multiply it by ufl.dx" if isinstance(F, Expr) else "write it with ufl, and do not compile it"
-        given.kind(what, F, False, "a UFL form", remedy)
-    try:
-        arguments = F.arguments()
-        check_form_arity(ufl.algorithms.expand_derivatives(F), arguments)
-    except (ArityMismatch, ValueError) as error:
-        raise InputError(
-            f"{what} is not linear in its test function ({error}): expected every term to hold the test function once"
-        ) from error
-    if not arguments:
-        remedy = f"of an energy, take {what} = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))"
-        raise InputError(f"{what} is a functional, without test function: expected a form linear in one; {remedy}")
-    if len(arguments) > 1:
-        remedy = "put u in place of the TrialFunction"
-        raise InputError(f"{what} has {len(arguments)} arguments: expected a test function alone; {remedy}")
-    if arguments[0].ufl_function_space() != u.function_space:
-        raise SpaceError(
-            f"the test function of {what} belongs to another space than the displacement: expected ufl.TestFunction(u.function_space)"
-        )
+    check_linear(what, F, u.function_space)
     for part in chain.from_iterable(traverse_unique_terminals(integral.integrand()) for integral in F.integrals()):
         if isinstance(part, ScalarValue) and not np.isfinite(complex(part)):
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
+
+
+def check_materials(materials: Any, F: ufl.Form, u: fem.Function) -> list[HistoryMaterial]:
+    """The laws with history as a list: all that F is made of, each once, of this displacement.
+
+    Raises:
+        InputTypeError: if they are no list of laws with history.
+        InputError: if one stands in the list twice, F is not made of it, or F holds fields of one that is not in the list.
+        SpaceError: if one is of another displacement.
+    """
+    found: list[HistoryMaterial] = given.items(
+        "materials", materials, is_history_material, "a material with history, as VonMises"
+    )
+    for i, material in enumerate(found):
+        name = f"materials[{i}], {given.described(material)},"
+        if any(material is other for other in found[:i]):
+            raise InputError(f"{name} stands in the list before: expected each law once; make a law of its own for every body")
+        if getattr(material, "u", u) is not u:
+            raise SpaceError(f"{name} is of another displacement: expected the problem's u; make it with that")
+    fields = {id(law): f for f in F.coefficients() if (law := material_of(f)) is not None}
+    for i, material in enumerate(found):
+        tells = any(material_of(f) is material for f in material.history.values())
+        if fields.pop(id(material), None) is None and tells:
+            raise InputError(
+                f"F is not made of materials[{i}], {given.described(material)}: expected a term material.residual(v) in F"
+            )
+    for f in fields.values():
+        raise InputError(
+            f"F holds '{f.name}' of a law with history that is not in materials, and would stay as it is: expected all such laws; give "
+            "materials=[material], or F a copy of the field where that is meant"
+        )
+    return found
 
 
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:

@@ -11,12 +11,12 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.active_set import Wrong
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 
 
-def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
+def touch_ahead(forces: BodyForces, pairs: Sequence[Interface], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
     It saves the solve that would find them; who is wrong among them is released before anything moves. Contactors with friction are left
@@ -29,24 +29,24 @@ def touch_ahead(forces: BodyForces, pairs: Sequence[ContactPair], rigid: RigidMo
         place: projects all contactors.
     """
     config, comm = forces.config, forces.comm
-    known = comm.allreduce(any(pair.rough or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
+    known = comm.allreduce(any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
     if known or rigid is None:
         return
     place()
     free, prescribed = forces.free[: config.n_owned], forces.prescribed
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(comm.allreduce(np.abs(du).max(initial=0.0), op=MPI.MAX))
-    gaps = [pair.foreseen(du) for pair in pairs]
+    gaps = [pair.predicted(du) for pair in pairs]
     wrong = []
     for pair, gap in zip(pairs, gaps):
         none = np.zeros(len(pair.nodes))
-        wrong.append(pair.wrong(gap, none, none, none, near, False, du))
+        wrong.append(pair.wrong(gap, pair.traction._replace(lam=none), none, none, near, False, du))
     if comm.allreduce(any(w.enter.any() for w in wrong), op=MPI.LOR):
         for pair, first in zip(pairs, deepest_of(pairs, gaps, wrong)):
             pair.exchange(first, False)
 
 
-def deepest_of(pairs: Sequence[ContactPair], gaps: Sequence[Array], wrong: Sequence[Wrong]) -> list[Wrong]:
+def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], wrong: Sequence[Wrong]) -> list[Wrong]:
     """Of contactors that would all enter at once, those deep enough to touch at first, besides all that are released (collective).
 
     Args:

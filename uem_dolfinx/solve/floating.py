@@ -8,6 +8,7 @@ statically determinate way, where the reaction is zero.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from mpi4py import MPI
 
@@ -15,28 +16,27 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.active_set import TOUCHING
+from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.log import logger
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
+from uem_dolfinx.solve.rigid_steps import least_motion, weighted
 
-#: Until contact has developed, motions that it resists with less than this part are held as well: a body that has touched ground
-#: with one or two nodes would else swing about them.
-#: [heuristic; size of the motion; -]
-HARDLY_HELD = 0.03
-#: Forces up to this part of all forces take a body no farther than ``SHORT_WAY`` of the model's size: on a single facet it would slide
-#: away as soon as the facet tilts in the least.
-#: [heuristic; sum of all forces; -]
-BARELY_LOADED = 1e-3
-#: See ``BARELY_LOADED``.
-#: [heuristic; the model's size; -]
-SHORT_WAY = 0.01
 #: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]
 FAR = 1e3
-#: A body that falls touches ground after so many stations at most.
-#: [bound; stations; -]
-MOST_STATIONS = 200
+#: Bodies turn by so much in a step, in radians, and go as far as their radius times that, or to where they touch first.
+#: [heuristic; radians; -]
+TURN = 0.3
+#: Bodies without loads are as light as this part of the most loaded one: what touches them pushes them aside.
+#: [bound; the largest load; -]
+LIGHT = 1e-3
+#: A body that falls comes to rest in so many steps at most.
+#: [bound; steps; -]
+MOST_RIGID_STEPS = 200
+#: What an equation is of: a contactor in front of its target, one that follows it, one that friction holds.
+AHEAD, UNITED, HELD = range(3)
 
 
 class FloatingBodies:
@@ -51,7 +51,7 @@ class FloatingBodies:
         motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
-    def __init__(self, forces: BodyForces, pairs: Sequence[ContactPair]):
+    def __init__(self, forces: BodyForces, pairs: Sequence[Interface]):
         self._forces, self._pairs = forces, pairs
         config, dynamics = forces.config, forces.dynamics
         self.rigid: RigidMotions | None = None
@@ -70,8 +70,6 @@ class FloatingBodies:
         self._open: Array = np.zeros((0, 0))
         #: Likewise with those that friction alone resists, where all contactors slip.
         self._sliding: Array = np.zeros((0, 0))
-        #: Whether contact has yet to develop in this step.
-        self._developing = False
 
     def begin_step(self, place: Callable[[], None]) -> None:
         """Let bodies fall until they touch; ``place`` projects all contactors (collective).
@@ -81,10 +79,9 @@ class FloatingBodies:
         """
         if self._forces.dynamics is not None:
             self.motions = self._in_motion if self._forces.dynamics.moving else self._at_rest
-        self._developing = self.motions is not None
         if self.motions is not None:
             self.motions.forget_supports()
-            self._fall(place, freely=True, small_loads=False)
+            self._fall(place, freely=True)
 
     def begin_motion(self) -> None:
         """Take the motions of a step in time for the first acceleration."""
@@ -108,10 +105,9 @@ class FloatingBodies:
         """
         if self.motions is None:
             return free
-        resistance = HARDLY_HELD if self._developing else OPEN
-        self._open = self._sliding = self.motions.open_motions(resisting, resistance)
+        self._open = self._sliding = self.motions.open_motions(self._rates(resisting))
         if resisting is not equations:
-            self._sliding = self.motions.open_motions(equations, resistance)
+            self._sliding = self.motions.open_motions(self._rates(equations))
         return free & ~self.motions.supports(self._sliding, equations)
 
     def slide(self, driving: Array, forces: Array) -> Array | None:
@@ -147,16 +143,8 @@ class FloatingBodies:
         """
         if self.motions is None:
             return False
-        more = False
-        if self._developing and settled and not changed:
-            # go on if more was held than must be
-            self._developing = False
-            more = self._open.shape[1] > self.motions.open_motions(self._equations()).shape[1]
-        if changed or more or settled:
-            # a body that has lost its hold on the way falls only when the others have come to rest
-            freely = not (changed or more)
-            more |= self._fall(place, freely=freely, small_loads=freely)
-        return more
+        # a body that has lost its hold on the way falls only when the others have come to rest
+        return (changed or settled) and self._fall(place, freely=not changed)
 
     def without_open_motions(self, du: Array) -> Array:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
@@ -164,17 +152,17 @@ class FloatingBodies:
             return du
         return du - self.motions.part(self._sliding, du.reshape(-1, self._forces.config.gdim)).ravel()
 
-    def _equations(self) -> UnitingEquations:
-        """Uniting equations of all pairs, the derivatives of their gaps."""
-        return UnitingEquations.join([pair.equations().resisting for pair in self._pairs], self._forces.config.gdim)
+    def _rates(self, equations: UnitingEquations) -> Any:
+        """Rates of the equations that hold, see ``RigidMotions`` (collective)."""
+        assert self.motions is not None
+        return self.motions.rates(equations.select(equations.active))
 
-    def _fall(self, place: Callable[[], None], freely: bool, small_loads: bool) -> bool:
+    def _fall(self, place: Callable[[], None], freely: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).
 
         Args:
             place: projects all contactors (collective).
             freely: otherwise they only take hold of what they touch already.
-            small_loads: follow small loads as well, to what is near.
 
         Returns:
             Whether any body has moved or touched something.
@@ -182,32 +170,99 @@ class FloatingBodies:
         Raises:
             FloatingBodyError: naming a body, and the motion that nothing stops.
         """
-        motions, config = self.motions, self._forces.config
+        motions = self.motions
         assert motions is not None
-        changed, motion = False, motions.every_motion[0]
-        for _ in range(MOST_STATIONS):
+        changed, before, damping = False, np.zeros(motions.count * motions.n_modes), np.ones(motions.count)
+        for _ in range(MOST_RIGID_STEPS):
             place()
             self._forces.assemble()
-            motion = motions.load(motions.open_motions(self._equations()), self._forces.residual.array_r.reshape(-1, config.gdim))
-            way = np.inf if motions.share > BARELY_LOADED else SHORT_WAY * config.size if small_loads else 0.0
-            if not motion.any() or not way:
-                return changed
-            motion /= np.linalg.norm(motion)
-            closing, distance = [], np.inf
             for pair in self._pairs:
-                ahead = pair.approach
-                rate = motions.rates(ahead) @ motion
-                # one that closes more slowly would not resist
-                closing.append(rate < -OPEN)
-                ways = np.where(rate < -OPEN, np.maximum(ahead.gap, 0.0) / np.maximum(-rate, OPEN), np.inf)
-                distance = min(distance, float(ways.min(initial=np.inf)))
-            distance = config.comm.allreduce(distance, op=MPI.MIN)
-            if not any([pair.activate_closing(c) for pair, c in zip(self._pairs, closing)]):
-                if not freely or way < distance:
-                    return changed
-                if np.isinf(distance):
-                    raise motions.error(motion)
-                # on curved surfaces the touch may come later than it seems; then the next station is nearer
-                motions.move(distance * motion)
-            changed = True
-        raise motions.error(motion)
+                pair.release_apart()
+            v, took = self._step(damping, freely)
+            changed |= took
+            if v is None:
+                return changed
+            motions.move(v)
+            back = (v * before).reshape(motions.count, -1).sum(axis=1) < 0
+            damping, before, changed = np.where(back, 0.5 * damping, np.minimum(1.0, 2.0 * damping)), v, True
+        raise motions.error(before)
+
+    def _step(self, damping: Array, freely: bool) -> tuple[Array | None, bool]:
+        """Contactors that touch and carry become active; an increment of all motions under the loads (collective).
+
+        Args:
+            damping: of every body's step, up to 1 ``(count,)``.
+            freely: see ``_fall``.
+
+        Returns:
+            The increment, None where contact holds the bodies, and whether any contactor has become active.
+
+        Raises:
+            FloatingBodyError: if the bodies move and no gap closes.
+        """
+        motions, config, comm = self.motions, self._forces.config, self._forces.comm
+        assert motions is not None
+        ahead = [pair.approach for pair in self._pairs]
+        united = [pair.equations().resisting for pair in self._pairs]
+        united = [e.select(e.active) for e in united]
+        rows = UnitingEquations.join(ahead + united, config.gdim)
+        kind = np.repeat(
+            [AHEAD] * len(ahead) + [HELD if pair.frictional else UNITED for pair in self._pairs], [len(e) for e in ahead + united]
+        )
+        R, force, scale = motions.rates(rows), *motions.forces(self._residual)
+        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._residual).any()
+        if not (loose or freely):
+            return None, False
+        # friction holds what sticks in all directions; contactors without it may part again
+        basis, n = motions.open_motions(R[kind == HELD]), motions.n_modes
+        f = basis @ (basis.T @ force)
+        size = np.linalg.norm(f.reshape(-1, n), axis=1)
+        motions.share = 0.0
+        if size.max() <= LOADED * scale:
+            return None, False
+        R, gap = R[kind != HELD], rows.gap[kind != HELD]
+        # as if each body were as heavy as its load, those without any hardly at all
+        weight, turn = np.maximum(size, LIGHT * size.max()), TURN * motions.radius
+        ways = self._ways(R, gap, f / np.repeat(weight, n))
+        shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
+        M = ((weight / damping)[:, None] / np.where(np.arange(n) < config.gdim, shift[:, None], turn[:, None])).ravel()
+        B = weighted(basis, M)
+        v, push = least_motion(comm, f, B, R, gap)
+        took = False
+        if loose:
+            free = B @ (B.T @ f)
+            carries = (push > 0) | ((R @ free < -OPEN * np.linalg.norm(free)) & (R @ v <= OPEN * np.linalg.norm(free)))
+            parts = np.split(carries[: sum(len(e) for e in ahead)], np.cumsum([len(e) for e in ahead])[:-1])
+            active = [pair.activate_closing(c) for pair, c in zip(self._pairs, parts)]
+            took = any(active)
+            if freely and any(a and pair.frictional for a, pair in zip(active, self._pairs)):
+                return np.zeros_like(v), True
+        if not freely:
+            return None, took
+        left = basis @ (basis.T @ (M * v))
+        motions.share = float(np.abs(left).max() / scale)
+        if np.abs(v).max() <= TOUCHING * config.size:
+            return None, took
+        # a step that no gap closes, nor takes a body out of an overlap, goes on for ever
+        rate, some = R @ v, OPEN * np.abs(v).max()
+        if not comm.allreduce(bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
+            raise motions.error(v)
+        return v, took
+
+    @property
+    def _residual(self) -> Array:
+        """Forces of the bodies at the owned nodes ``(n_owned, gdim)``."""
+        return np.asarray(self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))
+
+    def _ways(self, R: Any, gap: Array, v: Array) -> Array:
+        """How far bodies go in motions ``v (n_motions,)`` until the first of their gaps closes ``(count,)`` (collective)."""
+        motions = self.motions
+        assert motions is not None
+        ways, rate = np.full(motions.count, np.inf), R @ v
+        closing = np.flatnonzero(rate < -OPEN)
+        terms = R[closing].tocoo()
+        large = np.abs(terms.data) > OPEN
+        way = np.maximum(gap[closing], 0.0) / -rate[closing]
+        np.minimum.at(ways, terms.col[large] // motions.n_modes, way[terms.row[large]])
+        self._forces.comm.Allreduce(MPI.IN_PLACE, ways, op=MPI.MIN)
+        return ways

@@ -15,9 +15,9 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.arc_length import AlongArc
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.newton import Iteration
-from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
-from uem_dolfinx.solve.stepping import between_steps
+from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 
 
 def load_steps(
@@ -45,11 +45,11 @@ def load_steps(
         LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
+    check_steps(problem, checkpoint)
     with agreed(problem.comm):
         steps, arc_length = given.count("steps", steps), given.flag("arc_length", arc_length)
     given.alike(problem.comm, "load_steps", steps=steps, arc_length=arc_length)
-    if checkpoint is not None and not checkpoint.begun:
-        checkpoint.begin(problem.state())
+    begin_checkpoint(checkpoint, problem.state, problem.u)
     made = _load_steps(problem, steps, AlongArc(problem) if arc_length else ByLoad(problem))
     return between_steps(problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint)
 

@@ -5,25 +5,26 @@ The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics al
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.errors import ConvergenceError, FrictionError, InvertedElementError, NotFiniteError, PrecisionError
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; -]
 STALLED = 0.5
-#: The active set of a linearised problem settles within so many exchanges, or the step is cut.
-#: [bound; exchanges; -]
-MOST_EXCHANGES = 100
 #: Shortest step of the line search.
 #: [bound; halvings of a step; -]
 SHORTEST_SEARCH = 1.0 / 64
+#: Longest step where forces drive the bodies on.
+#: [bound; doublings of a step; -]
+LONGEST_SEARCH = 64.0
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 ENOUGH_DECREASE = 0.9
@@ -134,6 +135,10 @@ class UnitedSystem(Protocol):
         """Whether an iteration follows that makes up for what a solve leaves, so that none need be exact."""
 
     @property
+    def convex(self) -> bool:
+        """Whether the tangent leaves out what could make it indefinite, so that steps are no longer than forces drive the bodies."""
+
+    @property
     def in_contact(self) -> bool:
         """Whether there are contacts at all."""
 
@@ -160,9 +165,10 @@ class UnitedSystem(Protocol):
         """Norm of the forces at those nodes where they are told from rounding."""
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
-        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none.
+        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if none is to change.
 
-        ``du`` solves the linearised problem, but for this ``accuracy`` of a right-hand side of norm ``driving``.
+        ``du`` solves the linearised problem, but for this ``accuracy`` of a right-hand side of norm ``driving``. A ConvergenceError bounds
+        the number of states.
         """
 
     @property
@@ -210,7 +216,7 @@ def solve_united(
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
         forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
-        heed: called on all ranks between iterations; what it raises ends the loop.
+        heed: called on all ranks after every linear solve; what it raises ends the loop.
 
     Returns:
         The history; its last entry is the converged state.
@@ -234,7 +240,8 @@ def solve_united(
             "check loads, material parameters and the initial displacement for NaN and division by zero"
         )
     for k in range(max_iterations + 1):
-        state = system.unite(settled)
+        with _told(history):
+            state = system.unite(settled)
         if k == 0:
             # a displacement that comes back to nothing keeps the rounding of what it was
             start, left = state.norm, min(state.rounding, rtol * forces_before)
@@ -267,20 +274,13 @@ def solve_united(
             wanted, left_anyway = rtol * forces, newton if k > 0 else ACCURACY_ON_THE_WAY
         else:
             wanted = left_anyway = 0.0
-        step = _solve_linearised(system, state, wanted, left_anyway)
+        with _told(history):
+            step = _solve_linearised(system, state, wanted, left_anyway, heed)
         residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
         changed = state.changed or step.exchanges > 0
         history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
         _report(history, verbose)
-        if step.du is None:
-            error = FrictionError if system.rough else ConvergenceError
-            raise error(
-                f"the active set does not settle in {MOST_EXCHANGES} exchanges: take smaller load steps, or a target of finer facets",
-                history,
-            )
         length = _advance(system, step.state, step.rhs, step.dq, step.du, line_search)
-        if heed is not None:
-            heed()
     last = history[-1]
     raise ConvergenceError(
         f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
@@ -297,6 +297,16 @@ def _no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
     )
 
 
+@contextmanager
+def _told(history: list[Iteration]) -> Iterator[None]:
+    """Give the history to errors that do not know it."""
+    try:
+        yield
+    except ConvergenceError as error:
+        error.history = list(history)
+        raise
+
+
 @dataclass(frozen=True)
 class _Step:
     """Solution of a linearised problem.
@@ -305,7 +315,7 @@ class _Step:
         state: with the active set that its solution agrees with.
         rhs: right-hand side of the last solve.
         dq: its unknowns.
-        du: its increment; None if the active set did not settle.
+        du: its increment.
         driving: norm of ``rhs``.
         linear_iterations: of all solves.
         exchanges: number of solves after the first.
@@ -314,13 +324,15 @@ class _Step:
     state: IterationState
     rhs: PETSc.Vec
     dq: PETSc.Vec
-    du: PETSc.Vec | None
+    du: PETSc.Vec
     driving: float
     linear_iterations: int
     exchanges: int
 
 
-def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float) -> _Step:
+def _solve_linearised(
+    system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float, heed: Callable[[], None] | None
+) -> _Step:
     """Solve the linearised problem together with the conditions of contact; nothing moves.
 
     Args:
@@ -328,9 +340,10 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
         state: to begin with.
         wanted: norm of the residual that convergence asks for; zero where solves are to be exact.
         left_anyway: part of the right-hand side that solves may leave, since another iteration follows in any case.
+        heed: see ``solve_united``.
     """
-    iterations, du = 0, None
-    for exchanges in range(MOST_EXCHANGES + 1):
+    iterations, exchanges, du = 0, 0, None
+    while True:
         rhs = system.linearise(state)
         driving = rhs.norm()
         needed = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
@@ -339,8 +352,10 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
         first = ACCURACY_OF_EXCHANGES if system.inexact and system.in_contact else needed
         near = None if du is None else state.trial.reduce(du)
         for accuracy in (first, needed) if first > needed else (needed,):
-            dq, count = system.solve(rhs, accuracy, near)
-            iterations += count
+            dq, solves = system.solve(rhs, accuracy, near)
+            iterations += solves
+            if heed is not None:
+                heed()
             driving = max(driving, rhs.norm())
             du, near = system.move(state, dq), dq
             better = system.exchange(state, du, driving, accuracy)
@@ -348,8 +363,7 @@ def _solve_linearised(system: UnitedSystem, state: IterationState, wanted: float
                 break
         if better is None:
             return _Step(state, rhs, dq, du, driving, iterations, exchanges)
-        state = better
-    return _Step(state, rhs, dq, None, driving, iterations, MOST_EXCHANGES)
+        state, exchanges = better, exchanges + 1
 
 
 def _advance(
@@ -374,7 +388,10 @@ def _advance(
         elif system.assemble_residual():
             residual = system.reduced_residual(state)
             less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
-            if last or less_work or residual.norm() <= ENOUGH_DECREASE * norm:
+            downhill = system.convex and dq.dot(residual) < 0.0
+            if downhill and not less_work and length == 1.0:
+                length = _downhill(system, state, start, dq, du)
+            if last or less_work or downhill or residual.norm() <= ENOUGH_DECREASE * norm:
                 break
         elif last:
             break
@@ -382,6 +399,18 @@ def _advance(
     system.place(returning=length == 1.0)
     if not system.assemble_residual():
         raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+    return length
+
+
+def _downhill(system: UnitedSystem, state: IterationState, start: PETSc.Vec, dq: PETSc.Vec, du: PETSc.Vec) -> float:
+    """Go on as long as forces still drive the bodies that way, and displace them: the length taken, of 1, 2, 4 ... up to a bound."""
+    length = 1.0
+    while length < LONGEST_SEARCH:
+        system.displace(start, du, 2.0 * length)
+        if system.inverted() is not None or not system.assemble_residual() or dq.dot(system.reduced_residual(state)) >= 0.0:
+            break
+        length *= 2.0
+    system.displace(start, du, length)
     return length
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.checks import CORNER
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.crossings import Crossings, find_crossings
@@ -35,7 +35,7 @@ LOOKING_AWAY = -0.5
 
 
 def refuse_passages(
-    config: Configuration, pairs: Sequence[ContactPair], start: Array, motions: Sequence[Motion | None], moving: bool = False
+    config: Configuration, pairs: Sequence[Interface], start: Array, motions: Sequence[Motion | None], moving: bool = False
 ) -> None:
     """Refuse a step that leads a contactor through its target (collective).
 
@@ -70,23 +70,24 @@ def refuse_passages(
         else:
             depth, behind = _through_surface(pair, ways[k][0], motion, longest, moving)
             unsure = np.zeros(len(depth))
-        _refuse(pair, depth, "passes through the target within a step, {:.4g} inside on its way")
+        _refuse(pair, depth, "passes through the target within a step, {:.4g} inside on its way", moving)
         behind = np.where(behind > PASSAGE_DEPTH * pair.target.stride, behind, 0.0)
-        _refuse(pair, behind, "touches the target from behind after a step, {:.4g} inside on its way")
-        _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away")
+        _refuse(pair, behind, "touches the target from behind after a step, {:.4g} inside on its way", moving)
+        _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away", moving)
 
 
-def _refuse(pair: ContactPair, by: Array, how: str) -> None:
-    """Raise if a contactor has passed, by a length that is positive ``(n,)`` (collective)."""
+def _refuse(pair: Interface, by: Array, how: str, moving: bool) -> None:
+    """Raise if a contactor has passed, by a length that is positive ``(n,)``; ``moving`` as of ``refuse_passages`` (collective)."""
     error = None
     if (by > 0.0).any():
         i = int(np.argmax(by))
         where = pair.config.describe(int(pair.nodes[i]))
-        error = TunnellingError(f"{pair.name}: the contactor at {where} {how.format(by[i])}: take smaller steps")
+        advice = "" if moving else ", or give the bodies inertia if they snap from one equilibrium to another"
+        error = TunnellingError(f"{pair.name}: the contactor at {where} {how.format(by[i])}: take smaller steps{advice}")
     agree(pair.config.comm, error)
 
 
-def _ways(pair: ContactPair, du: Array, motion: Motion | None) -> tuple[Array, Array]:
+def _ways(pair: Interface, du: Array, motion: Motion | None) -> tuple[Array, Array]:
     """Ways of the contactors, relative to a rigid target, and of the nodes of a meshed one, ``(n, gdim)`` each."""
     way, now = du[pair.nodes], pair.target.motion
     if motion is not now:
@@ -99,7 +100,7 @@ def _ways(pair: ContactPair, du: Array, motion: Motion | None) -> tuple[Array, A
 # -- meshed targets ------------------------------------------------------------------------------------------------------
 
 
-def _through_mesh(pair: ContactPair, target: MeshTarget, start: Array, du: Array, moving: bool) -> Array:
+def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, moving: bool) -> Array:
     """How deep contactors that pass are in a mesh, from displacements ``du (n_local, gdim)`` relative to its mean ``(n,)`` (collective)."""
     comm, points, way = pair.config.comm, pair.points, du[pair.nodes]
     moved = du[target.dofs]
@@ -159,7 +160,7 @@ def _entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
     return entry, leaving, np.setdiff1d(outs, leaving)
 
 
-def _normals_at_start(pair: ContactPair, start: Array, who: Ints) -> Array:
+def _normals_at_start(pair: Interface, start: Array, who: Ints) -> Array:
     """Normals of the target at contactors ``who (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
     with pair.config.at(start):
         p = pair.target.project(pair.points[who])
@@ -167,7 +168,7 @@ def _normals_at_start(pair: ContactPair, start: Array, who: Ints) -> Array:
     return np.where(began[:, None], p.normal, 0.0)
 
 
-def _came_from(pair: ContactPair, target: MeshTarget, start: Array) -> tuple[Array, Array]:
+def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array, Array]:
     """Where contactors that have come to a mesh in a step began (collective).
 
     Returns:
@@ -200,7 +201,7 @@ def _dot(a: Array, b: Array) -> Array:
 # -- other targets -------------------------------------------------------------------------------------------------------
 
 
-def _through_surface(pair: ContactPair, way: Array, motion: Motion | None, longest: float, moving: bool) -> tuple[Array, Array]:
+def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest: float, moving: bool) -> tuple[Array, Array]:
     """Contactors that pass through a surface without facets, by its gaps at places a stride apart (collective).
 
     Returns:

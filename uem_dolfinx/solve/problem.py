@@ -11,8 +11,9 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.contact.contact import Contact, check_new
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.checks import check_moved, check_new
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 from uem_dolfinx.errors import UEMError
@@ -20,14 +21,16 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
-from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material
+from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.checks import check_conditions, check_load, check_residual, check_values, set_constant
+from uem_dolfinx.solve.checks import check_conditions, check_load, check_materials, check_residual, check_values, set_constant
 from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
 from uem_dolfinx.solve.passages import refuse_passages
-from uem_dolfinx.solve.step_control import StepControl
+from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
 
@@ -55,7 +58,7 @@ class UnitedProblem:
             proportion, or a function of the factor that returns it; or one function of the factor that sets loads and Dirichlet
             values itself. None ramps the Dirichlet values only. In time steps the time takes the place of the factor.
         dynamics: mass, velocity and time integration; None is statics.
-        materials: laws with history in F, such as ``VonMises``.
+        materials: all laws with history that F is made of, such as ``VonMises``.
         newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
         consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
         line_search: shorten steps that invert cells or do not reduce the residual's work.
@@ -68,12 +71,15 @@ class UnitedProblem:
 
     Raises:
         InputError, InputTypeError: for what is of another type or out of its range, named with its value; on all ranks.
-        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, F does not depend on it, a Dirichlet condition
-            or the test function is of another space, or a contact belongs to another problem.
+        SpaceError: if ``u`` is no vector Lagrange Function of the mesh's dimension, F does not depend on it, a Dirichlet condition,
+            the test function or a law with history is of another one, F holds what is of another mesh, or a contact belongs to
+            another problem.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
+        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM meanwhile.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
 
+    @end_together(lambda self, F, u, **options: u.function_space.mesh.comm if isinstance(u, fem.Function) else None)
     def __init__(
         self,
         F: ufl.Form,
@@ -104,12 +110,13 @@ class UnitedProblem:
             bcs = check_conditions(self.config, bcs)
             self.contacts = given.items("contacts", contacts, lambda one: isinstance(one, Contact), "a Contact")
             check_new(self.contacts)
-            self.materials = given.items("materials", materials, is_history_material, "a material with history, as VonMises")
+            self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
+            given.kind("method", method, callable(method), "what makes a united system of bodies and contacts, as BodySystem")
             consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(
@@ -143,10 +150,20 @@ class UnitedProblem:
         self.progress = Progress()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
-        self._motions = self._rigid_motions()
-        self._largest_forces = 0.0
+        #: Where the rigid targets were then; None for those that had not moved, and for meshes.
+        self.motions = self._rigid_motions()
+        #: Norm of the largest forces of all steps, as far as they are told from rounding.
+        self.largest_forces = 0.0
+        #: What the last step began with, where its ramp began, how far it went, and whether something led its load.
+        from uem_dolfinx.solve.memory import Memory
+
+        self._before = Memory.of(self)
+        self._led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
         for contact in self.contacts:
             contact.begin()
+        from uem_dolfinx.solve.settings import Settings
+
+        self._settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics)
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -163,10 +180,45 @@ class UnitedProblem:
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
 
-        Arguments, return value and errors are those of :meth:`attempt`.
+        In the body of a loop over ``load_steps`` or ``time_steps`` it is equilibrium again at the step's load factor or time, under
+        loads, Dirichlet values and fields as they are now: the step is taken once more from the state that it began with, and what
+        comes of it takes its place. Histories of friction and plasticity, and velocities, are those of one step, however often it
+        is taken.
+
+        Arguments, return value and errors are those of :meth:`attempt`; a step that fails when it is taken again stays what it was.
+        KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
         """
-        history = self.attempt(start=start, fraction=fraction)
-        self.commit()
+        with self.progress.heeding(self.comm):
+            if self.progress.inside and start is None and fraction == 1.0:
+                return self._solve_again()
+            history = self.attempt(start=start, fraction=fraction)
+            self.commit()
+            return history
+
+    def _solve_again(self) -> list[Iteration]:
+        """Take the last step once more from the state that it began with, and commit it in its place (collective)."""
+        from uem_dolfinx.solve.memory import Memory, move_targets
+
+        led = start, fraction, arc = self._led
+        dynamics, now, moved, found = self.dynamics, Memory.of(self), self._rigid_motions(), np.array(self.u.x.array)
+        self._before.put_back(self)
+        move_targets(self, moved)
+        if arc:
+            # past a limit point the load alone would lead away
+            self.u.x.array[:] = found
+        if dynamics is not None:
+            dynamics.begin(dynamics.dt)
+        try:
+            history = self.attempt(start=start, fraction=fraction)
+        except UEMError:
+            now.put_back(self)
+            raise
+        finally:
+            self._led = led
+        self._keep()
+        if dynamics is not None:
+            # which may have been rounded to a multiple of the step
+            dynamics.time = now.dynamics[0]
         return history
 
     def attempt(
@@ -183,10 +235,16 @@ class UnitedProblem:
             The history of iterations.
 
         Raises:
+            InputError, InputTypeError: if ``start`` is no displacement array, or ``fraction`` no number.
             ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
             TunnellingError, UserFunctionError: after the committed state has been restored.
         """
-        start = self.committed if start is None else start
+        for pair in self.pairs:
+            check_moved(pair)
+        self._led = start, fraction, along is not None
+        with agreed(self.comm):
+            start = self.committed if start is None else given.vector("start", start, len(self.committed))
+            fraction = given.number("fraction", fraction)
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.forces.bcs)
         with agreed(self.comm):
@@ -200,20 +258,37 @@ class UnitedProblem:
                 max_iterations=self.max_iterations,
                 line_search=self.line_search and along is None,
                 verbose=self.verbose,
-                forces_before=self._largest_forces,
+                forces_before=self.largest_forces,
                 heed=lambda: self.progress.heed(self.comm),
             )
             self.system.end_step()
-            refuse_passages(self.config, self.pairs, self.committed, self._motions, moving=self.dynamics is not None)
-        except UEMError:
+            refuse_passages(self.config, self.pairs, self.committed, self.motions, moving=self.dynamics is not None)
+        except UEMError as error:
             self.restore()
+            if isinstance(error, MENDABLE):
+                self._name_corner(error)
             raise
         return history
 
+    def _name_corner(self, error: UEMError) -> None:
+        """Tell in an error of a convex corner of a target inside contactors, if there is one (collective)."""
+        for contact in self.contacts:
+            corner = contact.corner_inside(self.forces.stiffness)
+            if corner is not None:
+                error.amend(f"{contact.name}: {corner}")
+                return
+
     def commit(self) -> None:
         """Keep the present displacement and contact state."""
+        from uem_dolfinx.solve.memory import Memory
+
+        self._before = Memory.of(self)
+        self._keep()
+        self.progress.steps += 1
+
+    def _keep(self) -> None:
         self.committed = np.array(self.u.x.array)
-        self._largest_forces = max(self._largest_forces, self.system.forces_told_apart())
+        self.largest_forces = max(self.largest_forces, self.system.forces_told_apart())
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:
@@ -221,10 +296,10 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
-        self._motions = self._rigid_motions()
-        self.progress.steps += 1
+        self.motions = self._rigid_motions()
         for contact in self.contacts:
             contact.look_at_ends()
+            contact.look_at_corners(self.forces.stiffness)
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -251,15 +326,16 @@ class UnitedProblem:
         else:
             d = self.dynamics
             functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
+            functions["mean velocity"] = d.mean_velocity
         for i, material in enumerate(self.materials, 1):
             functions |= {f"{name} {i}": f for name, f in material.history.items()}
-        state = State(self.config.mesh, functions, self.contacts)
+        state = State(self.config.mesh, functions, self.contacts, settings=self._settings.describe(self.comm))
 
         def collect() -> None:
             known = self.forces.to_checkpoint(stiffness)
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
-            state.numbers |= {"largest forces": self._largest_forces, "stiffness known": known}
+            state.numbers |= {"largest forces": self.largest_forces, "stiffness known": known}
             state.numbers |= self.progress.to_checkpoint(ramped)
             if ramped and self.progress.ramp:
                 start.x.array[:] = self.progress.start
@@ -267,8 +343,8 @@ class UnitedProblem:
                 state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
         def restore() -> None:
-            self.committed, self._motions = np.array(self.u.x.array), self._rigid_motions()
-            self._largest_forces = state.numbers["largest forces"]
+            self.committed, self.motions = np.array(self.u.x.array), self._rigid_motions()
+            self.largest_forces = state.numbers["largest forces"]
             self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             self.progress.from_checkpoint(state.numbers, start.x.array if ramped else None)
             if self.dynamics is not None:
@@ -294,10 +370,21 @@ class UnitedProblem:
         return np.sum(self.comm.allgather(np.where(self.forces.free[nodes], 0.0, force).sum(axis=0)), axis=0)
 
     @property
-    def pairs(self) -> list[ContactPair]:
+    def pairs(self) -> list[Interface]:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
 
     def _rigid_motions(self) -> list[Motion | None]:
         """Where the rigid targets are now; None for those that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.pairs]
+
+
+def check_steps(problem: Any, checkpoint: Any) -> None:
+    """Refuse to step what is no problem, or with what is no checkpoint (collective where there is a problem).
+
+    Raises:
+        InputTypeError: naming it.
+    """
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    with agreed(problem.comm):
+        given.kind("checkpoint", checkpoint, checkpoint is None or isinstance(checkpoint, Checkpoint), "a Checkpoint, or None")

@@ -1,6 +1,13 @@
-"""Rigid motions of bodies: which of them conditions and contacts leave open, which are loaded, what holds the neutral ones."""
+"""Rigid motions of bodies: which of them conditions and contacts leave open, which are loaded, what holds the neutral ones.
+
+Matrices are sparse: a motion that nothing resists is of one body, and others are of bodies that touch each other.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import chain
+from typing import Any
 
 from mpi4py import MPI
 
@@ -28,7 +35,7 @@ class RigidMotions:
     """Rigid motions of the bodies of a scene that its Dirichlet conditions do not hold.
 
     A motion is a vector with as many entries per body as it has rigid-body modes: translations, then rotations about the body's
-    middle in units of its radius, so that all entries are lengths.
+    middle in units of its radius, so that all entries are lengths. Several motions are the columns of a sparse matrix.
 
     Args:
         config: configuration of the displacement.
@@ -73,55 +80,72 @@ class RigidMotions:
         """Rigid-body modes of one body."""
         return 3 if self.config.gdim == 2 else 6
 
-    @property
-    def every_motion(self) -> Array:
-        """All motions of all bodies ``(n_motions, n_motions)``."""
-        return np.eye(self.count * self.n_modes)
-
-    def _spread(self, values: Array, body: Ints) -> Array:
-        """Rows in all motions from rows in the modes of one body each ``(n, count * n_modes)``."""
-        rows = np.zeros((len(values), self.count, self.n_modes))
-        rows[np.arange(len(values)), body] = values
-        return rows.reshape(len(values), self.count * self.n_modes)
-
-    def rates(self, equations: UnitingEquations) -> Array:
-        """How fast each motion opens the gap of each equation ``(m, n_motions)`` (collective)."""
-        config, g = self.config, self.config.gdim
-        own = self._body[: config.n_owned]
-        x = self._places
-        known = config.ask_owners(equations.followed, np.column_stack([own, x]))
-        modes = self._modes(x[equations.node], own[equations.node])
-        rows = self._spread(np.einsum("nmg,ng->nm", modes, equations.direction), own[equations.node])
-        body = known[:, 0].astype(np.int64)
-        terms = np.einsum("nmg,ng->nm", self._modes(known[:, 1 : 1 + g], body), equations.coefficients)
-        return rows - sums_of_rows(equations.row * self.count + body, terms, len(rows) * self.count).reshape(rows.shape)
-
-    def open_motions(self, equations: UnitingEquations | None, resistance: float = OPEN) -> Array:
-        """Orthonormal motions that neither conditions nor active equations resist ``(n_motions, k)`` (collective).
+    def _spread(self, values: Array, body: Ints, row: Ints | None = None, number: int | None = None) -> Any:
+        """Rows in all motions: sums of rows in the modes of one body each.
 
         Args:
-            equations: of all contactors, or None.
-            resistance: what counts as none, as part of the motion's size.
+            values: rows in the modes of a body ``(n, n_modes)``.
+            body: which one ``(n,)``.
+            row: that each belongs to ``(n,)``; None numbers them.
+            number: of rows; None takes as many as there are values.
+
+        Returns:
+            Sparse matrix ``(number, n_motions)``.
+        """
+        from scipy.sparse import csr_matrix
+
+        n = self.n_modes
+        row = np.arange(len(values)) if row is None else row
+        at = np.repeat(row, n), (body[:, None] * n + np.arange(n)).ravel()
+        return csr_matrix((values.ravel(), at), shape=(len(values) if number is None else number, self.count * n))
+
+    def rates(self, equations: UnitingEquations) -> Any:
+        """How fast each motion opens the gap of each equation, a sparse matrix ``(m, n_motions)`` (collective)."""
+        config, g = self.config, self.config.gdim
+        own, x = self._body[: config.n_owned], self._places
+        known = config.ask_owners(equations.followed, np.column_stack([own, x]))
+        body = np.append(own[equations.node], known[:, 0].astype(np.int64))
+        modes = self._modes(np.concatenate([x[equations.node], known[:, 1 : 1 + g]]), body)
+        terms = np.einsum("nmg,ng->nm", modes, np.concatenate([equations.direction, -equations.coefficients]))
+        return self._spread(terms, body, np.append(np.arange(len(equations)), equations.row), len(equations))
+
+    def open_motions(self, rates: Any | None) -> Any:
+        """Orthonormal motions that neither conditions nor equations resist, a sparse matrix ``(n_motions, k)`` (collective).
+
+        Args:
+            rates: of this rank's equations ``(m, n_motions)``, or None.
         """
         if self.finite:
             self.middle = self._middles()
-        held = self._held()
-        resisted = held.T @ held
-        if equations is not None:
-            rows = self.rates(equations.select(equations.active))
-            resisted = resisted + rows.T @ rows
-        values, vectors = np.linalg.eigh(self.comm.allreduce(resisted))
-        return vectors[:, values < resistance**2]
+        body, modes, _ = self._held()
+        values, vectors = np.linalg.eigh(self.comm.allreduce(self._products(body, modes, modes)))
+        b, k = np.nonzero(values < OPEN**2)
+        free = self._spread(vectors[b, :, k], b).T.tocsc()
+        if rates is None:
+            return free
+        here = rates @ free
+        resisted = sum(self.comm.allgather((here.T @ here).tocsc()))
+
+        def least(blocks: Array) -> tuple[Array, Bools]:
+            values, vectors = np.linalg.eigh(blocks)
+            return vectors, values < OPEN**2
+
+        return (free @ by_block(resisted, least)).tocsc()
 
     def any_open(self) -> bool:
         """Whether the conditions leave any motion open (collective)."""
         return bool(self.open_motions(None).shape[1])
 
-    def _held(self) -> Array:
-        """How each motion moves the components with a Dirichlet condition ``(n, n_motions)``."""
+    def _held(self) -> tuple[Ints, Array, tuple[Ints, Ints]]:
+        """Components with a Dirichlet condition: bodies ``(n,)``, how their modes move them ``(n, n_modes)``, nodes and components."""
         i, c = np.nonzero(~self.free)
         body = self._body[i]
-        return self._spread(self._modes(self._places[i], body)[np.arange(len(i)), :, c], body)
+        return body, self._modes(self._places[i], body)[np.arange(len(i)), :, c], (i, c)
+
+    def _products(self, body: Ints, a: Array, b: Array) -> Array:
+        """Sums of the products of rows of ``a (n, j)`` and ``b (n, k)`` body by body ``(count, j, k)``."""
+        sums = sums_of_rows(body, (a[:, :, None] * b[:, None, :]).reshape(len(a), a.shape[1] * b.shape[1]), self.count)
+        return sums.reshape(self.count, a.shape[1], b.shape[1])
 
     def following(self, prescribed: Array) -> Array:
         """The motion that follows the Dirichlet conditions by least squares; what they leave open rests (collective).
@@ -131,15 +155,15 @@ class RigidMotions:
         """
         if self.finite:
             self.middle = self._middles()
-        held = self._held()
-        gram, along = self.comm.allreduce(held.T @ held), self.comm.allreduce(held.T @ prescribed[~self.free])
-        return np.asarray(np.linalg.pinv(gram, OPEN**2, hermitian=True) @ along)
+        body, modes, at = self._held()
+        sums = self._products(body, modes, np.column_stack([modes, prescribed[at]]))
+        sums = self.comm.allreduce(sums)
+        return np.asarray(np.linalg.pinv(sums[:, :, :-1], OPEN**2, hermitian=True) @ sums[:, :, -1:]).ravel()
 
-    def load(self, motions: Array, residual: Array, among: Array | None = None) -> Array:
-        """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
+    def forces(self, residual: Array, among: Array | None = None) -> tuple[Array, float]:
+        """Forces along all motions ``(n_motions,)``, and the sum of all nodal forces (collective).
 
         Args:
-            motions: ``(n_motions, k)``.
             residual: ``F`` at the owned nodes ``(n_owned, gdim)``.
             among: forces beside which they count ``(n_owned, gdim)``; None takes the residual itself.
         """
@@ -149,7 +173,18 @@ class RigidMotions:
         total, scale = (
             sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual if among is None else among).sum())))
         )
-        along = motions.T @ total
+        return total, scale
+
+    def load(self, motions: Array, residual: Array, among: Array | None = None) -> Array:
+        """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
+
+        Args:
+            motions: sparse matrix ``(n_motions, k)``.
+            residual: see ``forces``.
+            among: see ``forces``.
+        """
+        total, scale = self.forces(residual, among)
+        along = np.asarray(motions.T @ total)
         self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
         force = motions @ np.where(np.abs(along) > LOADED * scale, along, 0.0)
         # bodies that are held stay where they are, to the last bit
@@ -166,12 +201,15 @@ class RigidMotions:
 
         Without it the increment does not depend on the supports: bodies stay where they are along neutral motions.
         """
+        from scipy.sparse.linalg import spsolve
+
+        if not motions.shape[1]:
+            return np.zeros_like(du)
         own = self._body[: self.config.n_owned]
-        modes = self._modes(self._places, own)
-        parts = motions.reshape(self.count, self.n_modes, motions.shape[1])
-        fields = np.einsum("nmg,nmk->ngk", modes, parts[own]).reshape(du.size, -1)
-        gram, along = (sum(a) for a in zip(*self.comm.allgather((fields.T @ fields, fields.T @ du.ravel()))))
-        return (fields @ np.linalg.solve(gram, along)).reshape(du.shape) if motions.shape[1] else np.zeros_like(du)
+        modes = self._modes(self._places, own).transpose(0, 2, 1).reshape(du.size, self.n_modes)
+        fields = self._spread(modes, np.repeat(own, self.config.gdim)) @ motions
+        gram, along = (sum(a) for a in zip(*self.comm.allgather(((fields.T @ fields).tocsc(), fields.T @ du.ravel()))))
+        return np.asarray(fields @ spsolve(gram, along)).reshape(du.shape)
 
     def move(self, motion: Array) -> None:
         """Move the bodies, ghosts included."""
@@ -183,44 +221,58 @@ class RigidMotions:
             u += np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body])
             return
         x = config.x
-        for b in np.flatnonzero(np.abs(parts).max(axis=1) > 0):
-            turn = rotation_matrix(_turn(parts[b, g:] / self.radius[b]))
-            here = body == b
-            u[here] += (x[here] - self.middle[b]) @ (turn - np.eye(g)).T + parts[b, :g]
+        turns = np.array([rotation_matrix(_turn(angles)) for angles in parts[:, g:] / self.radius[:, None]]) - np.eye(g)
+        u += np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g]
 
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 
-    def supports(self, motions: Array, equations: UnitingEquations) -> Bools:
+    def supports(self, motions: Any, equations: UnitingEquations) -> Bools:
         """Components of owned nodes that hold neutral motions without any reaction ``(n_owned, gdim)`` (collective).
 
-        One component per motion, each where what the earlier ones leave open moves it most; contactors are spared.
+        One component per motion, each where what the earlier ones of its bodies leave open moves it most; contactors are spared.
         """
-        if self._supports is not None:
+        if self._supports is not None and motions.shape[1]:
             before, pins = self._supports
-            same = before.shape == motions.shape and np.abs(before @ (before.T @ motions) - motions).max(initial=0.0) < OPEN
-            if same:
+            if before.shape == motions.shape and abs(before @ (before.T @ motions) - motions).max() < OPEN:
                 return pins
-        config, g = self.config, self.config.gdim
+        from scipy.sparse import csr_matrix
+
+        config, g, comm = self.config, self.config.gdim, self.comm
         pins = np.zeros((config.n_owned, g), dtype=bool)
+        # motions of bodies that touch each other make a group
+        terms = motions.tocoo()
+        moved = csr_matrix((np.ones(terms.nnz), (terms.row // self.n_modes, terms.col)), shape=(self.count, motions.shape[1]))
+        group, place, number = blocks_of(moved.T @ moved)
+        of_body = np.full(self.count, -1)
+        of_body[terms.row // self.n_modes] = group[terms.col]
         own = self._body[: config.n_owned]
-        allowed = np.array(self.free)
+        allowed = self.free & (of_body[own] >= 0)[:, None]
         allowed[equations.node] = False
         i, c = np.nonzero(allowed)
+        own, of = own[i], of_body[own[i]]
         # last bits of places differ from partition to partition
-        places = np.round(config.X[: config.n_owned] / (SAME_PLACE * config.size))
-        rows = self._spread(self._modes(self._places, own)[i, :, c], own[i]) @ motions
-        for _ in range(motions.shape[1]):
+        places = np.round(config.X[i] / (SAME_PLACE * config.size))
+        order = np.lexsort([c, *places.T[::-1]])
+        rows = np.zeros((len(i), place.max(initial=-1) + 1))
+        full = (self._spread(self._modes(self._places[i], own)[np.arange(len(i)), :, c], own) @ motions).tocoo()
+        rows[full.row, place[full.col]] = full.data
+        for k in range(rows.shape[1]):
             size = np.linalg.norm(rows, axis=1)
-            largest = self.comm.allreduce(float(size.max(initial=0.0)), op=MPI.MAX)
+            largest = np.zeros(len(number))
+            np.maximum.at(largest, of, size)
+            comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
             # of equally good ones the first by its place in the drawing, whichever rank has it
-            good = np.flatnonzero(size >= (1.0 - OPEN) * largest)
-            keys = [(*places[i[k]], c[k]) for k in good]
-            best, offers = int(good[keys.index(min(keys))]) if keys else -1, self.comm.allgather(min(keys, default=None))
-            winner = offers.index(min(offer for offer in offers if offer is not None))
-            if winner == self.comm.rank:
-                pins[i[best], c[best]] = True
-            direction = self.comm.bcast(rows[best] / size[best] if winner == self.comm.rank else None, root=winner)
-            rows -= np.outer(rows @ direction, direction)
+            good = order[(size >= (1.0 - OPEN) * largest[of])[order] & (number[of] > k)[order]]
+            first = good[np.unique(of[good], return_index=True)[1]]
+            offers = [((*places[j], c[j]), of[j], comm.rank, j, rows[j] / size[j]) for j in first]
+            offered = sorted(chain(*comm.allgather(offers)), key=lambda offer: offer[0], reverse=True)
+            best = {offer[1]: offer for offer in offered}
+            direction = np.zeros((len(number), rows.shape[1]))
+            for n, (_, _, rank, j, way) in best.items():
+                direction[n] = way
+                if rank == comm.rank:
+                    pins[i[j], c[j]] = True
+            rows -= np.einsum("nk,nk->n", rows, direction[of])[:, None] * direction[of]
         self._supports = motions, pins
         return pins
 
@@ -233,7 +285,7 @@ class RigidMotions:
         g = self.config.gdim
         parts = motion.reshape(self.count, self.n_modes)
         b = int(np.abs(parts).max(axis=1).argmax())
-        size = np.abs(parts[b]).max()
+        size = np.abs(parts[b]).max() or 1.0
         shift, turn = parts[b, :g] / size, parts[b, g:] / size
         ways = []
         if np.abs(shift).max() > 1e-6:
@@ -252,3 +304,47 @@ class RigidMotions:
 def _turn(angles: Array) -> Array:
     """Angle ``(1,)`` or rotation vector ``(3,)`` from rotations in the planes that ``rigid_velocities`` lists."""
     return angles if len(angles) == 1 else np.array([angles[2], -angles[1], angles[0]])
+
+
+def blocks_of(H: Any) -> tuple[Ints, Ints, Ints]:
+    """Diagonal blocks that a symmetric sparse matrix ``(n, n)`` falls into: each row's block, its place in it ``(n,)``, and their sizes."""
+    from scipy.sparse.csgraph import connected_components
+
+    number, block = connected_components(H, directed=False)
+    size = np.bincount(block, minlength=number)
+    place = np.empty(len(block), dtype=np.int64)
+    place[np.argsort(block, kind="stable")] = np.arange(len(block)) - np.repeat(np.cumsum(size) - size, size)
+    return block.astype(np.int64), place, size
+
+
+def by_block(H: Any, make: Callable[[Array], tuple[Array, Bools]]) -> Any:
+    """Columns made of the diagonal blocks that a symmetric sparse matrix falls into.
+
+    Args:
+        H: the matrix ``(n, n)``.
+        make: columns ``(b, s, s)`` of blocks ``(b, s, s)`` of one size, and which of them are kept ``(b, s)``.
+
+    Returns:
+        Sparse matrix ``(n, k)``.
+    """
+    from scipy.sparse import csc_matrix
+
+    block, place, size = blocks_of(H)
+    entries = H.tocoo()
+    rows, columns, values, number = [], [], [], 0
+    for s in np.unique(size):
+        number_of = np.cumsum(size == s) - 1
+        inside, here = size[block[entries.row]] == s, np.flatnonzero(size[block] == s)
+        dense, own = np.zeros(((size == s).sum(), s, s)), np.empty(((size == s).sum(), s), dtype=np.int64)
+        dense[number_of[block[entries.row[inside]]], place[entries.row[inside]], place[entries.col[inside]]] = entries.data[
+            inside
+        ]
+        own[number_of[block[here]], place[here]] = here
+        made, kept = make(dense)
+        b, k = np.nonzero(kept)
+        rows.append(own[b].ravel())
+        values.append(made[b, :, k].ravel())
+        columns.append(np.repeat(number + np.arange(len(b)), s))
+        number += len(b)
+    at = np.concatenate([*rows, np.zeros(0, int)]), np.concatenate([*columns, np.zeros(0, int)])
+    return csc_matrix((np.concatenate([*values, np.zeros(0)]), at), shape=(H.shape[0], number))

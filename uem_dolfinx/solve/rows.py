@@ -14,11 +14,12 @@ from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.coupling import LabelledEquations
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.kinematics import Constraints, Traction
 from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
+from uem_dolfinx.parallel import agree
 
 
 class Meetings:
@@ -35,9 +36,9 @@ class Meetings:
         contestable: whether equations can get in each other's way.
     """
 
-    def __init__(self, config: Configuration, pairs: Sequence[ContactPair]):
+    def __init__(self, config: Configuration, pairs: Sequence[Interface]):
         self._config = config
-        follows = [followed_nodes(config, pair.coupling.followed) for pair in pairs]
+        follows = [followed_nodes(config, pair.discretisation.followed) for pair in pairs]
         meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
         shared = len(np.unique(contactors)) < len(contactors)
@@ -48,16 +49,16 @@ class Meetings:
         self.mutual: Bools = (meets & meets.T).any(axis=1)
         for pair, mutual in zip(pairs, self.mutual):
             pair.mutual = bool(mutual)
-            if mutual and not pair.coupling.two_pass:
+            if mutual and not pair.discretisation.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
-        self.stacked = bool(meets.any()) or any(pair.coupling.chained for pair in pairs)
-        self.contestable = self.shared or bool(self.mutual.any()) or any(pair.coupling.prescribed for pair in pairs)
+        self.stacked = bool(meets.any()) or any(pair.discretisation.chained for pair in pairs)
+        self.contestable = self.shared or bool(self.mutual.any()) or any(pair.discretisation.prescribed for pair in pairs)
 
     def restrict(
-        self, labelled: list[LabelledEquations], equations: UnitingEquations, free: Bools, prescribed: Array
+        self, labelled: list[Constraints], equations: UnitingEquations, free: Bools, prescribed: Array
     ) -> tuple[Restriction, IndependentEquations | None]:
         """P or Q of equations, and how those in each other's way were resolved (collective).
 
@@ -88,7 +89,7 @@ class Rows:
         upright: Q as it is without the friction of contactors that slip, which closes the gaps as well.
     """
 
-    equations: list[LabelledEquations]
+    equations: list[Constraints]
     trial: UnitingEquations | None
     independent: IndependentEquations | None
     test: Restriction
@@ -97,7 +98,7 @@ class Rows:
 
 def make_rows(
     meetings: Meetings,
-    pairs: Sequence[ContactPair],
+    pairs: Sequence[Interface],
     hold: Callable[[UnitingEquations, UnitingEquations], Bools],
     prescribed: Array,
 ) -> Rows:
@@ -110,38 +111,63 @@ def make_rows(
         prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
 
     Raises:
-        FrictionError: if contactors slip where equations get in each other's way.
+        FrictionError: if contactors wedge where several equations meet.
     """
+    rigid = [pair for pair in pairs if not pair.target.n_nodes]
+    for pair in rigid if meetings.shared else ():
+        pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    upright = trial = UnitingEquations.join([e.upright for e in equations], g)
-    if any(e.trial is not e.upright for e in equations):
+    upright = trial = UnitingEquations.join([e.frictionless for e in equations], g)
+    if any(e.trial is not e.frictionless for e in equations):
         trial = UnitingEquations.join([e.trial for e in equations], g)
     resisting = stopping = trial
-    if any(e.holding is not None for e in equations):
+    if any(e.resisting is not e.trial for e in equations):
         resisting = UnitingEquations.join([e.resisting for e in equations], g)
         stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
     Q, independent = meetings.restrict(equations, upright, free, prescribed)
     tilted = Q
-    if any(e.test is not e.upright for e in equations):
-        if independent is not None and independent.found:
-            raise FrictionError(
-                "contactors slip where uniting equations get in each other's way: keep contacts with friction from sharing "
-                "contactors and from being contactor and target of each other, and their contactors from prescribed normals"
-            )
+    if any(e.test is not e.frictionless for e in equations):
         test = UnitingEquations.join([e.test for e in equations], g)
-        tilted = Restriction(Q.config, test, free, prescribed, Q.stacked, like=Q)
+        if independent is not None and independent.found:
+            independent = _tilted(pairs, independent, test)
+            test = independent.equations
+        tilted = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
     return Rows(equations, None if trial is upright else trial, independent, tilted, Q)
 
 
-def unbalanced(pairs: Sequence[ContactPair], F: PETSc.Vec, forces: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
+def _tilted(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
+    """Equations that got in each other's way, tilted where contactors slip (collective).
+
+    Args:
+        pairs: of all contacts.
+        independent: how they were resolved upright.
+        test: tilted equations of all pairs.
+
+    Raises:
+        FrictionError: naming the first contactor, of the first rank that has one, whose equations no longer tell its motion.
+    """
+    tilted = independent.tilted(test)
+    bad, error = np.flatnonzero(tilted.undetermined), None
+    if len(bad):
+        node = int(test.node[bad[0]])
+        names = ", ".join(pair.name for pair in pairs if node in pair.nodes)
+        error = FrictionError(
+            f"{names}: friction leaves more than one answer about the contactor at {pairs[0].config.describe(node)}, where several uniting "
+            "equations meet and it wedges: take less friction there, or drop one of the contacts"
+        )
+    agree(pairs[0].config.comm, error)
+    return tilted
+
+
+def unbalanced(pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction]) -> tuple[Array, Array]:
     """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
 
-    ``forces`` are those of every pair, as ``Coupling.forces`` returns them.
+    ``forces`` are those of every pair.
     """
     every = F.array_r.reshape(-1, F.getBlockSize()).copy()
     left = every.copy()
     for pair, found in zip(pairs, forces):
-        left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(*found)))
+        left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(found)))
     return left, every

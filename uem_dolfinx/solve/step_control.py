@@ -11,10 +11,10 @@ from uem_dolfinx import errors
 from uem_dolfinx.log import logger
 
 #: A step may be cut to this part of its nominal length.
-#: [convention; nominal length; test_thresholds_motion.py::test_steps_are_cut_ten_times]
+#: [convention; nominal length; test_step_control.py::test_steps_are_cut_ten_times]
 SHORTEST_LENGTH = 1.0 / 1024
 #: A step that needs no more linear solves than this is easy: the next one may be twice as long.
-#: [convention; linear solves; test_thresholds_motion.py::test_easy_steps_are_doubled]
+#: [convention; linear solves; test_step_control.py::test_easy_steps_are_doubled]
 EASY = 6
 #: What is left to the end, or to a multiple of the nominal length, is rounding below this part of it.
 #: [convention; nominal length; test_thresholds_motion.py::test_no_step_for_rounding]
@@ -42,11 +42,13 @@ class StepControl:
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy = nominal, np.inf, 0, 0.0
-        self._cuts = 0
+        self._cuts, self._read = 0, False
 
     def begin(self, nominal: float) -> None:
-        """Go on with steps of another nominal length."""
-        self.nominal, self._cuts = nominal, 0
+        """Go on with steps of another nominal length, and say so if it is another than that of the run that is gone on with."""
+        if self._read and nominal != self.nominal:
+            logger.warning("going on with steps of %.6g; those of the run before the checkpoint were %.6g", nominal, self.nominal)
+        self.nominal, self._cuts, self._read = nominal, 0, False
 
     @property
     def length(self) -> float:
@@ -59,7 +61,11 @@ class StepControl:
         Returns:
             Whether to try again: not if the error has nothing to do with the length, or if the step would become too short.
         """
-        if not isinstance(error, MENDABLE) or 0.5 * length < SHORTEST_LENGTH * self.nominal:
+        if not isinstance(error, MENDABLE):
+            return False
+        if 0.5 * length < SHORTEST_LENGTH * self.nominal:
+            if self._cuts:
+                error.amend(f"shorter steps, down to {length:.3g}, are no better")
             return False
         self.longest, self._cuts = 0.5 * length, self._cuts + 1
         logger.info("step %d failed (%s); cut to %.3g", self.number + 1, error, self.longest)
@@ -74,8 +80,10 @@ class StepControl:
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers that a run goes on from, by name."""
-        return {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
+        kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
+        return kept | {"nominal length": self.nominal}
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Go on from what ``to_checkpoint`` returned; other numbers may stand beside them."""
-        self.number, self.longest, self.largest_energy = (kept[name] for name in self.to_checkpoint())
+        self.number, self.longest, self.largest_energy, self.nominal = (kept[name] for name in self.to_checkpoint())
+        self._read = True

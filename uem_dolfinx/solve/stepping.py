@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from mpi4py import MPI
 
@@ -13,6 +14,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
+from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
 
@@ -48,6 +50,8 @@ class Progress:
         reach: arc length of the whole call, were all of it like its first step; 0 without arc lengths.
         control: length of its steps.
         interruption: signals that are noted while the problem steps.
+        end: ends the run on a signal of a number, once the problem is in its last converged state.
+        inside: whether a step has been handed out, and the caller is not done with it.
     """
 
     steps: int = 0
@@ -58,6 +62,8 @@ class Progress:
     reach: float = 0.0
     control: StepControl = field(default_factory=StepControl)
     interruption: Interruption | None = None
+    end: Callable[[int], NoReturn] = lambda number: end_run(number, "the problem is in its last converged state")
+    inside: bool = False
     _calls: int = 0
 
     @property
@@ -76,13 +82,31 @@ class Progress:
             self.ramp, self.factor, self.start = self._calls, 0.0, np.array(displacement)
             self.reach = 0.0
             self.control = StepControl()
-        self.control.begin(1.0 / steps)
+        if self._calls == self.ramp:
+            self.control.begin(1.0 / steps)
         return self._calls == self.ramp
 
     def heed(self, comm: MPI.Comm) -> None:
         """Raise ``InterruptedStepError`` on all ranks if any has got a signal since the stepping began (collective)."""
         if self.interruption is not None:
             self.interruption.heed(comm)
+
+    @contextmanager
+    def heeding(self, comm: MPI.Comm) -> Iterator[None]:
+        """A block in which a signal to any rank ends the run on all, once the problem is in its last converged state (collective)."""
+        outer, own = self.interruption, self.interruption or Interruption()
+        self.interruption = own
+        try:
+            with own:
+                yield
+                if outer is None:
+                    self.heed(comm)
+        except InterruptedStepError as interrupted:
+            if outer is not None and not self.inside:
+                raise
+            self.end(interrupted.number)
+        finally:
+            self.interruption = outer
 
     def to_checkpoint(self, ramped: bool) -> dict[str, Any]:
         """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
@@ -99,6 +123,20 @@ class Progress:
             self.control.from_checkpoint(kept)
             # a script that is run anew comes to this call of load_steps once more
             self._calls = max(0, min(self._calls, self.ramp - 1))
+
+
+def begin_checkpoint(checkpoint: Checkpoint | None, state: Callable[[], State], u: Any) -> None:
+    """Begin a checkpoint unless the caller has, with a state that has the displacement (collective).
+
+    Raises:
+        CheckpointError: as ``Checkpoint.begin``, or if it has begun with the state of another problem.
+    """
+    if checkpoint is None:
+        return
+    if checkpoint.begun:
+        checkpoint.check(u)
+    else:
+        checkpoint.begin(state())
 
 
 def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkpoint: Checkpoint | None) -> Iterator[T]:
@@ -118,12 +156,17 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
         SystemExit: likewise with status 143 after SIGTERM.
         CheckpointError: if the checkpoint cannot be written.
     """
-    outer, progress.interruption = progress.interruption, Interruption() if checkpoint is None else checkpoint.interruption
+    outer = progress.interruption, progress.end
+    progress.interruption = Interruption() if checkpoint is None else checkpoint.interruption
+    if checkpoint is not None:
+        progress.end = checkpoint.end
     try:
         with progress.interruption:
             try:
                 for step in steps:
+                    progress.inside = True
                     yield step
+                    progress.inside = False
                     if checkpoint is None:
                         progress.heed(comm)
                     else:
@@ -131,8 +174,6 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
                 if checkpoint is not None:
                     checkpoint.finish()
             except InterruptedStepError as interrupted:
-                if checkpoint is None:
-                    end_run(interrupted.number, "the problem is in its last converged state")
-                checkpoint.end(interrupted.number)
+                progress.end(interrupted.number)
     finally:
-        progress.interruption = outer
+        (progress.interruption, progress.end), progress.inside = outer, False

@@ -19,17 +19,18 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.active_set import Pivoting, Wrong
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.body_forces import BodyForces
-from uem_dolfinx.solve.first_touch import deepest_of, touch_ahead
+from uem_dolfinx.solve.exchanges import Exchanges, count
+from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
 from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
-from uem_dolfinx.solve.tangent import contact_curvature, slip_terms, together
+from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
 #: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_foretells]
@@ -62,7 +63,7 @@ class BodySystem:
     def __init__(
         self,
         forces: BodyForces,
-        pairs: Sequence[ContactPair],
+        pairs: Sequence[Interface],
         solver: UnitedSolver,
         *,
         newton: str = "full",
@@ -73,11 +74,13 @@ class BodySystem:
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self._factored: object = None
         self._curvature: PETSc.Mat | None = None
-        self._pivoting = Pivoting()
+        self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
         self._apart = False
         #: The state that was settled last, if its united matrix has a negative determinant.
         self._doubtful: BodyState | None = None
+        #: Whether the bodies have moved in this step.
+        self._led = False
         #: Whether the last exchange has let go of a body that loads drive.
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
@@ -117,7 +120,8 @@ class BodySystem:
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
-        self._doubtful, place = None, partial(self.place, returning=False)
+        self._doubtful, self._led, place = None, False, partial(self.place, returning=False)
+        self.exchanges.begin_step()
         self.floating.begin_step(place)
         if self.forces.dynamics is None and self.floating.motions is None:
             touch_ahead(self.forces, self.pairs, self.floating.rigid, place)
@@ -126,7 +130,6 @@ class BodySystem:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
-            pair.check()
         self.floating.end_step()
         if (state := self._doubtful) is None:
             return
@@ -140,6 +143,13 @@ class BodySystem:
             )
 
     # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def _residual(self) -> PETSc.Vec:
+        """Forces of the bodies less those of friction that are known, which do not grow with the force along the normal (collective)."""
+        F = self.forces.residual
+        for nodes, forces in filter(None, (pair.known_forces() for pair in self.pairs)):
+            F.array[:] -= self.config.add_at_owners(nodes, forces).ravel()
+        return F
 
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
@@ -159,7 +169,7 @@ class BodySystem:
             # what tells tension from rounding
             forces.update_tangent()
         self._turn()
-        F, rounding = forces.residual, self.rounding()
+        F, rounding = self._residual(), self.rounding()
         with timed("uniting equations"):
             rows = self._rows()
             y = rows.test.pass_on(F)
@@ -173,15 +183,21 @@ class BodySystem:
                 for pair in pairs:
                     pair.place_again()
             here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
-            wrong = self._count(
-                [pair.wrong(pair.gap, pair.trial.lam, self._along(pair), least, 0.0, self._swept) for pair, least in here]
+            wrong = count(
+                pairs, [pair.wrong(pair.gap, pair.traction, self._along(pair), least, 0.0, self._swept) for pair, least in here]
             )
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
+            wanting = not (at_rest and wrong == 0 and not moved)
+            # the residual that a step begins with does not know how far conditions lead the bodies
+            if wanting and pairs and self._led and self.exchanges.visit(residual.norm()):
+                for pair in pairs:
+                    pair.place_again()
+                moved = True
             fallen = self.floating.fall_again(lambda: self.place(returning=False), unsettled, at_rest)
             if moved or fallen:
                 rows = self._rows()
-                residual = rows.test.transpose(forces.residual)
+                residual = rows.test.transpose(self._residual())
         return self._state(rows, residual, rounding, moved or fallen, at_rest and wrong == 0)
 
     def _rows(self) -> Rows:
@@ -232,31 +248,33 @@ class BodySystem:
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             left = 0.0 if self.solver.exact else accuracy
             near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            foreseen = [pair.foreseen(increment) for pair in self.pairs]
+            foreseen = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
             wrong = []
-            for pair, gap, (lam, _, _) in zip(self.pairs, foreseen, forces):
+            for pair, gap, seen in zip(self.pairs, foreseen, forces):
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, lam, along, least, near, self._swept, moved))
-            count = self._count(wrong)
-            if not count and sliding is not None:
+                wrong.append(pair.wrong(gap, seen, along, least, near, self._swept, moved))
+            chosen = wrong if self._adrift else self.exchanges.choose(wrong, foreseen, self._curvature is not None)
+            settled = not count(self.pairs, chosen)
+            if settled and sliding is not None and not self.exchanges.frozen:
                 raise FrictionError(
                     "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
                     "Dirichlet condition, give it inertia, or take less load"
                 )
-            if not count or self._adrift:
+            if settled or self._adrift:
                 self._doubtful = state if self.solver.negative else None
                 self._take(forces)
                 return None
-            wrong = self._choose(wrong, foreseen, count)
-            if any([pair.exchange(w, self._pivoting.ahead) for pair, w in zip(self.pairs, wrong)]):
-                self._pivoting.start_again()
+            if self.exchanges.straight:
+                self._curvature = None
+            if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen)]):
+                self.exchanges.start_again()
             rows = self._rows()
             # a body that is let go has to fall first
             self._adrift = self.floating.adrift
-            residual = rows.test.transpose(self.forces.residual)
+            residual = rows.test.transpose(self._residual())
         return self._state(rows, residual, state.rounding, state.changed, False)
 
     def _foreseen_forces(self, state: BodyState, du: PETSc.Vec) -> PETSc.Vec:
@@ -265,36 +283,20 @@ class BodySystem:
         for more in (self._curvature, state.added):
             if more is not None:
                 F.axpy(1.0, more * du)
-        F.axpy(1.0, self.forces.residual)
+        F.axpy(1.0, self._residual())
         if state.held is not None:
             F.axpy(1.0, state.held)
         return F
 
-    def _sliding(self, F: PETSc.Vec, forces: list[tuple[Array, Array, Array]]) -> Array | None:
+    def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
         """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
         if self.floating.motions is None or not self.rough:
             return None
-        return self.floating.slide(*unbalanced(self.pairs, F, forces))
+        # known forces are among those of the contact
+        every = F + (self.forces.residual - self._residual())
+        return self.floating.slide(*unbalanced(self.pairs, every, forces))
 
-    def _choose(self, wrong: list[Wrong], gaps: list[Array], count: int) -> list[Wrong]:
-        """Which of the wrong contactors are exchanged now (collective)."""
-        touching = sum(pair.n_active for pair in self.pairs)
-        if not self._pivoting.all_at_once(count):
-            pattern, told = zlib.crc32(b"".join(pair.pattern for pair in self.pairs)), self._curvature is None and not self.rough
-            if self._pivoting.repeats(self.comm.allgather(pattern), told) and self._curvature is not None:
-                # with curvature the problem may have no solution, or several; without there is one
-                self._curvature, self._pivoting = None, Pivoting()
-            worst = self.comm.allreduce(max(w.worst for w in wrong), op=MPI.MAX)
-            return [w.among_the_worst(worst) for w in wrong]
-        if self.comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > touching:
-            return deepest_of(self.pairs, gaps, wrong)
-        return wrong
-
-    def _count(self, wrong: list[Wrong]) -> int:
-        """Number of wrong contactors over all pairs and ranks (collective)."""
-        return int(self.comm.allreduce(sum(w.count for w in wrong)))
-
-    def _along(self, pair: ContactPair) -> Array:
+    def _along(self, pair: Interface) -> Array:
         """Stiffness of the pair's contactors along their normals ``(n,)``."""
         assert self.forces.stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
@@ -309,8 +311,8 @@ class BodySystem:
         """Q of the present equations (collective)."""
         return self._rows().test
 
-    def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[tuple[Array, Array, Array]]:
-        """Contact forces of every pair, as ``Coupling.forces`` returns them, from forces that were passed on (collective)."""
+    def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[Traction]:
+        """Contact forces of every pair, from forces that were passed on (collective)."""
         lam = rows.test.multipliers(y)
         redundant = np.zeros(len(lam), dtype=bool)
         if rows.independent is not None:
@@ -324,10 +326,10 @@ class BodySystem:
             start += len(own)
         return found
 
-    def _take(self, forces: list[tuple[Array, Array, Array]]) -> None:
+    def _take(self, forces: list[Traction]) -> None:
         """Hand the contact forces to the pairs."""
         for pair, own in zip(self.pairs, forces):
-            pair.set_forces(*own)
+            pair.set_forces(own)
 
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
@@ -345,7 +347,7 @@ class BodySystem:
         """
         self.place(returning=False)
         self._turn()
-        return self.restriction().transpose(self.forces.residual)
+        return self.restriction().transpose(self._residual())
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
@@ -361,13 +363,16 @@ class BodySystem:
     def differentiate(self, first: bool) -> None:
         """Tangent of the bodies and curvature of the contact at the present displacement (collective)."""
         forms.free_petsc_garbage(self.comm)
+        self._led = True
         if first:
             self.solver.begin_step()
         if first or self.newton == "full":
             self.forces.update_tangent()
         with timed("contact curvature"):
-            self._curvature = self.curvature() if self.consistent_tangent else None
-        self._pivoting, self._adrift = Pivoting(), False
+            how = self.forces.vector(), self._apart, self.exchanges.convex
+            self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
+        self.exchanges.begin()
+        self._adrift = False
 
     def linearise(self, state: IterationState) -> PETSc.Vec:
         """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)`` (collective)."""
@@ -383,16 +388,6 @@ class BodySystem:
             self.solver.set_operator(P, K, curvature, Q)
         self._factored = made_of
         return -Q.transpose(self._foreseen_forces(state, P.c))
-
-    def curvature(self) -> PETSc.Mat | None:
-        """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any."""
-        parts = [part for pair in self.pairs if pair.sliding == "finite" for part in pair.curvature()]
-        if not self._apart:
-            parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
-        # a plane has none
-        if not self.comm.allreduce(any(blocks.any() for _, blocks in parts), op=MPI.LOR):
-            return None
-        return contact_curvature(parts, self.forces.vector())
 
     @property
     def inexact(self) -> bool:
@@ -440,9 +435,14 @@ class BodySystem:
         return self.forces.dynamics is None and not (self.linear and self._curvature is None)
 
     @property
+    def convex(self) -> bool:
+        """Whether the curvature of contact is without what could make the united tangent indefinite."""
+        return self.exchanges.convex
+
+    @property
     def rough(self) -> bool:
         """Whether there is friction."""
-        return any(pair.rough for pair in self.pairs)
+        return any(pair.frictional for pair in self.pairs)
 
     @property
     def in_contact(self) -> bool:

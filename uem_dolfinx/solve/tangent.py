@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.contact.pair import ContactPair
+from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -106,7 +106,36 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
     return G
 
 
-def slip_terms(pairs: Sequence[ContactPair], du: PETSc.Vec) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
+def convex_part(blocks: Array) -> Array:
+    """Blocks ``(k, n, n)`` without the negative eigenvalues of those that are symmetric."""
+    out = blocks.copy()
+    which = np.flatnonzero((blocks == blocks.transpose(0, 2, 1)).all(axis=(1, 2)))
+    value, vector = np.linalg.eigh(blocks[which])
+    out[which] = (vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1)
+    return out
+
+
+def curvature_of(pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool) -> PETSc.Mat | None:
+    """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any (collective).
+
+    Args:
+        pairs: of all contacts.
+        du: a vector with the displacement's layout.
+        apart: whether P differs from Q; else the symmetric part counts.
+        convex: whether what could make the tangent indefinite is left out.
+    """
+    parts = [part for pair in pairs if pair.sliding == "finite" for part in pair.curvature()]
+    if convex:
+        parts = [(nodes, convex_part(blocks)) for nodes, blocks in parts]
+    if not apart:
+        parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
+    # a plane has none
+    if not du.comm.tompi4py().allreduce(any(blocks.any() for _, blocks in parts)):
+        return None
+    return contact_curvature(parts, du)
+
+
+def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
     """What the directions of slip add to the tangent and to the residual; None without friction in space (collective).
 
     Args:

@@ -18,15 +18,16 @@ from uem_dolfinx.log import logger, progress
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
-from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
-from uem_dolfinx.solve.stepping import Step, between_steps
+from uem_dolfinx.solve.stepping import Step, begin_checkpoint, between_steps
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
 TIME_ROUNDING = 4 * np.finfo(float).eps
-#: Contacts may give the bodies this part of the largest kinetic energy in a step.
-#: [convention; kinetic energy; test_thresholds_motion.py::test_energy_given]
+#: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
+#: in the surfaces that they press.
+#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
 MOST_GIVEN = 2e-3
 #: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
 #: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
@@ -97,6 +98,7 @@ def time_steps(
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
+    check_steps(problem, checkpoint)
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
@@ -104,15 +106,18 @@ def time_steps(
         dt, end = given.number("dt", dt, given.POSITIVE), given.number("end", end, _not_before(dynamics.start))
         if event_tolerance is not None:
             event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
-        given.kind("checkpoint", checkpoint, checkpoint is None or isinstance(checkpoint, Checkpoint), "a Checkpoint, or None")
     given.alike(problem.comm, "time_steps", dt=dt, end=end, event_tolerance=event_tolerance)
+    with np.errstate(all="ignore"):
+        squares = np.array([dt, SHORTEST_LENGTH * dt]) ** 2
+        countable = np.isfinite(squares).all() and np.isfinite(1.0 / squares).all()
+    if not countable:
+        raise InputError(f"dt = {dt}: its square, or that of a step that is cut, is no number; take other units of time")
     if _rounding(dynamics, dt, end) > SHORTEST_LENGTH * dt:
         raise InputError(
             f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
         )
-    if checkpoint is not None and not checkpoint.begun:
-        checkpoint.begin(problem.state())
+    begin_checkpoint(checkpoint, problem.state, problem.u)
     steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
     shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
     return between_steps(problem.comm, problem.progress, shown, checkpoint)
@@ -151,7 +156,8 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         touched = tuple(name for name, was, now in changes if now and not was)
         left = tuple(name for name, was, now in changes if was and not now)
         yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
-        before = after
+        # the caller may have taken the step again
+        before = _touching(problem)
 
 
 def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
@@ -221,7 +227,8 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     if given <= MOST_GIVEN * control.largest_energy:
         return
     control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
-    if given <= MOST_GIVEN * control.largest_energy:
+    at_work = control.largest_energy + _held_by(problem, forces)
+    if given <= MOST_GIVEN * at_work:
         return
     barred = [pair.bar_returned() for pair in problem.pairs]
     for pair, count in zip(problem.pairs, barred):
@@ -233,12 +240,22 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
                 count,
                 dynamics.time,
             )
-    words = (
-        f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {control.largest_energy:.3g}"
-    )
+    words = f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
     if length > SHORTEST_GIVEN * control.nominal or any(barred):
         raise EnergyGivenError(words)
     logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
+
+
+def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
+    """Energy that contact forces ``(n_owned * gdim,)`` hold in the cells they press, the mean of a step's start and end (collective).
+
+    Of bodies at rest it is what the work of these forces is compared with: their kinetic energy is the rounding of nothing.
+    """
+    K = problem.forces.stiffness
+    if K is None:
+        return 0.0
+    compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()
+    return float(problem.comm.allreduce(sum(0.25 * float(f @ (compliance * f)) for f in forces)))
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:

@@ -1,0 +1,220 @@
+"""Contactors that change sides: states that come again are noticed at once, another rule ends the circle, or an error names them.
+
+Read first: ``test_scenes_that_went_in_circles``.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from friction_scenes import driven
+from helpers import at, blocks, box, clamp, linear, modulus, raised, run, scene, st_venant
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.contact.active_set import Rule, Wrong
+from uem_dolfinx.solve.exchanges import ALONG, Exchanges
+
+COMM = MPI.COMM_WORLD
+
+
+class Nodes:
+    """A pair of which one knows the places of its contactors in the drawing and whether they are active; each rank has its own part."""
+
+    def __init__(self, X, name="upper on lower", rough=False):
+        X = np.asarray(X, dtype=float)[COMM.rank :: COMM.size]
+        config = SimpleNamespace(
+            comm=COMM, X=X, gdim=X.shape[1], size=1.0, describe=lambda i: "(" + ", ".join(f"{c:.6g}" for c in X[i]) + ")"
+        )
+        self.config, self.nodes, self.name, self.frictional = config, np.arange(len(X)), name, rough
+        self.active, self.calmed, self.n_active = np.zeros(len(X), bool), False, len(X)
+
+    @property
+    def pattern(self):
+        return self.active[:, None].astype(np.int64)
+
+    def of_all(self, values):
+        """This rank's part of what all contactors have."""
+        return np.asarray(values)[COMM.rank :: COMM.size]
+
+    def calm(self, which):
+        calm, self.calmed = self.calmed, True
+        return not calm
+
+
+def wrong(pair, which, alike=True):
+    """Contactors that would be released, all as wrong as each other or not."""
+    here = pair.of_all(which)
+    size = np.ones(len(here)) if alike else 1.0 + pair.of_all(np.arange(len(which)))
+    return Wrong(np.zeros(len(here), bool), here, np.where(here, size, 0.0))
+
+
+def all_released(pair, chosen):
+    """Which of all ranks' contactors are to be exchanged."""
+    out = np.zeros(COMM.allreduce(len(pair.nodes)), bool)
+    for rank, part in enumerate(COMM.allgather(chosen.release)):
+        out[rank :: COMM.size] = part
+    return out.tolist()
+
+
+def test_the_order_does_not_depend_on_ranks():
+    """All of them, the worst, and at last the first along a direction of the drawing, of the first pair that has any."""
+    X = [(0.0, 0.0), (1.0, 0.0), (0.0, 0.5), (0.5, 0.5)]
+    pairs = [Nodes(X), Nodes(X)]
+    none, some = np.array([False] * 4), np.array([False, True, True, True])
+    for first, last in ((none, [2]), (some, [2])):
+        exchanges, went = Exchanges(pairs), []
+        for _ in range(3):
+            chosen = exchanges.choose([wrong(pairs[0], first, alike=False), wrong(pairs[1], some, alike=False)], (), False)
+            went.append([all_released(pair, c) for pair, c in zip(pairs, chosen)])
+        at_work = 0 if first.any() else 1
+        every = [first.tolist(), some.tolist()]
+        assert went[0] == every
+        assert [np.flatnonzero(w[at_work]).tolist() for w in went[1:3]] == [[3], last]
+        assert not any(went[2][1 - at_work])
+        along = np.array(X) @ ALONG[:2]
+        assert last == [int(np.flatnonzero(some)[along[some].argmin()])]
+
+
+def test_who_goes_in_a_circle_is_named():
+    """Contacts and places of the contactors that the last rule has exchanged, three at most and how many more, in one order."""
+    X = [(float(i), 0.5) for i in range(6)]
+    for rough, error in ((False, uem.ConvergenceError), (True, uem.FrictionError)):
+        pair = Nodes(X, rough=rough)
+        exchanges = Exchanges([pair])
+
+        def exchange_for_ever(exchanges=exchanges, pair=pair):
+            for k in range(100):
+                which = np.zeros(6, bool)
+                which[[1, 2, 4, 5][k % 4]] = True
+                pair.active = pair.of_all(which)
+                exchanges.choose([wrong(pair, which)], (), False)
+
+        found = raised(error, "goes in a circle", exchange_for_ever)
+        assert "upper on lower at (1, 0.5), upper on lower at (2, 0.5), upper on lower at (4, 0.5), and 1 more" in str(found)
+
+
+def test_without_curvature_first():
+    """Before the first contactor goes alone the curvature of the contact is left out."""
+    pair = Nodes([(0.0, 0.0), (1.0, 0.0)])
+    exchanges, which, straight = Exchanges([pair]), np.array([True, True]), []
+    for _ in range(5):
+        exchanges.choose([wrong(pair, which)], (), True)
+        straight.append(exchanges.straight)
+    assert straight == [False, False, True, True, True]
+    assert exchanges._pivoting._rule < Rule.FIRST
+
+
+def test_convex_until_it_gets_better():
+    """A state that comes again and again although no contactor changes gets a convex tangent, until a tenth of the residual is left."""
+    pair = Nodes([(0.0, 0.0), (1.0, 0.0)])
+    exchanges = Exchanges([pair])
+    pair.active = pair.of_all([True, False])
+    convex = []
+    for norm in (1.0, 0.5, 0.6, 0.6, 0.6, 0.9, 0.091, 0.05, 0.04, 0.07):
+        exchanges.visit(norm)
+        convex.append(exchanges.convex)
+    assert convex == [False] * 5 + [True, True] + [False] * 3
+    exchanges.begin_step()
+    assert not exchanges.convex
+
+
+def test_states_that_come_again():
+    """A state with no less than 0.9 of its residual has led nowhere; bends are left out then, and the sixth time is an error."""
+    pair = Nodes([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)])
+    exchanges = Exchanges([pair])
+
+    def visit(first, norm):
+        pair.active = pair.of_all([first, True, False])
+        return exchanges.visit(norm)
+
+    # it gets better, then nothing changes, then it goes in a circle
+    assert not any(visit(k % 2 == 0, 0.85**k) for k in range(10))
+    exchanges.begin_step()
+    assert not any(visit(True, 1.0) for _ in range(4))
+    exchanges.begin_step()
+    assert [visit(*v) for v in ((True, 1.0), (False, 1.0), (True, 0.95), (False, 1.0), (True, 1.0))] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+    assert not visit(False, 1.0)
+    visit(True, 1.0)
+    # two rounds so far, each of three visits
+    for k in range(3 * 3):
+        visit(k % 2 == 1, 1.0)
+    error = raised(uem.ConvergenceError, "goes in a circle", lambda: [visit(k % 2 == 1, 1.0) for k in range(9, 14)])
+    assert str(error).count("upper on lower") == 1 and "(0, 0)" in str(error)
+
+
+def belt(mu, n):
+    """A block on a plane that moves on under it."""
+    s = scene(COMM, "hexahedron", [box("hexahedron", [0.0] * 3, [1.0] * 3, [n] * 3)])
+    V = compat.function_space(s.mesh, 1, (3,))
+    u, top, plane = fem.Function(V), fem.Function(V), uem.RigidPlane([0.0] * 3, [0.0, 0.0, 1.0])
+    contact = uem.Contact(s.tag("low", 0, at(2, 0.0)), plane, friction=mu)
+    bcs = [fem.dirichletbc(top, fem.locate_dofs_topological(V, 2, s.tag("top", 0, at(2, 1.0)).entities))]
+
+    def load(part):
+        top.x.array[2::3] = -0.01
+        plane.move([0.2 * part, 0.06 * part, 0.0])
+
+    return uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], load=load), 10
+
+
+def pressed(n_low, n_high):
+    """A block of degree 2 pressed straight onto another, whose nodes its corners stand on."""
+    b = blocks(COMM, "quadrilateral", n_low, n_high, overhang=0.5, degree=2)
+    contact = uem.Contact(b.high, b.low, friction=0.3)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.02])]
+    return uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=bcs, contacts=[contact]), 1
+
+
+def leaves(mu):
+    """A spring of five leaves that are clamped at one end, the longest bent by its tip."""
+    t, n = 0.02, 5
+    s = scene(
+        COMM,
+        "quadrilateral",
+        [box("quadrilateral", [0, -t * (k + 1)], [1 - k / 8, -t * k], [16 - 2 * k + k % 2, 1]) for k in range(n)],
+    )
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, bcs, contacts = fem.Function(V), clamp(V, s.tag("tip", 0, at(0, 1.0)), 1, value=-0.1), []
+    for k in range(n):
+        bcs += clamp(V, s.tag(f"root {k}", k, at(0, 0.0)))
+    for k in range(1, n):
+        upper, lower = s.tag(f"{k}", k, at(1, -t * k)), s.tag(f"above {k}", k - 1, at(1, -t * k))
+        contacts.append(uem.Contact(upper, lower, friction=mu))
+    return uem.UnitedProblem(st_venant(u, 1.0), u, bcs=bcs, contacts=contacts), 1
+
+
+@pytest.mark.parametrize(
+    ("make", "how", "most"),
+    [(belt, (1.0, 3), 150), (belt, (1.0, 5), 100), (pressed, (4, 5), 60), (leaves, (0.2,), 120)],
+)
+def test_scenes_that_went_in_circles(make, how, most):
+    """At the end of the load without a cut, after so many linear solves at most; the states are checked by ``conftest``."""
+    problem, number = make(*how)
+    steps = run(problem, number)
+    assert len(steps) == number and not any(step.cuts for step in steps)
+    assert sum(step.newton_iterations + step.exchanges for step in steps) <= most
+
+
+def test_signals_are_heeded_between_exchanges():
+    """After every linear solve, not only when the bodies have moved."""
+    d = driven(mu=0.3)
+    d.to(0.0, -0.01)
+    heeded = []
+    d.problem.progress.heed = lambda comm: heeded.append(comm)
+    history = d.to(0.05, -0.01)
+    solves = sum(i.exchanges + 1 for i in history[:-1])
+    assert solves > len(history) - 1
+    # and once more when all is done
+    assert len(heeded) == solves + 1

@@ -1,0 +1,90 @@
+"""Directions along the target at contactors with friction, and how far these have moved along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact import friction
+from uem_dolfinx.contact.kinematics import Kinematics
+from uem_dolfinx.contact.ties import Ties
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What friction sees of one placement: a value.
+
+    Attributes:
+        ties: by what contactors follow other nodes.
+        away: how far contactors are from their anchors, or have moved relative to what they follow since the last step ``(n, gdim)``.
+        tangents: directions along the target ``(n, gdim - 1, gdim)``.
+        free_tangents: those in which nothing prescribes the relative motion ``(n, gdim - 1, gdim)``.
+        beside: normals of other rigid surfaces that hold the contactors, zero where none does ``(n, k, gdim)``.
+        prescribed: whether any contactor has a Dirichlet condition.
+        cornered: contactors that a corner holds, along whose edge alone friction acts ``(n,)``.
+    """
+
+    ties: Ties
+    away: Array
+    tangents: Array
+    free_tangents: Array
+    beside: Array
+    prescribed: bool
+    cornered: Bools
+
+    @classmethod
+    def of(cls, kinematics: Kinematics, away: Array, beside: Array, prescribed: bool) -> Frame:
+        """The frame of contactors that are this far ``away (n, gdim)``; other arguments as the attributes (collective)."""
+        normals, ties, c = kinematics.normal[:, None], kinematics.ties, kinematics.corners
+        n, g = away.shape
+        cornered = np.zeros(n, dtype=bool)
+        if c is not None:
+            normals = np.concatenate([normals, c.axes_of(n)], axis=1)
+            cornered[c.which] = True
+        free = np.ones((n, g), dtype=bool)
+        every = told = friction.tangents(normals, free)
+        if prescribed or beside.shape[1]:
+            moves = ties.moves if prescribed else free
+            told = friction.tangents(np.concatenate([normals, beside], axis=1), moves)
+        return cls(ties, away, every, told, beside, prescribed, cornered)
+
+    def along(self, way: Array) -> Array:
+        """Parts of relative motions ``(n, gdim)`` along the target; of what is prescribed, only of the motion itself."""
+        if not self.prescribed:
+            return friction.along(self.tangents, way)
+        told = friction.along(self.free_tangents, way) + friction.along(self.tangents, np.where(self.ties.moves, 0.0, way))
+        return np.where(np.abs(self.beside).sum(axis=(1, 2))[:, None] > 0, friction.along(self.tangents, way), told)
+
+    @cached_property
+    def slip(self) -> Array:
+        """Motion along the target since the last step; of a contactor that sticks, how far it is off its anchor ``(n, gdim)``."""
+        return self.along(self.away)
+
+    def directions(self, vectors: Array) -> Array:
+        """Unit vectors along the target of ``vectors (n, gdim)``, zero for zero."""
+        s = self.along(vectors)
+        size = np.linalg.norm(s, axis=1, keepdims=True)
+        return s / np.where(size > 0, size, 1.0)
+
+    def tangential(self, force: Array) -> Array:
+        """Parts of forces ``(n, gdim)`` along the target."""
+        return friction.along(self.tangents, force)
+
+    def forced(self, away: Array, left_out: Bools) -> Array:
+        """How far conditions and other surfaces take contactors over the target ``(n,)``.
+
+        Args:
+            away: relative motions ``(n, gdim)``.
+            left_out: tangents whose equations depend on others, where more conditions meet than the target can follow
+                ``(n, gdim - 1)``.
+        """
+        along = friction.along(self.tangents, away) - friction.along(self.free_tangents, away)
+        told = np.where(self.beside.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
+        if not self.prescribed:
+            return told
+        lost = np.where(left_out[:, :, None], self.free_tangents, 0.0)
+        parts = (self.tangents, np.where(self.ties.moves, 0.0, away)), (lost, away)
+        return told + sum(np.linalg.norm(friction.along(T, way), axis=1) for T, way in parts)

@@ -1,0 +1,450 @@
+"""The interface of one contact: contactors, what ties them to their target, and the law they follow. It places, decides and commits.
+
+It keeps a trial state that changes with every iteration and a committed one that changes only after convergence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact import active_set
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.state import FrictionState, PairState
+from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.sliding import Sliding
+
+#: A normal return may change nodal forces by this part of the largest contact force.
+#: [heuristic; largest contact force; -]
+GENTLE = 0.1
+
+
+class Interface:
+    """Contactors against one target.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        discretisation: what ties them to their target.
+        friction: what it adds along the target; None without.
+        name: for messages.
+        sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
+        max_penetration: bound on the initial penetration, a length.
+        thickness: of the target's body, a length.
+
+    Attributes:
+        trial: state of the present iteration.
+        committed: state of the last step.
+        kinematics: of the contactors, for the trial state; known after ``project``.
+        initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
+        redundant: active contactors whose equations depend on others and were left out ``(n,)``.
+        reserved: contactors that have rows in the sparsity of P ``(n,)``.
+        barred: contactors that came back into the target from beside it with a blow; they are left out until they are in front of it
+            again ``(n,)``.
+        mutual: whether contactor and target follow each other (two-pass).
+    """
+
+    kinematics: Kinematics
+
+    def __init__(
+        self,
+        config: Configuration,
+        nodes: Indices,
+        discretisation: Discretisation,
+        friction: Sliding | None = None,
+        *,
+        name: str,
+        sliding: str,
+        max_penetration: float,
+        thickness: float = np.inf,
+    ):
+        self.config, self.nodes, self.discretisation, self.friction = config, nodes, discretisation, friction
+        self.name, self.sliding, self.max_penetration, self.thickness = name, sliding, max_penetration, thickness
+        n, g = len(nodes), config.gdim
+        state = PairState.initial(n, g)
+        self.trial = self.committed = replace(state, friction=FrictionState.initial(n, g)) if friction else state
+        self.initial_overlap, self.mutual = 0.0, False
+        none: Bools = np.zeros(n, dtype=bool)
+        self.redundant = self.reserved = self.barred = none
+
+    @property
+    def frictional(self) -> bool:
+        """Whether there is friction."""
+        return self.friction is not None
+
+    @property
+    def target(self) -> Target:
+        """What the contactors may touch."""
+        return self.discretisation.target
+
+    @property
+    def points(self) -> Array:
+        """Current positions of the contactors ``(n, gdim)``."""
+        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+
+    # -- where the contactors stand --------------------------------------------------------------------------------------
+
+    @timed("projection")
+    def project(self) -> None:
+        """Project the contactors onto the target where both are now (collective).
+
+        Raises:
+            NotFiniteError: if the target's functions return what is not finite.
+        """
+        self.kinematics = self.discretisation.place(self.points, self.trial)
+        p = self.projection
+        bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
+        error = None
+        if len(bad):
+            error = NotFiniteError(
+                f"{self.name}: gap {p.gap[bad[0]]}, normal {p.normal[bad[0]]} at {self.config.describe(int(self.nodes[bad[0]]))}: "
+                "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
+            )
+        agree(self.config.comm, error)
+        if self.friction is not None:
+            assert self.trial.friction is not None
+            self.friction.place(self.kinematics, self.trial.friction)
+
+    def _replace(self, kinematics: Kinematics) -> None:
+        """Take other kinematics at the same displacement (collective)."""
+        # values that are the same on one rank are so on all
+        if kinematics is not self.kinematics:
+            self.kinematics = kinematics
+            if self.friction is not None:
+                self.friction.replace(kinematics)
+
+    @property
+    def projection(self) -> Projection:
+        """Of the contactors, as last placed."""
+        return self.kinematics.projection
+
+    @property
+    def gap(self) -> Array:
+        """Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
+        return self.kinematics.gap
+
+    @property
+    def off(self) -> Bools:
+        """Contactors that have slid past an end of the target, and are not taken back yet ``(n,)``."""
+        return self.kinematics.off(self.trial) | self.barred
+
+    @property
+    def movable(self) -> Bools:
+        """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
+        return self.kinematics.movable
+
+    def return_to_target(self, stiffness: Array) -> None:
+        """Normal return [UEM, 4.2]: put the active contactors back onto the moved target (collective).
+
+        A return that would disturb the contact forces is left to the next linear solve, which moves the whole body with it.
+
+        Args:
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
+        """
+        correction = self.kinematics.return_vectors(self.trial)
+        if self.friction is not None:
+            correction = correction + self.friction.return_vectors(self.trial)
+        disturbance = np.abs(stiffness[self.nodes] * correction).max(axis=1)
+        largest = self.config.comm.allreduce(float(self.trial.lam.max(initial=0.0)), op=MPI.MAX)
+        correction[disturbance > GENTLE * largest] = 0.0
+        self.config.displacement[self.nodes] += correction
+        self._replace(self.kinematics.returned(self.points, self.trial))
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks (collective)."""
+        return int(self.config.comm.allreduce(int(self.trial.active.sum())))
+
+    @property
+    def pattern(self) -> Ints:
+        """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
+        told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
+        return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
+
+    def largest_gap(self) -> float:
+        """Largest gap of an active contactor, or distance from the anchor that it sticks to, over all ranks, a length (collective)."""
+        here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
+        if self.friction is not None:
+            here = max(here, self.friction.largest_distance(self.trial, self.redundant))
+        return float(self.config.comm.allreduce(here, op=MPI.MAX))
+
+    # -- activation and release ------------------------------------------------------------------------------------------
+
+    def set_friction(self, value: Array) -> None:
+        """Take other values of the law of friction's parameter ``(n,)`` between two steps (collective)."""
+        assert self.friction is not None
+        self.trial = self.committed = self.friction.other_values(self.committed, value)
+
+    def _set_active(self, state: PairState) -> None:
+        """Take over a state of which only the active set is another (collective)."""
+        if self.friction is not None:
+            state = self.friction.come_and_go(state, self.trial.active)
+        self.trial = state
+        self._replace(self.kinematics.with_active(state))
+
+    def activate_touching(self) -> None:
+        """Start with the contactors that touch without force as active, where they stick (collective)."""
+        anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
+        state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
+        self._set_active(replace(state, at_end=self._at_end(self.trial)))
+        if anchored is not None and self.trial.friction is not None:
+            self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
+        # a first step that fails and is cut starts from here again
+        self.committed = self.trial
+        if anchored is not None:
+            self.project()
+
+    def bar_returned(self) -> int:
+        """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
+        came = self.trial.active & ~self.committed.active & self.committed.passed
+        self.barred = self.barred | came
+        return int(self.config.comm.allreduce(int(came.sum())))
+
+    def _at_end(self, state: PairState) -> Bools:
+        """Contactors that an end of the target holds in the next step ``(n,)``.
+
+        Where the surfaces follow each other none needs to be: past the end, it is the end that touches.
+        """
+        return self.kinematics.at_end(state) & (not self.mutual)
+
+    def follow(self) -> bool:
+        """Let go of contactors past an end of the target, follow the others from facet to facet (collective).
+
+        Returns:
+            Whether any rank changed what its contactors are united to.
+        """
+        off = self.off
+        gone = bool((self.trial.active & off).any())
+        self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
+        self._set_active(state)
+        return bool(self.config.comm.allreduce(gone or moved, op=MPI.LOR))
+
+    def predicted(self, du: Array) -> Array:
+        """Gaps that decide on contact, to first order in an increment; see ``Kinematics.predicted`` (collective)."""
+        return self.kinematics.predicted(du)
+
+    def wrong(
+        self,
+        gap: Array,
+        seen: Traction,
+        stiffness: Array,
+        force_rounding: Array,
+        gap_rounding: float,
+        swept: bool,
+        du: Array | None = None,
+    ) -> active_set.Wrong:
+        """Contactors that break the conditions of contact with such gaps and forces (collective).
+
+        Args:
+            gap: that decides on contact ``(n,)``.
+            seen: contact forces, here or predicted.
+            stiffness: of the contactors along the normal ``(n,)``.
+            force_rounding: forces below it are zero ``(n,)``.
+            gap_rounding: gaps below it are zero, and below rounding of positions.
+            swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
+            du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
+        """
+        off = self.off
+        if swept and self.thickness < np.inf:
+            off = off | (self.trial.slips > 0)
+        # an equation that was left out as dependent and does not hold is no contact
+        apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
+        # the facets of a corner are let go of one by one, which ``follow`` does
+        pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
+        rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
+        wrong = active_set.find_wrong(
+            self.trial, gap, pulled, off, self.movable & ~apart, stiffness, force_rounding=force_rounding, gap_rounding=rounding
+        )
+        if self.friction is None:
+            return wrong
+        return self.friction.wrong(wrong, self.trial, seen, stiffness, (force_rounding, rounding), du)
+
+    def exchange(self, wrong: active_set.Wrong, ahead: bool) -> bool:
+        """Let wrong contactors change sides, and those that are to follow them if ``ahead`` (collective): whether there are any."""
+
+        def enter(state: PairState) -> PairState:
+            self.trial = state
+            self._set_active(active_set.exchange(state, wrong))
+            return self.trial
+
+        if self.friction is None:
+            enter(self.trial)
+            return False
+        self.trial, led = self.friction.exchange(wrong, self.trial, self.committed, self.kinematics, ahead, enter)
+        return led
+
+    def calm(self, which: Bools) -> bool:
+        """Give those of contactors ``which (n,)`` that bends lead to and fro averaged normals in this step: whether any gets them."""
+        from uem_dolfinx.contact.valleys import HOLD_AFTER, MOST_CHANGES
+
+        changes = self.trial.changes
+        some = which & self.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)
+        self.trial = replace(self.trial, changes=np.where(some, MOST_CHANGES, changes))
+        return bool(some.any())
+
+    def meet(self, others: Sequence[Interface]) -> None:
+        """Take what other contacts with rigid surfaces do to the same contactors (collective)."""
+        if self.friction is None:
+            return
+        normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
+        for k, other in enumerate(others):
+            _, own, theirs = np.intersect1d(self.nodes, other.nodes, return_indices=True)
+            normals[own, k] = np.where(other.trial.active[theirs, None], other.projection.normal[theirs], 0.0)
+        self.friction.meet(self.kinematics, normals)
+
+    def place_again(self) -> None:
+        """Put contactors whose equations have changed where they now belong (collective)."""
+        self._replace(self.kinematics.placed_again(self.trial))
+
+    # -- bodies that only contact holds ----------------------------------------------------------------------------------
+
+    @property
+    def _ahead(self) -> Ints:
+        """Contactors in front of the target that are not active."""
+        return np.flatnonzero(~self.trial.active & ~self.off & self.movable)
+
+    @property
+    def approach(self) -> UnitingEquations:
+        """The equations that all contactors in front of the target would have, of those that are not active."""
+        return self.kinematics.approach(self._ahead)
+
+    def activate_closing(self, closing: Bools) -> bool:
+        """Activate the contactors among those of ``approach`` that close and touch (collective): whether there are any."""
+        i = self._ahead
+        now = i[closing & (self.projection.gap[i] <= active_set.TOUCHING * self.config.size)]
+        active = self.trial.active.copy()
+        active[now] = True
+        self._set_active(replace(self.trial, active=active))
+        return bool(self.config.comm.allreduce(len(now)))
+
+    def release_apart(self) -> None:
+        """Release contactors without friction that rigid motions have taken off their target (collective)."""
+        if not self.frictional:
+            apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
+            self._set_active(replace(self.trial, active=self.trial.active & ~apart))
+
+    # -- what the united system gets -------------------------------------------------------------------------------------
+
+    def equations(self) -> Constraints:
+        """Uniting equations of the contactors that are or may become active (collective).
+
+        Contactors near the target keep rows in the sparsity of P; they are looked for anew when an active one lacks its row. Where
+        nothing touches at the start of a step, none has one until something does.
+        """
+        if (self.trial.active & ~self.reserved).any():
+            self.reserved = self.kinematics.near(self.trial)
+        own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
+        return own if self.friction is None else self.friction.equations(own, self.trial, self.kinematics)
+
+    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+        """Take which of the equations ``(m,)`` depend on others and were left out."""
+        normal = (equations.kind == NORMAL) & (equations.tangent < 0)
+        self.redundant = np.zeros(len(self.nodes), dtype=bool)
+        self.redundant[equations.contactor[normal]] = redundant[normal]
+        if self.friction is not None:
+            self.friction.set_redundant(equations, redundant)
+
+    def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
+        """Contact forces from the multipliers of the equations ``(m,)`` (collective).
+
+        ``du (n_owned, gdim)`` is the increment that they are predicted with; None where the bodies are now.
+        """
+        if self.friction is None:
+            return self.kinematics.forces(self.trial, equations, multipliers)
+        return self.friction.forces(equations, multipliers, self.trial, self.kinematics, du)
+
+    @property
+    def traction(self) -> Traction:
+        """Contact forces of the trial state."""
+        t = self.trial
+        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau)
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """The contact forces of a state at nodes of both bodies; see ``Kinematics.nodal_forces``."""
+        return self.kinematics.nodal_forces(state)
+
+    def with_forces(self, found: Traction) -> PairState:
+        """The trial state with contact forces that were read or predicted."""
+        state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force)
+        if state.friction is None or found.tau is None:
+            return state
+        return replace(state, friction=replace(state.friction, tau=found.tau))
+
+    def set_forces(self, found: Traction, active: Bools | None = None) -> None:
+        """Give the trial state contact forces, and an active set ``(n,)`` if another method than elimination decides on it."""
+        state = self.with_forces(found)
+        self.trial = state if active is None else replace(state, active=active)
+
+    def known_forces(self) -> tuple[Ints, Array] | None:
+        """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)``; None without any."""
+        return None if self.friction is None else self.friction.known_forces(self.trial, self.kinematics)
+
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
+        parts = self.kinematics.curvature(self.trial)
+        return parts if self.friction is None else parts + self.friction.curvature(self.trial, self.kinematics)
+
+    def turn(self, stiffness: Array) -> None:
+        """Take the directions of friction from where the contactors are; ``stiffness (n, gdim)`` is the diagonal of K at them."""
+        if self.friction is not None:
+            self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
+
+    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+        """What sliding friction adds to tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
+        return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
+
+    # -- trial and committed ---------------------------------------------------------------------------------------------
+
+    def commit(self) -> None:
+        """Make the trial state the committed one; to be followed by ``project``."""
+        if self.friction is not None:
+            self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
+        slips = np.where(self.trial.active, self.trial.slips, 0)
+        self.barred = self.barred & (self.projection.gap < 0)
+        passed = self.off | (self.trial.passed & (self.projection.gap < 0))
+        fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
+        self.committed = replace(fresh, at_end=self._at_end(fresh))
+        self.restore()
+        self.discretisation.commit()
+        if not self.trial.active.any():
+            self.reserved = np.zeros_like(self.reserved)
+
+    def restore(self) -> None:
+        """Go back to the committed state; to be followed by ``project``."""
+        self.trial = self.committed
+
+    def memory(self) -> tuple[PairState, Bools, Bools, Bools]:
+        """What the next step begins with, the displacement aside."""
+        return self.committed, self.reserved, self.redundant, self.barred
+
+    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+        """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
+        self.committed, self.reserved, self.redundant, self.barred = memory
+        self.discretisation.commit()
+        if self.friction is not None:
+            self.friction.forget()
+        self.restore()
+
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
+        return kept | self.committed.to_checkpoint(self.target.keys_of)
+
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
+        reserved, redundant, barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
+        self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant, barred))

@@ -1,0 +1,235 @@
+"""The seam of contact: a discretisation makes a value ``Kinematics`` of where contactors stand relative to their target.
+
+An interface asks it for gaps, for rows of equations with the contactor and the kind of each, for forces from the rows' multipliers and
+for their derivatives. How they come about it does not ask, so that nodes against facets, control gaps of quadratic surfaces, or
+integrals over segments differ in nothing else. A law decides on gaps and forces, without knowing of rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.projection import Projection, Target
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.corners import Corners
+    from uem_dolfinx.contact.ties import Ties
+
+#: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
+#: [format; number of a kind; -]
+NORMAL = 0
+
+
+class Traction(NamedTuple):
+    """Contact forces of the contactors of an interface.
+
+    Attributes:
+        lam: along the normal, that decides on contact ``(n,)``.
+        nodal: of the node along the normal ``(n,)``.
+        force: on the contactor ``(n, gdim)``.
+        tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
+    """
+
+    lam: Array
+    nodal: Array
+    force: Array
+    tau: Array | None = None
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Uniting equations of one interface, each with its contactor and kind. Lists that do not differ are the same object.
+
+    Attributes:
+        trial: rows of P: how contactors move, ``du = P dq + c``.
+        test: rows of Q: how contact forces are handed on, ``Q'r = 0``. Equations of both are in the same order and eliminate the same
+            nodes.
+        frictionless: test rows as they are without the friction of contactors that slip.
+        resisting: trial rows of all relative motions that the contact resists.
+        stopping: trial rows of the relative motions that the contact does not let go on without end.
+        contactor: place of each equation's contactor among those of the interface ``(m,)``.
+        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
+        tangent: number of the direction along the target of equations by which friction holds, -1 for all others ``(m,)``.
+    """
+
+    trial: UnitingEquations
+    test: UnitingEquations
+    frictionless: UnitingEquations
+    resisting: UnitingEquations
+    stopping: UnitingEquations
+    contactor: Ints
+    kind: Ints
+    tangent: Ints
+
+    @classmethod
+    def without_friction(cls, trial: UnitingEquations, test: UnitingEquations, contactor: Ints, kind: Ints) -> Constraints:
+        """Equations across the target alone."""
+        return cls(trial, test, test, trial, trial, contactor, kind, np.full(len(kind), -1))
+
+    def across(self) -> Constraints:
+        """The test rows across the target alone, without friction."""
+        which = self.tangent < 0
+        rows = self.frictionless.select(which)
+        return Constraints.without_friction(rows, rows, self.contactor[which], self.kind[which])
+
+    def __len__(self) -> int:
+        return len(self.contactor)
+
+
+class Kinematics(Protocol):
+    """Where contactors stand relative to their target, in one state and at one displacement: a value."""
+
+    @property
+    def points(self) -> Array:
+        """Of the contactors ``(n, gdim)``."""
+
+    @property
+    def projection(self) -> Projection:
+        """Of the contactors; those that a corner holds are in the corner."""
+
+    @property
+    def nearest(self) -> Projection:
+        """Of the contactors, on their nearest facets."""
+
+    @property
+    def gap(self) -> Array:
+        """That decides on contact ``(n,)``: of nodes, control gaps on a quadratic surface, or weighted ones."""
+
+    @property
+    def corners(self) -> Corners | None:
+        """Of the target that hold contactors; None if no rank has any."""
+
+    @property
+    def normal(self) -> Array:
+        """Unit vectors across which friction acts ``(n, gdim)``."""
+
+    @property
+    def movable(self) -> Bools:
+        """Contactors whose gap can be closed, for all the Dirichlet conditions on both sides ``(n,)``."""
+
+    @property
+    def ties(self) -> Ties:
+        """By what contactors follow other nodes, and how they move relative to these (first time: collective)."""
+
+    @property
+    def force_per_multiplier(self) -> Array:
+        """Friction that belongs to ``lam`` over the multipliers of equations along the target ``(n,)`` (first time: collective)."""
+
+    @property
+    def cone(self) -> Array:
+        """``lam`` over these times the multiplier of a contactor's equation along the normal ``(n,)`` (first time: collective)."""
+
+    # -- the same contactors in another state ----------------------------------------------------------------------------
+
+    def with_active(self, state: PairState) -> Kinematics:
+        """In a state of which only the active set is another (collective)."""
+
+    def placed_again(self, state: PairState) -> Kinematics:
+        """At the same points in another state (collective)."""
+
+    def returned(self, points: Array, state: PairState) -> Kinematics:
+        """After the normal return to ``points (n, gdim)`` (collective)."""
+
+    def follow(self, state: PairState) -> tuple[Kinematics, PairState, bool]:
+        """Follow contactors from facet to facet, into corners and out of them: whether equations change here (collective)."""
+
+    # -- what decides ----------------------------------------------------------------------------------------------------
+
+    def predicted(self, du: Array) -> Array:
+        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+
+    def off(self, state: PairState) -> Bools:
+        """Contactors that have slid past an end of the target ``(n,)``."""
+
+    def at_end(self, state: PairState) -> Bools:
+        """Contactors that an end of the target holds in the next step ``(n,)``."""
+
+    def near(self, state: PairState) -> Bools:
+        """Contactors so near that a row in the sparsity of P pays ``(n,)``."""
+
+    def return_vectors(self, state: PairState) -> Array:
+        """Displacements that put the active contactors back onto the target [UEM, 4.2], zero for others ``(n, gdim)``."""
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def approach(self, which: Ints) -> UnitingEquations:
+        """The equations that the contactors ``which (k,)`` would have if they were active."""
+
+    def equations(self, state: PairState, which: Ints) -> Constraints:
+        """Equations across the target of the contactors ``which (k,)``; those of inactive ones only keep their place."""
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """Contact forces across the target from the multipliers of equations ``(m,)`` (collective)."""
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """The state's contact forces at nodes of both bodies: global nodes, repeated or not ``(k,)``, and forces ``(k, gdim)``."""
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda grad^2 g``: lists of global nodes ``(k, m)`` and values ``(k, m gdim, m gdim)``."""
+
+    def turning(self, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+        """Derivatives of the forces of friction of contactors that slip (collective).
+
+        Args:
+            state: of the interface.
+            which: contactors that slip and push, ascending ``(k,)``.
+            tau: their friction, as multipliers of rows along the target ``(k, gdim)``.
+
+        Returns:
+            Lists of global nodes, negative where there is none, and blocks, as of ``curvature``.
+        """
+
+    def areas(self, areas: Array, current: bool) -> Array:
+        """What ``lam`` is an integral of the pressure over, as drawn or where it is now (collective).
+
+        Args:
+            areas: integrals of the shape functions over the one or the other ``(n,)``.
+            current: which of the two.
+        """
+
+
+class Discretisation(Protocol):
+    """Ties contactors to a target. From step to step it keeps the feet or segments of a contact with small sliding."""
+
+    @property
+    def target(self) -> Target:
+        """What the contactors may touch."""
+
+    @property
+    def followed(self) -> Indices:
+        """Local nodes that contactors may follow, repeated or not ``(k,)``."""
+
+    @property
+    def two_pass(self) -> bool:
+        """Whether the target may be the contactor of another contact with these surfaces."""
+
+    @property
+    def pointwise(self) -> bool:
+        """Whether each contactor follows the point of the target below it, rather than in a mean."""
+
+    @property
+    def at_feet(self) -> bool:
+        """Whether contact forces act at the feet of the projection."""
+
+    @property
+    def chained(self) -> bool:
+        """Whether contactors may follow each other."""
+
+    @property
+    def prescribed(self) -> bool:
+        """Whether any contactor on any rank has a Dirichlet condition."""
+
+    def with_friction(self, mu: Array) -> None:
+        """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+
+    def place(self, points: Array, state: PairState) -> Kinematics:
+        """The only search: where contactors at ``points (n, gdim)`` stand (collective)."""
+
+    def commit(self) -> None:
+        """A step has been kept."""

@@ -1,0 +1,1 @@
+"""Laws of contact as functions of arrays, without mesh and without communication."""

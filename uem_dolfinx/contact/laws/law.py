@@ -1,0 +1,77 @@
+"""What a law of friction says, and how a law in one file is handed to a contact.
+
+A contactor that sticks bears any force along the target up to a limit; one that slips bears the limit against its way. The law is this
+limit and its derivative with the force along the normal, from which test rows are tilted. ``coulomb`` and ``tresca`` are examples of a
+file each: a law of the user's own is a class with the same attributes, and is given to ``Contact`` as ``friction``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.parallel import agreed, ask_together
+
+#: A number, or a function of place that is given points ``(3, n)`` as drawn and returns ``(n,)``.
+Field: TypeAlias = float | Callable[[Array], npt.ArrayLike]
+
+
+class FrictionLaw(Protocol):
+    """A law of friction."""
+
+    @property
+    def field(self) -> Field:
+        """Its one parameter by place, 0 where there is no friction."""
+
+    @property
+    def per_area(self) -> bool:
+        """Whether its limit needs the contactors' areas."""
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """The largest force along the target, and its derivative with the force along the normal.
+
+        Args:
+            value: of ``field`` at the contactors ``(n,)``.
+            lam: forces along the normal, 0 or positive ``(n,)``.
+            area: of the surface as drawn that these are integrals over ``(n,)``; zeros unless ``per_area``.
+
+        Returns:
+            A force and a number for each contactor ``(n,)``.
+        """
+
+
+def as_law(friction: Any) -> FrictionLaw:
+    """The law that a contact was given: Coulomb's where it is a number or a function; refuse all else."""
+    if hasattr(friction, "limit"):
+        return cast(FrictionLaw, friction)
+    return Coulomb(friction if callable(friction) else given.number("friction", friction, given.NOT_NEGATIVE))
+
+
+def given_friction(friction: Any) -> Field | FrictionLaw:
+    """Friction that was given, a number, a function or a law; refuse all else."""
+    law = as_law(friction)
+    if not callable(law.field):
+        given.number("friction", law.field, given.NOT_NEGATIVE)
+    return law if hasattr(friction, "limit") else law.field
+
+
+def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str) -> Array | None:
+    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)``; None if all are zero (collective)."""
+    if not callable(law.field):
+        return np.full(len(nodes), law.field) if law.field > 0 else None
+    places = np.zeros((3, len(nodes)))
+    places[: config.gdim] = config.X[nodes].T
+    words = f"contact '{name}': friction"
+    value = np.array(ask_together(config.comm, words, law.field, places), dtype=float)
+    with agreed(config.comm):
+        if value.shape != (len(nodes),) or not given.NOT_NEGATIVE.holds(value).all():
+            raise InputError(f"{words}(x) has shape {value.shape}: expected {len(nodes)} numbers, 0 or positive and finite")
+    return value if config.comm.allreduce(int((value > 0).any())) else None

@@ -1,0 +1,30 @@
+"""Tresca's law: friction up to a stress that does not depend on the pressure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.arrays import Array
+
+
+@dataclass(frozen=True)
+class Tresca:
+    """A contactor slips where the force along the target reaches ``tau A``, wherever it touches.
+
+    The united matrix is symmetric: test rows are those of P.
+
+    Args:
+        field: the stress tau, a force per area as drawn: a number, or a function of place that is given points ``(3, n)`` as drawn and
+            returns ``(n,)``.
+    """
+
+    field: float | Callable[[Array], npt.ArrayLike]
+    per_area = True
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """``tau A`` and 0; see ``FrictionLaw``."""
+        return value * area, np.zeros_like(value)

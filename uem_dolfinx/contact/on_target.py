@@ -1,0 +1,66 @@
+"""Contactors and the target that they are searched on, whatever their gaps are."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
+
+
+class OnTarget:
+    """Contactors of one target.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        target: what they may touch.
+        free: components without Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
+        sliding: ``"finite"`` projects at every placement, ``"small"`` once per step, ``"fixed"`` once.
+        thickness: of the target's body, a length: what has passed its end and is deeper than this lies behind it.
+
+    Attributes:
+        free: components without Dirichlet condition of the contactors ``(n, gdim)``.
+        free_of_owned: of all owned nodes.
+        prescribed: whether any contactor on any rank has a Dirichlet condition.
+        frictional: whether there is friction.
+        anchor: projection whose feet a contact with small or fixed sliding keeps.
+    """
+
+    def __init__(
+        self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf
+    ):
+        self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
+        self.free, self.free_of_owned, self.frictional = free[nodes], free, False
+        self.prescribed = bool(config.comm.allreduce(int(not self.free.all())))
+        self.anchor: Projection | None = None
+        #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
+        self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
+
+    def with_friction(self, mu: Array) -> None:
+        """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+        self.frictional = True
+
+    @property
+    def followed(self) -> Indices:
+        """Local nodes of the target, repeated or not ``(k,)``."""
+        return self.target.dofs.ravel()
+
+    def on_target(self, points: Array, anchor: Projection | None = None) -> Projection:
+        """The contactors on the nearest places of the target, or with the feet of ``anchor``; as before if nothing moved (collective)."""
+        if not self.target.n_nodes:
+            return self.target.project(points) if anchor is None else self.target.follow(points, anchor)
+        x, last = self.config.x[self.target.dofs], self._projected
+        same = last is not None and last[2] is anchor and np.array_equal(points, last[0]) and np.array_equal(x, last[1])
+        if last is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+            found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
+            self._projected = last = points, x, anchor, found
+        return last[3]
+
+    def commit(self) -> None:
+        """Small sliding finds its feet anew in every step."""
+        if self.sliding == "small":
+            self.anchor = None

@@ -1,0 +1,432 @@
+"""What an interface with friction adds along the target: equations of contactors that stick, tilted rows and forces of those that slip.
+
+``friction`` says, as functions of arrays, who sticks and who slips, and a law how much force that takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact import friction
+from uem_dolfinx.contact.active_set import GAP_ROUNDING, Wrong
+from uem_dolfinx.contact.anchors import anchored, anchors_of, way_since
+from uem_dolfinx.contact.corners import friction_in
+from uem_dolfinx.contact.frame import Frame
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.slip_front import Front
+from uem_dolfinx.contact.state import FrictionState, LastStep, PairState, Pivot
+from uem_dolfinx.geometry.configuration import Configuration
+
+#: What is left of a limit that is proportional to the force along the normal, below this part of it, is rounding.
+#: [bound; limit of friction; -]
+ROUNDING = 1e-14
+
+
+class Sliding:
+    """Friction of the contactors of one interface.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        discretisation: what ties them to their target.
+        law: of friction.
+        value: of its parameter at the contactors ``(n,)``.
+        areas: of the contactors' surface as drawn ``(n,)``, asked for by laws that need them (collective).
+        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+        keeps_feet: whether feet stay where they were at the start of the step.
+
+    Attributes:
+        frame: directions along the target and relative motions, of the last placement.
+        left_out: tangents whose equations depend on others and were left out ``(n, gdim - 1)``.
+    """
+
+    frame: Frame
+
+    def __init__(
+        self,
+        config: Configuration,
+        nodes: Indices,
+        discretisation: Discretisation,
+        *,
+        law: FrictionLaw,
+        value: Array,
+        areas: Callable[[], Array],
+        free: Bools,
+        keeps_feet: bool,
+    ):
+        self.config, self.nodes, self.discretisation = config, nodes, discretisation
+        self.law, self.free, self.keeps_feet = law, free, keeps_feet
+        n, g = len(nodes), config.gdim
+        self._areas = areas() if law.per_area else np.zeros(n)
+        self.area = self._areas
+        self.set(value)
+        self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
+        self._beside: Array = np.zeros((n, 0, g))
+        self._anchors: Array = np.zeros((n, g))
+        self._last: LastStep | None = None
+        self._pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+
+    def set(self, value: Array) -> None:
+        """Take other values of the law's parameter ``(n,)``."""
+        self.value = value
+        _, slope = self.law.limit(value, np.zeros(len(value)), self.area)
+        self.discretisation.with_friction(slope)
+
+    # -- where the contactors stand --------------------------------------------------------------------------------------
+
+    def place(self, kinematics: Kinematics, state: FrictionState) -> None:
+        """Find the anchors, or how far contactors have moved, where bodies and target are now (collective)."""
+        if self.discretisation.pointwise:
+            self._anchors = anchors_of(state, self.discretisation.target)
+        elif self._last is None:
+            here = self.config.x[: self.config.n_owned].copy()
+            self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
+        if self.law.per_area:
+            self.area = kinematics.areas(self._areas, False)
+        self.replace(kinematics)
+
+    def replace(self, kinematics: Kinematics) -> None:
+        """Take other kinematics at the same displacement (collective)."""
+        if self.discretisation.pointwise:
+            away = kinematics.points - self._anchors
+        else:
+            assert self._last is not None
+            away = self._last.ties.relative(self._way_since(self._last))
+        self.frame = Frame.of(kinematics, away, self._beside, self.discretisation.prescribed)
+
+    def _way_since(self, last: LastStep) -> Array:
+        return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
+
+    def meet(self, kinematics: Kinematics, normals: Array) -> None:
+        """Take the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which they do not slip (collective)."""
+        if self.config.comm.allreduce(not np.array_equal(normals, self._beside), op=MPI.LOR):
+            self._beside = normals
+            self.replace(kinematics)
+
+    def active(self, state: PairState) -> Bools:
+        """Active contactors that friction acts on ``(n,)``."""
+        return state.active & (self.value > 0)
+
+    def slipping(self, state: PairState) -> Bools:
+        """Contactors that slip ``(n,)``."""
+        return self.active(state) & ~_of(state).stick
+
+    def directions(self, state: PairState) -> Array:
+        """Directions of slip, which turn with the surface ``(n, gdim)``; zero for contactors that do not slip."""
+        return self.frame.directions(_of(state).direction)
+
+    def largest_distance(self, state: PairState, redundant: Bools) -> float:
+        """Largest distance from the anchor that a contactor sticks to, on this rank, a length."""
+        held = np.where(self.left_out[:, :, None], 0.0, self.frame.free_tangents)
+        away = friction.along(held, self.frame.away)[self.active(state) & _of(state).stick & ~redundant]
+        return float(np.linalg.norm(away, axis=1).max(initial=0.0))
+
+    def return_vectors(self, state: PairState) -> Array:
+        """Displacements along the target that put contactors that stick back to their anchors ``(n, gdim)``."""
+        stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
+        stuck &= (self.free | ~self.frame.ties.moves).all(axis=1)
+        return -np.where(stuck[:, None], friction.along(self.frame.free_tangents, self.frame.away), 0.0)
+
+    # -- the law ---------------------------------------------------------------------------------------------------------
+
+    def bound(self, lam: Array) -> Array:
+        """Largest force along the target with forces ``lam (n,)`` along the normal ``(n,)``."""
+        return self.law.limit(self.value, np.maximum(lam, 0.0), self.area)[0]
+
+    def _cone(self, state: PairState) -> tuple[Array, Array]:
+        """The limit as a linear function of the force along the normal, about that of the state: its value at 0 and slope ``(n,)``."""
+        lam = np.maximum(state.lam, 0.0)
+        limit, slope = self.law.limit(self.value, lam, self.area)
+        rest = limit - slope * lam
+        return np.where(np.abs(rest) > ROUNDING * limit, rest, 0.0), slope
+
+    def _limit(self, state: PairState, lam: Array) -> Array:
+        rest, slope = self._cone(state)
+        return rest + slope * lam
+
+    # -- who sticks and who slips ----------------------------------------------------------------------------------------
+
+    def come_and_go(self, state: PairState, before: Bools) -> PairState:
+        """The state in which contactors that were not active ``before (n,)`` stick, and those that are no longer forget."""
+        return replace(state, friction=friction.come_and_go(_of(state), before, state.active, self.value > 0))
+
+    def other_values(self, state: PairState, value: Array) -> PairState:
+        """The state with other values of the law's parameter ``(n,)``: contactors that get friction stick where they are."""
+        was = state.active & (self.value > 0)
+        self.set(value)
+        now = friction.come_and_go(_of(state), was, state.active & (value > 0), value > 0)
+        return replace(state, friction=now)
+
+    def wrong(
+        self, wrong: Wrong, state: PairState, seen: Traction, stiffness: Array, rounding: tuple[Array, float], du: Array | None
+    ) -> friction.FrictionWrong:
+        """Add those that break the conditions of friction (collective).
+
+        Args:
+            wrong: contactors that break the conditions of contact.
+            state: of the interface.
+            seen: contact forces, here or predicted.
+            stiffness: of the contactors ``(n,)``.
+            rounding: forces ``(n,)`` and lengths below which they are zero.
+            du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
+        """
+        away, tau = self.frame.away, _of(state).tau
+        if du is not None and seen.tau is not None:
+            away, tau = away + self.frame.ties.relative(du), seen.tau
+        lam, forced = seen.lam, self.frame.forced(away, self._lost)
+        by = friction.Seen(lam, self.frame.tangential(tau), self.bound(lam), self.frame.along(away), forced)
+        turned = replace(_of(state), direction=self.directions(state))
+        forces, lengths = rounding
+        who = self.active(state)
+        return friction.find_wrong(wrong, turned, who, by, stiffness, force_rounding=forces, gap_rounding=lengths)
+
+    @property
+    def _lost(self) -> Bools:
+        return np.asarray(self.left_out & ~self.free.all(axis=1, keepdims=True))
+
+    def exchange(
+        self,
+        wrong: Wrong,
+        state: PairState,
+        committed: PairState,
+        kinematics: Kinematics,
+        ahead: bool,
+        enter: Callable[[PairState], PairState],
+    ) -> tuple[PairState, bool]:
+        """Let wrong contactors change between stick and slip (collective).
+
+        Args:
+            wrong: contactors to change.
+            state: of the interface.
+            committed: that of the last step.
+            kinematics: of the contactors.
+            ahead: whether those that are to follow slip ahead.
+            enter: takes contactors in and out of contact (collective).
+
+        Returns:
+            The state, and whether any slip ahead.
+        """
+        assert isinstance(wrong, friction.FrictionWrong)
+        seen, pivot, share = wrong.seen, self._pivot, kinematics.force_per_multiplier[:, None]
+        tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, wrong.driven
+        space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
+        if ahead:
+            taken, tau = self._next_in_line(wrong, state, kinematics.points, tau)
+            pivot = replace(pivot, taken=taken)
+        slide = wrong.slide | pivot.taken if ahead else wrong.slide
+        # in the plane one whose slip turns slips the other way first: where a surface turns back they would else follow one after the
+        # other; nodes in space turn as long as the force q is beyond the cone; bodies that slide without end are held
+        q = pivot.stiffness[:, None] * slip - tau / share
+        beyond = np.linalg.norm(q, axis=1) > self.bound(lam) / share[:, 0] if space else ~pivot.turned
+        turns = wrong.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
+        # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
+        back = (wrong.enter & (committed.active | pivot.released | forced) | wrong.slide & forced) & (size > 0)
+        changed = replace(wrong, slide=slide, hold=wrong.hold & ~turns)
+        state = enter(replace(state, friction=friction.exchange(_of(state), changed, tau)))
+        led_by = pivot.stiffness[:, None] * slip if self.config.gdim == 3 else slip
+        way = np.where((turns & ~forced)[:, None] & space, q, led_by)
+        state = replace(state, friction=friction.turned(_of(state), back | turns, way))
+        # from here the slip of a target that has moved under contactors adds c w to the forces that q belongs to
+        q, of_q, led = pivot.q.copy(), pivot.tau.copy(), slide | back | turns
+        q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
+        of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
+        released, turned = pivot.released | wrong.release, pivot.turned | turns
+        self._pivot = replace(pivot, released=released, turned=turned, q=q, tau=of_q)
+        return state, ahead and bool(self.config.comm.allreduce(pivot.taken.any(), op=MPI.LOR))
+
+    def _next_in_line(self, wrong: friction.FrictionWrong, state: PairState, points: Array, tau: Array) -> tuple[Bools, Array]:
+        """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
+        stick, begin = self.active(state) & _of(state).stick, wrong.slide & ~wrong.driven
+        back = bool((self._pivot.taken & stick).any())
+        near, force = self._pivot.front.move(points[begin], tau[begin], back, points)
+        near &= stick & ~begin & ~wrong.release
+        return near, np.where(near[:, None], self.frame.tangential(force), tau)
+
+    def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
+        """Begin another linearised problem: directions of slip from where contactors are and from the forces last predicted.
+
+        Args:
+            state: of the interface.
+            kinematics: of the contactors.
+            stiffness: diagonal of K at them ``(n, gdim)``.
+        """
+        frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
+        if self.config.gdim == 2:
+            self._pivot = Pivot.begin(Front(self.config.comm), np.zeros(len(none)), none, none)
+            return state
+        c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
+        T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
+        # friction has no part in what is prescribed to stand still, and none but of the motion where all of that is prescribed
+        told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
+        goes = frame.forced(frame.away, self._lost) > GAP_ROUNDING * self.config.size
+        tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], friction.along(T, tau), tau)
+        q = c[:, None] * frame.slip - tau
+        self._pivot = Pivot.begin(Front(self.config.comm), c, q, tau)
+        return replace(state, friction=friction.turned(_of(state), self.slipping(state), q))
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
+        """Equations with those along the target, and tilted test rows where contactors slip (collective)."""
+        g, f, frame = self.config.gdim, _of(state), self.frame
+        normal = np.flatnonzero(own.kind == NORMAL)
+        who, test = own.contactor[normal], own.test
+        place = np.full(len(self.nodes), -1, dtype=np.int64)
+        place[who] = np.arange(len(who))
+        row, followed, weight = frame.ties.row, frame.ties.followed, frame.ties.weight
+        there = place[row] >= 0
+        row, followed, weight = place[row[there]], followed[there], weight[there, None]
+
+        def along(t: Array, gap: Array, active: Bools) -> UnitingEquations:
+            return UnitingEquations(test.node[normal], t, gap, active, row, followed, weight * t[row])
+
+        T, rubbing, slipping = frame.free_tangents[who], self.active(state)[who], self.slipping(state)[who]
+        away = np.einsum("nrg,ng->nr", T, frame.away[who])
+        resisted = [rubbing & T[:, r].any(axis=1) for r in range(g - 1)]
+        parts = [along(T[:, r], away[:, r], resisted[r] & f.stick[who]) for r in range(g - 1)]
+        frictionless = tilted = UnitingEquations.join([test, *parts], g)
+        trial = frictionless if own.trial is test else UnitingEquations.join([own.trial, *parts], g)
+        if self.config.comm.allreduce(int(slipping.any())):
+            size = (self._cone(state)[1] * kinematics.cone)[who, None]
+            tilt = np.where(slipping[:, None], -size * self.directions(state)[who], 0.0)
+            if self.config.comm.allreduce(bool(tilt.any()), op=MPI.LOR):
+                tilted = _tilted(frictionless, normal, tilt, (row, followed, weight))
+        stopping = trial
+        if g == 3:
+            across = np.cross(kinematics.normal[who], self.directions(state)[who])
+            stopping = UnitingEquations.join([trial, along(across, np.zeros(len(who)), slipping)], g)
+        return Constraints(
+            trial,
+            tilted,
+            frictionless,
+            replace(trial, active=np.concatenate([own.trial.active, *resisted])),
+            stopping,
+            np.concatenate([own.contactor, *[who] * (g - 1)]),
+            np.concatenate([own.kind, *[np.full(len(who), NORMAL)] * (g - 1)]),
+            np.concatenate([own.tangent, *(np.full(len(who), r) for r in range(g - 1))]),
+        )
+
+    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+        """Take which equations along the target were left out; ``redundant (m,)`` of all."""
+        which = equations.tangent >= 0
+        self.left_out = np.zeros_like(self.left_out)
+        self.left_out[equations.contactor[which], equations.tangent[which]] = redundant[which]
+
+    def forces(
+        self, equations: Constraints, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
+    ) -> Traction:
+        """Contact forces across and along the target from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
+        held = equations.tangent >= 0
+        across = kinematics.forces(state, equations.across(), multipliers[~held])
+        share, i = kinematics.force_per_multiplier, np.flatnonzero(held)
+        limit = self._limit(state, across.lam) / share
+        tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
+        np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.test.direction[i])
+        if du is not None and self.config.gdim == 3:
+            projector, stiffness, part = self._turning(state, kinematics)
+            i = np.flatnonzero(self.slipping(state))
+            taken = stiffness[:, None] * self.frame.ties.relative(du)[i] + part[:, None] * self._pivot.tau[i]
+            tau[i] -= np.einsum("kgh,kh->kg", projector, taken)
+        at_contactors = tau
+        if not self.discretisation.pointwise:
+            at_contactors = np.asarray(self.config.add_at_owners(*self.frame.ties.handed_on(tau))[self.nodes])
+        return across._replace(force=across.force + at_contactors, tau=tau * share[:, None])
+
+    def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array] | None:
+        """Friction of contactors that does not grow with the force along the normal: nodes and forces; None without any (collective)."""
+        rest, _ = self._cone(state)
+        if not self.config.comm.allreduce(bool(rest.any()), op=MPI.LOR):
+            return None
+        size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
+        return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
+
+    def _turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
+        """Of contactors that slip: projectors across their directions ``(k, g, g)``, and what ``turn_stiffness`` returns."""
+        i = np.flatnonzero(self.slipping(state))
+        T, s = self.frame.tangents[i], self.directions(state)[i]
+        across = np.einsum("krg,krh->kgh", T, T) - s[:, :, None] * s[:, None, :]
+        across[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
+        bound = (self.bound(state.lam) / kinematics.force_per_multiplier)[i]
+        return across, *friction.turn_stiffness(np.linalg.norm(self._pivot.q[i], axis=1), bound, self._pivot.stiffness[i])
+
+    def slip_terms(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array, Array] | None:
+        """What holds the directions of slip back in space; see ``Interface``."""
+        if self.config.gdim == 2:
+            return None
+        i = np.flatnonzero(self.slipping(state))
+        across, stiffness, part = self._turning(state, kinematics)
+        nodes, share = self.frame.ties.table(i)
+        k, m, g = *share.shape, self.config.gdim
+        blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, share, across).reshape(k, m * g, m * g)
+        forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self._pivot.tau[i]).reshape(k, m * g)
+        return nodes, blocks, forces
+
+    def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
+        """Derivatives of the forces of friction of contactors that slip, with the rows along the target (collective)."""
+        which = np.flatnonzero(self.slipping(state) & (state.lam > 0))
+        if not self.config.comm.allreduce(len(which)):
+            return []
+        limit = self._limit(state, state.lam) / kinematics.force_per_multiplier
+        tau = -limit[which, None] * self.directions(state)[which]
+        return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau)]
+
+    # -- from step to step -----------------------------------------------------------------------------------------------
+
+    def anchored(self, state: PairState, kinematics: Kinematics) -> FrictionState:
+        """The state in which contactors that do not stick are anchored where they are."""
+        f = _of(state)
+        if not self.discretisation.pointwise:
+            return f
+        loose = ~f.stick | ~self.active(state) | self.frame.cornered
+        return anchored(f, kinematics, self.discretisation.target, kinematics.points, loose, self.keeps_feet)
+
+    def commit(self, state: PairState, committed: PairState, kinematics: Kinematics) -> PairState:
+        """The state to be committed, with slips, work and new anchors (collective)."""
+        share, f, held = kinematics.force_per_multiplier[:, None], self.anchored(state, kinematics), self.frame.cornered
+        _, slope = self._cone(state)
+        tau = np.where(held[:, None], friction_in(kinematics.corners, state, committed.facet, slope) * share, f.tau)
+        # a contactor that changes facets slides over both
+        start, end = self._ways(kinematics)
+        slipped = f.slipped + np.where(held[:, None], end, np.where(self.slipping(state)[:, None], self.frame.slip / share, 0.0))
+        taken = friction.work(_of(committed).tau, tau, start, end, held)
+        self._last = None
+        now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken)
+        return replace(state, friction=now)
+
+    def forget(self) -> None:
+        """Another step has been begun from."""
+        self._last = None
+
+    def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
+        """Ways past the target since the last step, for a unit of friction at its start and one at its end ``(n, gdim)`` (collective)."""
+        share = kinematics.force_per_multiplier[:, None]
+        if self._last is None:
+            return (self.frame.away / share,) * 2
+        now = kinematics.ties.relative(self._way_since(self._last))
+        return self.frame.away / self._last.force_per_multiplier[:, None], now / share
+
+
+def _of(state: PairState) -> FrictionState:
+    assert state.friction is not None
+    return state.friction
+
+
+def _tilted(equations: UnitingEquations, which: Ints, tilt: Array, terms: tuple[Ints, Ints, Array]) -> UnitingEquations:
+    """Equations ``which (k,)`` of which have ``tilt (k, gdim)`` added, by the rows, nodes and weights of ``terms``."""
+    direction, (row, followed, weight) = equations.direction.copy(), terms
+    direction[which] += tilt
+    return replace(
+        equations,
+        direction=direction,
+        row=np.concatenate([equations.row, which[row]]),
+        followed=np.concatenate([equations.followed, followed]),
+        coefficients=np.concatenate([equations.coefficients, weight * tilt[row]]),
+    )

@@ -1,0 +1,91 @@
+"""How contactors move relative to what they follow, in components that are free and in those that Dirichlet conditions prescribe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.geometry.configuration import Configuration
+
+#: Where more than this part of what a prescribed contactor follows in a mean is prescribed as well, as on a plane of symmetry, this part
+#: counts alone: integrals over one side of the plane have parts of the nodes beside it. Halves are on the safe side of rounding.
+#: [convention; part of the weights; test_ties.py::test_what_is_held_tells]
+MOST_HELD = 0.5 + 1e-6
+
+
+@dataclass(frozen=True)
+class Ties:
+    """What contactors follow, and which components of their relative motion can change.
+
+    Attributes:
+        config: configuration of the displacement.
+        nodes: owned contactors ``(n,)``.
+        row: place of the contactor of each term ``(k,)``.
+        followed: global node that the term follows ``(k,)``.
+        weight: by which it does ``(k,)``.
+        moves: components of the relative motion that Dirichlet conditions leave free ``(n, gdim)``.
+        held: weights that tell the other components ``(k, gdim)``; None where they are ``weight``.
+    """
+
+    config: Configuration
+    nodes: Indices
+    row: Ints
+    followed: Ints
+    weight: Array
+    moves: Bools
+    held: Array | None
+
+    @classmethod
+    def of(
+        cls, config: Configuration, nodes: Indices, terms: tuple[Ints, Ints, Array], free: Bools | None, at_feet: bool
+    ) -> Ties:
+        """Ties with the weights ``terms`` (collective).
+
+        Args:
+            config: configuration of the displacement.
+            nodes: owned contactors ``(n,)``.
+            terms: ``row``, ``followed`` and ``weight``.
+            free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``; None if all contactors are free.
+            at_feet: whether weights are those of points, rather than means.
+        """
+        row, followed, weight = terms
+        if free is None:
+            return cls(config, nodes, row, followed, weight, np.ones((len(nodes), config.gdim), dtype=bool), None)
+        theirs = config.ask_owners(followed, free.astype(float))
+        size = np.abs(weight)[:, None]
+        of_free, of_held = (sums_of_rows(row, size * part, len(nodes)) for part in (theirs, 1.0 - theirs))
+        others = of_free > MOSTLY_PRESCRIBED
+        if at_feet:
+            return cls(config, nodes, row, followed, weight, free[nodes] | others, None)
+        moves = free[nodes] | (others & (of_held <= MOST_HELD * (of_held + of_free)))
+        part, whole = (sums_of_rows(row, weight[:, None] * w, len(nodes)) for w in (1.0 - theirs, np.ones_like(theirs)))
+        ratio = np.where(moves | (part == 0.0), 1.0, whole / np.where(part == 0.0, 1.0, part))
+        return cls(config, nodes, row, followed, weight, moves, (weight[:, None] * (1.0 - theirs)) * ratio[row])
+
+    def relative(self, du: Array) -> Array:
+        """How an increment ``(n_owned, gdim)`` moves contactors relative to what they follow ``(n, gdim)`` (collective)."""
+        theirs, n = self.config.ask_owners(self.followed, du), len(self.nodes)
+        way = du[self.nodes] - sums_of_rows(self.row, self.weight[:, None] * theirs, n)
+        if self.held is None:
+            return np.asarray(way)
+        return np.where(self.moves, way, du[self.nodes] - sums_of_rows(self.row, self.held * theirs, n))
+
+    def table(self, which: Ints) -> tuple[Ints, Array]:
+        """Of contactors ``which (k,)``: global nodes that move them relative to the target, -1 for none, and by how much ``(k, m)``."""
+        order = np.argsort(self.row, kind="stable")
+        row = self.row[order]
+        first = np.searchsorted(row, np.arange(len(self.nodes)))
+        column = np.arange(len(row)) - first[row]
+        nodes = np.full((len(self.nodes), int(column.max(initial=-1)) + 2), -1, dtype=np.int64)
+        share = np.zeros(nodes.shape)
+        nodes[:, 0], share[:, 0] = self.config.to_global(self.nodes), 1.0
+        nodes[row, column + 1], share[row, column + 1] = self.followed[order], -self.weight[order]
+        return nodes[which], share[which]
+
+    def handed_on(self, tau: Array) -> tuple[Ints, Array]:
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``tau (n, gdim)`` along the target, on both bodies."""
+        nodes = np.concatenate([self.config.to_global(self.nodes), self.followed])
+        return nodes, np.concatenate([tau, -self.weight[:, None] * tau[self.row]])

@@ -1,0 +1,245 @@
+"""Weighted gaps of a mortar discretisation: what contact asks of the rows that integrals over segments have made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.duals import Basis, basis_of
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
+from uem_dolfinx.contact.mortar_ends import curvature
+from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, WeightedRows
+from uem_dolfinx.contact.mortar_turning import Slips, turning
+from uem_dolfinx.contact.node_to_surface import near_target, past_end
+from uem_dolfinx.contact.on_target import OnTarget
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.ties import Ties
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.overlaps import Planes
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
+
+#: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
+#: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
+COVERED_AGAIN = 0.5
+
+
+class Contactors(OnTarget):
+    """Contactor facets of one target; other arguments as those of ``OnTarget``.
+
+    Args:
+        surface: the contactor's facets.
+    """
+
+    at_feet = False
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self.surface = surface
+        self.basis: Basis = basis_of(surface.shape)
+        self.elimination = Elimination(config, nodes, self.free)
+        self.remembered = Remembered(config, nodes, surface)
+
+    def along(self, equations: UnitingEquations, values: Array) -> Array:
+        """What the left sides of the equations make of the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
+        nodes, place = np.unique(equations.followed, return_inverse=True)
+        theirs = self.config.ask_owners(nodes, values)[place]
+        own = np.einsum("ng,ng->n", equations.direction, values[equations.node])
+        return own - np.bincount(equations.row, np.einsum("kg,kg->k", equations.coefficients, theirs), minlength=len(equations))
+
+    def sizes(self, x: Array) -> Array:
+        """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
+        return Planes.of(self.surface.shape, x, self.surface.sign).size
+
+    def stretch(self, facets: Ints, size: Array) -> Array:
+        """Areas that facets around contactors have grown to, ``size (k,)``, over those they were drawn with ``(n,)`` (collective)."""
+        dofs, mean = self.surface.dofs[facets], self.basis.mean
+        drawn = self.sizes(self.config.X[self.surface.dofs])[facets]
+        now, then = (self.config.to_owners(dofs.ravel(), (a[:, None] * mean).ravel())[self.nodes] for a in (size, drawn))
+        return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
+
+
+@dataclass(frozen=True)
+class MortarKinematics:
+    """Implements ``Kinematics``: weighted gaps.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        points: of the contactors ``(n, gdim)``.
+        projection: of the contactors, with weighted gaps and the directions of their plain rows.
+        nearest: of the contactors, on their nearest facets.
+        gap: weighted gaps ``(n,)``.
+        rows: all equations and what they were made of.
+        movable: contactors that can move along the normal, or something that they follow can ``(n,)``.
+    """
+
+    of: Contactors
+    points: Array
+    projection: Projection
+    nearest: Projection
+    gap: Array
+    rows: WeightedRows
+    movable: Bools
+
+    @property
+    def corners(self) -> None:
+        """No corner holds a facet."""
+        return None
+
+    @property
+    def normal(self) -> Array:
+        """Directions of the derivatives of the gaps with the contactors' own displacements ``(n, gdim)``."""
+        assert self.rows.normal is not None
+        return self.rows.normal
+
+    @cached_property
+    def ties(self) -> Ties:
+        """With integrals of the dual functions times the shape functions of both sides, over that of the contactor's own."""
+        of = self.of
+        assert self.rows.weights is not None
+        return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, of.at_feet)
+
+    @property
+    def force_per_multiplier(self) -> Array:
+        """Of all that the facets at a contactor push with, each along its own derivative of the gap."""
+        assert self.rows.push is not None
+        return np.asarray(self.rows.share / self.rows.push)
+
+    @property
+    def cone(self) -> Array:
+        """Of equations that were divided by the lengths of their derivatives."""
+        assert self.rows.push is not None
+        return np.asarray(self.rows.push / self.rows.length)
+
+    # -- the same contactors in another state ----------------------------------------------------------------------------
+
+    def with_active(self, state: PairState) -> MortarKinematics:
+        """Weighted gaps do not depend on the active set."""
+        return self
+
+    def placed_again(self, state: PairState) -> MortarKinematics:
+        """No equation depends on the state."""
+        return self
+
+    def returned(self, points: Array, state: PairState) -> MortarKinematics:
+        """Nothing is returned."""
+        return self
+
+    def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
+        """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
+
+        What a rigid target covers is kept in mind, and of what a mesh covers the nodes with a dual function of their own.
+        """
+        of, rows = self.of, self.rows
+        if of.sliding == "finite":
+            covered = np.zeros(of.surface.dofs.shape, dtype=bool)
+            if isinstance(of.target, MeshTarget):
+                covered[rows.facets] = rows.points.duals.kept
+            else:
+                covered[rows.facets[rows.points.facet[rows.points.segments.pair]]] = True
+            state = replace(state, cover=of.remembered.of(covered))
+        if not (of.target.faceted and of.sliding == "finite"):
+            return self, state, False
+        number = self.projection.facet
+        moved = state.active & ~rows.covered & (state.facet >= 0) & (state.facet != number)
+        return self, replace(state, facet=number, changes=state.changes + moved), False
+
+    # -- what decides ----------------------------------------------------------------------------------------------------
+
+    def predicted(self, du: Array) -> Array:
+        """Weighted gaps after an increment (collective)."""
+        return np.asarray(self.rows.length * (self.rows.equations.gap + self.of.along(self.rows.equations, du)))
+
+    def off(self, state: PairState) -> Bools:
+        """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
+
+        A target that springs back when its end lets go would cover the contactor's last bit again, for ever.
+        """
+        rows = self.rows
+        if not self.of.target.n_nodes:
+            return np.zeros(len(self.points), dtype=bool)
+        past = past_end(self.projection, state, self.of.thickness)
+        return np.where(rows.covered, (state.slips > 0) & (rows.ratio < COVERED_AGAIN), past)
+
+    def at_end(self, state: PairState) -> Bools:
+        """No end holds contactors: what is covered of them fades away."""
+        return np.zeros(len(self.points), dtype=bool)
+
+    def near(self, state: PairState) -> Bools:
+        """Contactors about a facet from the target; a rigid surface has no facets to measure by, and takes all."""
+        return near_target(self.projection, state, self.off(state))
+
+    def return_vectors(self, state: PairState) -> Array:
+        """Weighted gaps are closed by the linear solve."""
+        return np.zeros(self.points.shape)
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def approach(self, which: Ints) -> UnitingEquations:
+        """The equations that the contactors ``which (k,)`` would have if they were active."""
+        part = self._select(which)
+        return replace(part, active=np.ones(len(part), dtype=bool))
+
+    def equations(self, state: PairState, which: Ints) -> Constraints:
+        """One equation for each contactor."""
+        rows = replace(self._select(which), active=state.active[which])
+        return Constraints.without_friction(rows, rows, which, np.full(len(which), NORMAL))
+
+    def _select(self, which: Ints) -> UnitingEquations:
+        chosen = np.zeros(len(self.points), dtype=bool)
+        chosen[which] = True
+        return self.rows.equations.select(chosen)
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """Pressures times areas, and the contactors' forces (collective)."""
+        rows, config = self.rows, self.of.config
+        mu = np.zeros(len(self.points))
+        mu[equations.contactor] = multipliers
+        force = np.asarray(config.add_at_owners(*self._handed_on(mu))[self.of.nodes])
+        return Traction(mu / rows.length * rows.share, np.einsum("ng,ng->n", force, rows.plain.direction), force)
+
+    def _handed_on(self, mu: Array) -> tuple[Ints, Array]:
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
+        eq, nodes = self.rows.equations, self.of.nodes
+        own, terms = mu != 0, mu[eq.row] != 0
+        there = np.concatenate([self.of.config.to_global(nodes[own]), eq.followed[terms]])
+        return there, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """What the equations hand on of the state's multipliers."""
+        nodes, forces = self._handed_on(state.lam / self.rows.share * self.rows.length)
+        if state.friction is None:
+            return nodes, forces
+        along = self.ties.handed_on(state.friction.tau / self.force_per_multiplier[:, None])
+        return np.concatenate([nodes, along[0]]), np.concatenate([forces, along[1]])
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Second derivatives of the weighted gaps."""
+        of, rows = self.of, self.rows
+        pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
+        dofs = of.surface.dofs[rows.facets]
+        at_nodes = of.config.from_owners(of.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
+        return curvature(rows.points, at_nodes)
+
+    def turning(self, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+        """Of those that the target covers: traction turns, grows with its surface and is handed to what is opposite (collective)."""
+        of, rows = self.of, self.rows
+        assert rows.weights is not None
+        kept = rows.covered[which]
+        i, tau = which[kept], tau[kept]
+        slips = Slips(i, (state.lam / rows.share)[i], state.lam[i] / rows.area[i], self.normal[i], tau)
+        return turning(of.elimination, rows, of.surface.dofs[rows.facets], slips, rows.weights)
+
+    def areas(self, areas: Array, current: bool) -> Array:
+        """Integrals of the dual functions over what is covered (collective)."""
+        of, rows = self.of, self.rows
+        own = rows.area if current and of.sliding == "finite" else rows.area / rows.stretch
+        if current and of.sliding != "finite":
+            own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
+        return np.where(rows.covered, own, areas)

@@ -1,0 +1,93 @@
+"""UFL forms that users hand over, looked at before they are compiled: arguments, spaces and meshes.
+
+A form of another mesh or space would be assembled with the numbers of other nodes, or beyond the end of arrays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ufl
+from dolfinx import fem
+from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
+from ufl.algorithms.remove_complex_nodes import remove_complex_nodes
+from ufl.core.expr import Expr
+
+from uem_dolfinx import compat, given
+from uem_dolfinx.errors import InputError, SpaceError
+
+
+def check_linear(what: str, form: Any, V: Any) -> None:
+    """Refuse what is no form linear in a test function of a space, on its mesh.
+
+    Args:
+        what: it is, for messages.
+        form: handed over.
+        V: the displacement's space.
+
+    Raises:
+        InputTypeError, InputError, SpaceError: each with the remedy.
+    """
+    arguments = _arguments(what, form, V.mesh, "not linear in its test function", "every term to hold the test function once")
+    if not arguments:
+        remedy = f"of an energy, take {what} = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))"
+        raise InputError(f"{what} is a functional, without test function: expected a form linear in one; {remedy}")
+    if len(arguments) > 1:
+        remedy = "put u in place of the TrialFunction"
+        raise InputError(f"{what} has {len(arguments)} arguments: expected a test function alone; {remedy}")
+    if arguments[0].ufl_function_space() != V:
+        raise SpaceError(
+            f"the test function of {what} belongs to another space than the displacement: expected ufl.TestFunction(u.function_space)"
+        )
+
+
+def check_functional(what: str, form: Any, domain: Any = None) -> None:
+    """Refuse what is no functional, as an energy, on a mesh; None takes the mesh of its first integral; raises as ``check_linear``."""
+    arguments = _arguments(what, form, domain, "no functional", "no test function, or every term to hold it")
+    if arguments:
+        raise InputError(f"{what} has {len(arguments)} argument(s): expected a functional, without test function; leave it out")
+
+
+def _arguments(what: str, form: Any, domain: Any, fault: str, expected: str) -> Any:
+    """Arguments of a form of a mesh in which every term holds all of them once."""
+    if not isinstance(form, ufl.Form):
+        remedy = "integrate it: multiply it by ufl.dx" if isinstance(form, Expr) else "write it with ufl, and do not compile it"
+        given.kind(what, form, False, "a UFL form", remedy)
+    # UFL fails where meshes mix
+    _check_mesh(what, form, domain)
+    try:
+        arguments = form.arguments()
+        # as form compilers do: the conj of ufl.inner is none of a real form
+        check_form_arity(remove_complex_nodes(ufl.algorithms.expand_derivatives(form)), arguments)
+    except (Exception, ArityMismatch) as error:  # of which class depends on the version of UFL
+        raise InputError(f"{what} is {fault} ({error}): expected {expected}") from error
+    return arguments
+
+
+def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
+    """Refuse a form over another mesh, or with Functions, places or tags of one; None takes the mesh of its first integral.
+
+    Raises:
+        SpaceError: naming what is of another mesh.
+    """
+    own = None if domain is None else domain.ufl_domain()
+    for integral in form.integrals():
+        own = own or integral.ufl_domain()
+        if integral.ufl_domain() != own:
+            raise SpaceError(f"{what} is integrated over another mesh: expected {_mesh(domain)}; take ufl.dx(domain=mesh) of it")
+        tags = integral.subdomain_data()
+        if hasattr(tags, "indices") and not compat.belongs_to(tags, own.ufl_cargo()):
+            raise SpaceError(f"{what} has a measure with MeshTags of another mesh: expected those of {_mesh(domain)}")
+        check_expression(what, integral.integrand(), own, _mesh(domain))
+
+
+def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
+    """Refuse a UFL expression with Functions or places of another domain than ``own``, that of ``mesh`` in words, by a SpaceError."""
+    for part in ufl.corealg.traversal.traverse_unique_terminals(expression):
+        if any(other != own for other in ufl.domain.extract_domains(part)):
+            held = f"'{part.name}'" if isinstance(part, fem.Function) else given.described(part)
+            raise SpaceError(f"{what} holds {held} of another mesh: expected all of {mesh}; make both on one mesh")
+
+
+def _mesh(domain: Any) -> str:
+    return "one mesh" if domain is None else "the displacement's mesh"

@@ -1,0 +1,109 @@
+"""Nodes of a space: which rank has them, and what ranks tell each other about them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Ints, sums_of_rows
+from uem_dolfinx.parallel import Exchange
+
+
+class Nodes:
+    """Nodes of a Lagrange space with any number of components each, and where they are at first (collective).
+
+    Args:
+        V: the space.
+
+    Attributes:
+        block: number of components of a node: 1 of a temperature, the dimension of a displacement.
+        index_map: owned nodes and ghosts.
+        n_owned: number of nodes that this rank owns.
+        n_local: that and its ghosts.
+        X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
+    """
+
+    def __init__(self, V: Any):
+        self.V, self.mesh = V, V.mesh
+        self.comm = V.mesh.comm
+        self.gdim: int = V.mesh.geometry.dim
+        self.block: int = V.dofmap.index_map_bs
+        self.index_map = V.dofmap.index_map
+        self.n_owned: int = self.index_map.size_local
+        self.n_local: int = self.n_owned + self.index_map.num_ghosts
+        # every rank takes a node's position from its owner, to the last bit
+        every = np.arange(self.n_local)
+        self.X: Array = self.from_owners(every, V.tabulate_dof_coordinates()[: self.n_local, : self.gdim], every)
+
+    def modes(self, centred: bool = False) -> Array:
+        """Fields that bodies do not resist, at the owned nodes: a constant of each component ``(n_owned, n_modes, block)``.
+
+        Args:
+            centred: whether all are to be of one size (collective if so).
+        """
+        return np.broadcast_to(np.eye(self.block), (self.n_owned, self.block, self.block))
+
+    def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Global block numbers of local nodes."""
+        flat = np.ascontiguousarray(nodes, dtype=np.int32).ravel()
+        return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
+
+    @cached_property
+    def _work(self) -> fem.Function:
+        """Holds what is sent between owners and ghosts."""
+        return fem.Function(self.V)
+
+    def from_owners(self, nodes: npt.NDArray[np.integer], values: Array, wanted: npt.NDArray[np.integer]) -> Array:
+        """Values that owners have at their ``nodes (n, k)``, at local nodes ``wanted (m, k)``, ghosts or not (collective)."""
+        out = np.empty((len(wanted), values.shape[1]))
+        sent = self._work.x.array.reshape(-1, self.block)
+        for first in range(0, values.shape[1], self.block):
+            part = values[:, first : first + self.block]
+            sent[nodes, : part.shape[1]] = part
+            self._work.x.scatter_forward()
+            out[:, first : first + self.block] = sent[wanted, : part.shape[1]]
+        return out
+
+    def to_owners(self, nodes: npt.NDArray[np.integer], values: Array) -> Array:
+        """Sums of values at local ``nodes (m,)``, ghosts or not, at every local node ``(n_local,)`` (collective)."""
+        sent = self._work.x.array.reshape(-1, self.block)
+        sent[:] = 0.0
+        np.add.at(sent[:, 0], nodes, values)
+        forms.sum_ghosts(self._work)
+        return np.array(sent[:, 0])
+
+    @cached_property
+    def _first_nodes(self) -> Ints:
+        """First global node of every rank, and one past the last."""
+        return np.array([*self.comm.allgather(self.index_map.local_range[0]), self.index_map.size_global], dtype=np.int64)
+
+    def owner_of(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Ranks that own global nodes."""
+        return np.searchsorted(self._first_nodes, nodes, side="right") - 1
+
+    def gather_owned(self, nodes: Ints) -> Ints:
+        """Owned local nodes among the global ``nodes (m,)`` of all ranks, each once, sorted (collective)."""
+        (owned,) = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes)
+        return np.unique(owned) - self._first_nodes[self.comm.rank]
+
+    def ask_owners(self, nodes: Ints, values: Array) -> Array:
+        """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
+        exchange = Exchange.to(self.comm, self.owner_of(nodes))
+        (asked,) = exchange.send(nodes)
+        out = np.empty((len(nodes), values.shape[1]))
+        (out[exchange.rows],) = exchange.back(values[asked - self._first_nodes[self.comm.rank]])
+        return out
+
+    def add_at_owners(self, nodes: Ints, values: Array) -> Array:
+        """Sums of values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners ``(n_owned, k)`` (collective)."""
+        there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
+        return sums_of_rows(there - self._first_nodes[self.comm.rank], arrived, self.n_owned)
+
+    def describe(self, node: int) -> str:
+        """Where a local node is, for error messages."""
+        return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"

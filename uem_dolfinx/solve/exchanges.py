@@ -1,0 +1,222 @@
+"""Which of the wrong contactors change sides, exchange by exchange and iteration by iteration.
+
+A state that comes again is noticed when it does. Another rule takes over then; where none is left, an error names the contactors that
+change sides for ever.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.active_set import TOUCHING, Pivoting, Rule, Wrong
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.errors import ConvergenceError, FrictionError
+from uem_dolfinx.solve.first_touch import deepest_of
+
+#: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
+#: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
+ALONG = np.sqrt([2.0, 3.0, 5.0])
+#: The active set of a linearised problem settles within so many exchanges, or the step is cut.
+#: [bound; exchanges; -]
+MOST_EXCHANGES = 100
+#: A state that comes again with more than this part of the residual that it had has led nowhere.
+#: [convention; norm of the residual; test_exchanges.py::test_states_that_come_again]
+NO_LESS = 0.9
+#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left.
+#: [convention; norm of the residual; test_exchanges.py::test_convex_until_it_gets_better]
+WHOLE_AGAIN = 0.1
+#: States of a step may come again so often.
+#: [convention; rounds; test_exchanges.py::test_states_that_come_again]
+MOST_ROUNDS = 6
+#: A state that has come again so often although no contactor changes gets a convex tangent the next time.
+#: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]
+OFTEN = 3
+#: So many of the contactors that change sides for ever are named.
+#: [convention; contactors; test_exchanges.py::test_who_goes_in_a_circle_is_named]
+NAMED = 3
+
+
+@dataclass(frozen=True)
+class _Visit:
+    """A state that the bodies have been in on the way to equilibrium.
+
+    Attributes:
+        state: what tells it from others.
+        norm: of the residual.
+        patterns: of every pair.
+        changed: contactors of every pair that have been exchanged since the one before.
+    """
+
+    state: object
+    norm: float
+    patterns: list[Ints]
+    changed: list[Bools]
+
+
+class Exchanges:
+    """Chooses among the wrong contactors of all pairs; all methods are collective.
+
+    Args:
+        pairs: of all contacts.
+
+    Attributes:
+        straight: whether the linearised problem has to do without the curvature of contact.
+        convex: whether the curvature of contact has to do without what could make the tangent indefinite: Newton's method does not
+            leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
+        frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
+    """
+
+    def __init__(self, pairs: Sequence[Interface]):
+        self._pairs = pairs
+        self._rough = any(pair.frictional for pair in pairs)
+        self.begin_step()
+
+    def begin_step(self) -> None:
+        """Forget the states of other steps."""
+        self._visits: list[_Visit] = []
+        self._rounds = 0
+        #: Norm of the residual since when the curvature is convex; zero for the next.
+        self.convex, self._from = False, 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin another linearised problem."""
+        self._pivoting, self.straight, self.frozen = Pivoting(), False, False
+        self._number, self._rule = 0, Rule.ALL
+        #: Contactors exchanged in this problem, and of these by the present rule.
+        self._changed, self._lately = self._none(), self._none()
+
+    @property
+    def ahead(self) -> bool:
+        """See ``Pivoting``."""
+        return self._pivoting.ahead
+
+    def start_again(self) -> None:
+        """See ``Pivoting``."""
+        self._pivoting.start_again()
+
+    def choose(self, wrong: list[Wrong], gaps: Sequence[Array], curved: bool) -> list[Wrong]:
+        """Which of the wrong contactors are exchanged now; none if no contactor is to.
+
+        Args:
+            wrong: of every pair.
+            gaps: that decide on contact, of every pair ``(n,)``.
+            curved: whether the linearised problem has a curvature of contact.
+
+        Raises:
+            ConvergenceError, FrictionError: if no rule is left; it names the contactors that are wrong by turns.
+        """
+        comm = self._pairs[0].config.comm
+        if self.frozen:
+            wrong = [w.of_contact() for w in wrong]
+        number = count(self._pairs, wrong)
+        if not number:
+            return wrong
+        chosen, rule = wrong, self._pivoting.choose(number, self._state())
+        if rule >= Rule.FIRST and curved and not self.straight:
+            # with curvature the problem may have no solution, or several; without there is one
+            self._pivoting, self.straight, self.convex = Pivoting(), True, True
+        elif rule == Rule.WORST:
+            worst = comm.allreduce(max(w.worst for w in wrong), op=MPI.MAX)
+            chosen = [w.among_the_worst(worst) for w in wrong]
+        elif rule == Rule.FIRST:
+            chosen = self._first(wrong)
+        elif rule == Rule.NONE:
+            if not self._rough or self.frozen:
+                raise self._circle(self._lately)
+            self._pivoting, self.frozen = Pivoting(), True
+            return self.choose(wrong, gaps, curved)
+        elif comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > sum(pair.n_active for pair in self._pairs):
+            chosen = deepest_of(self._pairs, gaps, wrong)
+        if rule != self._rule:
+            self._rule, self._lately = rule, self._none()
+        self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
+        self._number += 1
+        if self._number > MOST_EXCHANGES:
+            raise self._circle(self._lately)
+        return chosen
+
+    def _none(self) -> list[Bools]:
+        return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
+
+    def _first(self, wrong: Sequence[Wrong]) -> list[Wrong]:
+        """The first of the wrong contactors alone, with those at the same place of the same pair."""
+        config = self._pairs[0].config
+        along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
+        least = np.array([np.where(w.which, a, np.inf).min(initial=np.inf) for w, a in zip(wrong, along)])
+        config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+        k = int(np.argmax(np.isfinite(least)))
+        at = least[k] + TOUCHING * config.size
+        return [w.among((a <= at) & (i == k)) for i, (w, a) in enumerate(zip(wrong, along))]
+
+    def visit(self, norm: float) -> bool:
+        """Note the state in which the bodies are, which is no equilibrium.
+
+        Args:
+            norm: of the residual.
+
+        Returns:
+            Whether it has come again, and contactors that go in and out of corners follow bends less closely from now on.
+
+        Raises:
+            ConvergenceError, FrictionError: if it has come again otherwise, naming the contactors that change.
+        """
+        if self.convex:
+            self._from = self._from or norm
+            self.convex = norm > WHOLE_AGAIN * self._from
+        if not self.convex:
+            self._from = 0.0
+        here = _Visit(self._state(), norm, [pair.pattern for pair in self._pairs], self._changed)
+        back = [k for k, v in enumerate(self._visits) if v.state == here.state and norm > NO_LESS * v.norm > 0.0]
+        self._visits.append(here)
+        if not back:
+            return False
+        since = self._visits[back[-1] + 1 :]
+        changed = [
+            np.any([v.changed[i] | (v.patterns[i] != here.patterns[i]).any(axis=1) for v in since], axis=0)
+            for i in range(len(self._pairs))
+        ]
+        comm = self._pairs[0].config.comm
+        if not comm.allreduce(sum(int(c.sum()) for c in changed)):
+            if len(back) <= OFTEN:
+                return False
+            self.convex, self._from = True, max(norm, self._from)
+            return False
+        self._visits, self._rounds = [], self._rounds + 1
+        if self._rounds == MOST_ROUNDS:
+            raise self._circle(changed)
+        return comm.allreduce(any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+
+    def _state(self) -> tuple[int, ...]:
+        """What tells the present states of all contactors from others."""
+        here = zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
+        return tuple(self._pairs[0].config.comm.allgather(here))
+
+    def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
+        """The error that names contactors ``(n,)`` of every pair."""
+        own = [
+            (tuple(pair.config.X[i]), pair.name, pair.config.describe(int(i)))
+            for pair, c in zip(self._pairs, changed)
+            for i in pair.nodes[c]
+        ]
+        found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
+        names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])
+        more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
+        why = "touch and let go, or stick and slip" if self._rough else "touch and let go"
+        return (FrictionError if self._rough else ConvergenceError)(
+            f"the active set goes in a circle: contactors {why} by turns: {names}{more}; take smaller load steps, or a target of finer "
+            f"facets there{', or less friction' if self._rough else ''}"
+        )
+
+
+def count(pairs: Sequence[Interface], wrong: Sequence[Wrong]) -> int:
+    """Number of wrong contactors over all pairs and ranks (collective)."""
+    return int(pairs[0].config.comm.allreduce(sum(w.count for w in wrong))) if pairs else 0

@@ -1,0 +1,64 @@
+"""What a ``UnitedProblem`` has committed, kept so that a step can be taken once more from the state it began with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.geometry.rigid import Motion
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The committed state of a problem: all that its next step begins with.
+
+    Attributes:
+        displacement: ``(n_local incl. ghosts,)``.
+        largest_forces: norm of the largest forces so far.
+        motions: of the pairs' rigid targets.
+        pairs: what each pair remembers.
+        histories: of the materials, values by name.
+        dynamics: what these remember, None in statics.
+    """
+
+    displacement: Array
+    largest_forces: float
+    motions: list[Motion | None]
+    pairs: list[Any]
+    histories: list[dict[str, Array]]
+    dynamics: Any
+
+    @classmethod
+    def of(cls, problem: Any) -> Memory:
+        """What the problem has committed last."""
+        return cls(
+            displacement=problem.committed,
+            largest_forces=problem.largest_forces,
+            motions=problem.motions,
+            pairs=[pair.memory() for pair in problem.pairs],
+            histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
+            dynamics=None if problem.dynamics is None else problem.dynamics.memory(),
+        )
+
+    def put_back(self, problem: Any) -> None:
+        """Make it the problem's committed and present state again (collective)."""
+        problem.committed, problem.largest_forces, problem.motions = self.displacement, self.largest_forces, self.motions
+        move_targets(problem, self.motions)
+        for material, kept in zip(problem.materials, self.histories):
+            for name, values in kept.items():
+                material.history[name].x.array[:] = values
+        if problem.dynamics is not None:
+            problem.dynamics.remember(self.dynamics)
+        for pair, own in zip(problem.pairs, self.pairs):
+            pair.remember(own)
+        problem.restore()
+
+
+def move_targets(problem: Any, motions: list[Motion | None]) -> None:
+    """Put the pairs' rigid targets where these motions take them."""
+    for pair, motion in zip(problem.pairs, motions):
+        if pair.target.motion is not motion:
+            pair.target.motion = motion

@@ -1,0 +1,116 @@
+"""What a run is made with, in words that a checkpoint keeps: a run that goes on with anything else would be neither run.
+
+Values of Constants and Functions are those that a problem was made with, since loads change later; they are told to six digits, which
+no partition changes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from hashlib import blake2b
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from ufl.constantvalue import RealValue
+from ufl.corealg.traversal import unique_pre_traversal
+
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.restart.numbering import DIGEST
+
+#: Numbers of a form that are shown.
+#: [format; numbers; -]
+SHOWN = 12
+
+
+class Settings:
+    """Takes what a problem is made with (making one is not collective).
+
+    Args:
+        forms: residual and damping form, by name.
+        u: displacement.
+        contacts: of the problem.
+        materials: likewise.
+        dynamics: likewise, or None.
+    """
+
+    def __init__(
+        self,
+        forms: dict[str, Any],
+        u: fem.Function,
+        contacts: Sequence[Contact],
+        materials: Sequence[Any],
+        dynamics: Dynamics | None,
+    ):
+        self._contacts, self._dynamics = contacts, dynamics
+        #: Words that are the same on all ranks, and values whose extent over all ranks counts, by name.
+        self._words: dict[str, str] = {}
+        self._values: dict[str, Array] = {}
+        history = [f for material in materials for f in vars(material).values() if isinstance(f, fem.Function)]
+        for name, form in forms.items():
+            if not isinstance(form, ufl.Form):
+                continue
+            numbers, operators = _contents(form)
+            shown = ", ".join(f"{n:.6g}" for n in numbers[-SHOWN:])
+            digest = blake2b(repr((numbers, operators)).encode(), digest_size=DIGEST).hexdigest()
+            self._words[f"{name}, its expressions and numbers"] = f"{shown} in {digest}"
+            for i, constant in enumerate(form.constants(), 1):
+                self._words[f"{name}, Constant {i}"] = " ".join(f"{v:.6g}" for v in np.ravel(constant.value))
+            for i, f in enumerate(form.coefficients(), 1):
+                if f is not u and isinstance(f, fem.Function) and not any(f is other for other in history):
+                    self._values[f"{name}, Function {i}"] = _extent(f.x.array)
+        for i, material in enumerate(materials, 1):
+            for what, values in getattr(material, "parameters", {}).items():
+                self._values[f"material {i}, {what}"] = _extent(values)
+
+    def describe(self, comm: MPI.Comm) -> dict[str, str]:
+        """All settings by name (collective)."""
+        words, values = dict(self._words), dict(self._values)
+        for i, contact in enumerate(self._contacts, 1):
+            name = f"contact {i} '{contact.name}'"
+            for what in ("coupling", "sliding", "normals", "thickness", "chords"):
+                words[f"{name}, {what}"] = str(getattr(contact, what))
+            values[f"{name}, friction"] = _extent(np.zeros(0) if contact.pair.friction is None else contact.pair.friction.value)
+        if (d := self._dynamics) is not None:
+            words |= {
+                "scheme": str(d.scheme),
+                "contactors": d.contactors,
+                "gravity": " ".join(f"{v:.6g}" for v in d.weight_of_one),
+            }
+            mass = " ".join(f"{m:.6g}" for m in d.mass.total)
+            words["mass"] = f"{mass}, its matrix of norm {d.mass.M.norm():.6g}"
+        for name, extent in values.items():
+            least, most = -comm.allreduce(-extent[0], op=MPI.MAX), comm.allreduce(extent[1], op=MPI.MAX)
+            words[name] = "none" if least > most else f"{least:.6g}" + (f" to {most:.6g}" if most > least else "")
+        # what differs from rank to rank by mistake must not be refused on one alone
+        return dict(comm.bcast(words))
+
+
+def _contents(form: ufl.Form) -> tuple[list[float], list[Any]]:
+    """Numbers in a form, and how often each integral has each kind of operator.
+
+    UFL's own signature is of no use: it depends on what was made before the form, since UFL orders operands by their numbers.
+    """
+    numbers, operators = set(), []
+    for part in form.integrals():
+        kinds: Counter[str] = Counter()
+        for e in unique_pre_traversal(part.integrand()):
+            kinds[type(e).__name__] += 1
+            if isinstance(e, RealValue):
+                numbers.add(float(e))
+        operators.append(
+            (part.integral_type(), str(part.subdomain_id()), repr(sorted(part.metadata().items())), sorted(kinds.items()))
+        )
+    return sorted(numbers), sorted(operators)
+
+
+def _extent(values: Any) -> Array:
+    """Least and largest value here."""
+    array = np.asarray(values, dtype=float)
+    return np.array([array.min(initial=np.inf), array.max(initial=-np.inf)])
