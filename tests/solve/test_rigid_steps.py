@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.sparse import block_diag, csr_matrix
+from scipy.sparse import block_diag, csr_matrix, eye
 
 from uem_dolfinx.solve import rigid_steps
 from uem_dolfinx.solve.rigid_steps import least_motion, nearest_point, weighted
@@ -31,7 +31,7 @@ def test_conditions_of_the_minimum(seed, k, m, length):
     assert np.abs(v - Z @ (Z.T @ v)).max(initial=0.0) <= 1e-9 * way
     assert (g + R @ v >= -1e-8 * max(way, length)).all()
     closed = g + R @ v <= 1e-7 * max(way, length)
-    assert (push >= 0).all() and not push[~closed[own]].any()
+    assert (push >= 0).all() and (push[~closed[own]] <= 1e-12 * np.linalg.norm(f)).all()
     left = Z.T @ (M * v - f - COMM.allreduce(R[own].T @ push))
     assert np.linalg.norm(left) <= 1e-6 * (np.linalg.norm(f) + np.linalg.norm(Z.T @ (M * v)))
 
@@ -62,12 +62,12 @@ def test_bodies_apart_are_programmes_of_their_own(monkeypatch):
 
     def motion(some, comm):
         R, g, f = (
-            block_diag([p[0] for p in some], "csr"),
+            block_diag([csr_matrix(p[0]) for p in some], "csr"),
             np.concatenate([p[1] for p in some]),
             np.concatenate([p[2] for p in some]),
         )
         own = np.flatnonzero(np.arange(len(g)) % comm.size == comm.rank)
-        B = weighted(block_diag([np.eye(6)] * len(some), "csr"), np.ones(len(f)))
+        B = weighted(eye(len(f), format="csr"), np.ones(len(f)))
         return least_motion(comm, f, B, R[own], g[own])[0]
 
     together = motion(pairs, COMM).reshape(-1, 6)
