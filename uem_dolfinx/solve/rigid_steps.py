@@ -19,7 +19,7 @@ from uem_dolfinx.algebra.equations import NEGLIGIBLE
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.solve.rigid_motions import blocks_of, by_block
 
-#: Gaps may stay negative by this part of the longest way.
+#: Gaps may stay negative by this part of the longest way, and forces smaller than this part of the largest are none.
 #: [convention; the longest way; test_rigid_steps.py::test_conditions_of_the_minimum]
 KEPT = 1e-10
 
@@ -111,14 +111,19 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     for bound in (h, np.minimum(h, 0.0)):
         d = (bound - G @ p) / size / scale
         E = np.vstack([(G / size[:, None]).T, d])
-        lam = lsq_linear(E, np.append(np.zeros(len(p)), 1.0), (0.0, np.inf), "bvls", 1e-15, max_iter=30 * E.shape[1]).x
+        # which keeps its bounds to rounding
+        lam = np.maximum(
+            lsq_linear(E, np.append(np.zeros(len(p)), 1.0), (0.0, np.inf), "bvls", 1e-15, max_iter=30 * E.shape[1]).x, 0.0
+        )
         left = 1.0 - float(d @ lam)
         if left > KEPT:
             break
     lam *= scale / left / size
-    # to rounding, with the rows that bear
-    i = np.flatnonzero(lam > 0)
-    exact = np.linalg.lstsq(G[i] @ G[i].T, bound[i] - G[i] @ p, rcond=None)[0]
-    if (exact >= 0).all():
-        lam[i] = exact
+    # to rounding, with the rows that bear; one more than there are unknowns, by rounding, would make them contradict each other
+    i = np.flatnonzero(lam * size > KEPT * (lam * size).max(initial=0.0))
+    exact = np.zeros(len(lam))
+    exact[i] = np.linalg.lstsq(G[i] @ G[i].T, bound[i] - G[i] @ p, rcond=None)[0]
+    x = p + G.T @ exact
+    if (exact >= 0).all() and (G @ x - bound >= -KEPT * scale * size).all():
+        return x, exact
     return p + G.T @ lam, lam
