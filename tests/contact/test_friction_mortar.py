@@ -109,11 +109,22 @@ def test_a_cylinder_slides_far(comm, degree):
     assert (np.abs(alone - row).max(axis=0) <= 1e-9 * np.abs(alone).max(axis=0)).all()
 
 
-@pytest.mark.parametrize(("cell", "rigid"), [("quadrilateral", False), ("tetrahedron", False), ("tetrahedron", True)])
-def test_friction_of_mortar_by_differences(cell, rigid):
+@pytest.mark.parametrize(
+    ("cell", "target"),
+    [
+        ("quadrilateral", "wider"),
+        ("tetrahedron", "wider"),
+        ("tetrahedron", "plane"),
+        ("quadrilateral", "ends"),
+        ("tetrahedron", "ends"),
+    ],
+)
+def test_friction_of_mortar_by_differences(cell, target):
     """Derivatives of the forces of friction of weighted gaps, over bodies that bend, all contactors slipping."""
     mu, h = 0.4, 1e-6
-    scene = driven(cell, mu, rigid=rigid, n=(3, 4) if cell == "quadrilateral" else (2, 3), how={"coupling": "mortar"})
+    scene = driven(
+        cell, mu, rigid=target == "plane", n=(3, 4) if cell == "quadrilateral" else (2, 3), how=MORTAR, swap=target == "ends"
+    )
     problem, pair = scene.problem, scene.contact.pair
     g, n = problem.config.gdim, len(pair.nodes)
     smooth, way, pressure = fields(problem, pair)

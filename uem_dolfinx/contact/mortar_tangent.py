@@ -311,7 +311,7 @@ class SegmentPoints:
         gap, height = (np.einsum("qa,qa->q", N, its[pair, :, -1]) - above for N in (tab.N, chord))
         motions = Motions(phi, chord, height / planes.size[pair], self.turning[e][pair])
         return Sides(
-            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), gap=gap, t=t, slope=np.einsum("qg,qg->q", t, outward),
+            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), N=tab.N, gap=gap, t=t, slope=np.einsum("qg,qg->q", t, outward),
             outward=outward, motions=motions, way=motions.along(outward), ahead=ahead,
             shift=shift, cut=cut, weight=s.weight, end=alone,
         )  # fmt: skip

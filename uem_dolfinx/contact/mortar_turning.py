@@ -2,8 +2,8 @@
 
 The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes get
 other shares. The traction turns with the derivative of the weighted gap with the contactor's own displacement, and grows with its size;
-these are the second derivatives of the gap of this contactor alone. Parts of quadratic facets do not all grow as these do. How dual
-functions change where the target ends is left out in what tractions are handed to.
+these are the second derivatives of the gap of this contactor alone. Parts of quadratic facets do not all grow as these do. Where the
+target ends over a facet, what is covered changes, and dual functions with it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import Motions, dual_tangents, sum_of_products
-from uem_dolfinx.geometry.shapes import tangents
+from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Slips:
     tau: Array
 
 
-def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
+def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
     """Derivatives of the nodal forces of a traction whose values at the contactors stay, on both sides.
 
     Args:
@@ -48,7 +48,7 @@ def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
         traction: at the contactor facets' nodes, a force per area ``(m, nc, gdim)``.
 
     Returns:
-        Global nodes of the pairs under traction ``(p, nc + nt)``, and blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+        Lists of global nodes ``(p, c)`` and blocks ``(p, c gdim, c gdim)``.
     """
     s, g = at.segments, at.to_gap.shape[1]
     some = np.bincount(s.pair, minlength=len(at.facet)) > 0
@@ -74,7 +74,34 @@ def handing_on(at: SegmentPoints, traction: Array) -> tuple[Ints, Array]:
             moved = np.zeros((len(q), share.shape[1], g))
             moved[:, motions.nc :] = -tab.dN[:, :, f, None] * force[:, None]
             blocks += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
-    return np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks
+    made = [(np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks)]
+    return made if at.other is None else made + _at_ends(at, at.other, traction)
+
+
+def _at_ends(at: SegmentPoints, other: FacetShape, traction: Array) -> list[tuple[Ints, Array]]:
+    """What ``handing_on`` has from ends of the target, of facets of the shape ``other``: of each pair, and through the facet's mean."""
+    which = at.partly_covered()
+    which = which[traction[at.facet[which]].any(axis=(1, 2))]
+    s = at.sides(other, which).at_ends()
+    if not len(s.pair):
+        return []
+    facet, k, (nc, g), nt = at.facet[which], len(which), traction.shape[1:], at.opposite.shape[1]
+    of_share, of_mean = at.duals.spread(facet[s.pair], s.b, traction)
+    left = np.concatenate([s.motions.phi, -s.N], axis=1)[:, :, None] * of_share[:, None]
+    left[:, :nc] += basis_of(at.shape).T.T @ of_mean
+    local = sum_of_products(s.pair, -s.weight, left, s.way, k)
+    width = (nc + nt) * g
+    means = add_up(s.pair, products(of_mean.reshape(-1, nc * g), (-s.way * s.weight[:, None, None]).reshape(-1, width)), k)
+    # the target's shape functions are projected onto the whole facet, with all that is opposite of it
+    here = np.flatnonzero(means.any(axis=1))
+    i, j = np.nonzero(facet[here, None] == facet[None, :])
+    i = here[i]
+    projected = at.duals.inverse[facet[j]] @ at.covered.N[which[j]]
+    out = np.zeros((len(i), nc + 2 * nt, g, nc + 2 * nt, g))
+    out[:, nc + nt :, :, : nc + nt] = -np.einsum("pbl,pbgah->plgah", projected, means.reshape(k, nc, g, nc + nt, g)[i])
+    nodes = np.concatenate([at.nodes[facet], at.opposite[which]], axis=1)
+    size = (nc + 2 * nt) * g
+    return [(nodes, local), (np.concatenate([nodes[i], at.opposite[which[j]]], axis=1), out.reshape(-1, size, size))]
 
 
 def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: Ints) -> Array:
@@ -116,7 +143,7 @@ def turning(
         weights: by what all contactors follow other nodes.
 
     Returns:
-        Twice, global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
+        Lists of global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
     """
     at, config, (which, normal, tau) = rows.points, elimination.config, (slips.which, slips.normal, slips.tau)
     n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
@@ -134,6 +161,17 @@ def turning(
         on_facet = add_up(at.facet[s.pair], stretched, m).reshape(m, nc, nc, g)
         grown += np.einsum("mjb,bj,mbag->mjag", (at.duals.C != 0).astype(float), basis_of(at.shape).T, on_facet)
     parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g + g)), grown], axis=3))]
+    if at.other is not None:
+        ends = at.partly_covered()
+        sides = at.sides(at.other, ends).at_ends()
+        pair = ends[sides.pair]
+        e = at.facet[pair]
+        share = sides.weight[:, None] * np.einsum(
+            "qjb,bj,qb->qj", (at.duals.C[e] != 0).astype(float), basis_of(at.shape).T, sides.b
+        )
+        grown = -share[:, :, None, None] * sides.way[:, None]
+        over = np.concatenate([at.nodes[e], at.opposite[pair]], axis=1)
+        parts.append(terms_of(at.nodes[e], over, np.concatenate([np.zeros((*grown.shape[:3], g * g + g)), grown], axis=3)))
     length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
     outward = rows.parts / np.where(length > 0, length, 1.0)
     for j in range(nc):
@@ -160,7 +198,7 @@ def turning(
     across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / (slips.push * rows.slope[which])[:, None, None]
     change = np.einsum("kg,kch->kgch", tau, along - of_whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
     blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
-    return [handing_on(at, there[:, :, 1:]), (nodes, blocks)]
+    return [*handing_on(at, there[:, :, 1:]), (nodes, blocks)]
 
 
 def _places(facets: Ints, which: Ints) -> Ints:

@@ -59,6 +59,7 @@ class Sides:
         pair: ascending ``(q,)``.
         xi: reference coordinates on the contactor's facets ``(q, fdim)``.
         b: functions of the contactor's basis there ``(q, nc)``.
+        N: the target's shape functions ``(q, nt)``.
         gap: ``(q,)``.
         t: change of the gap with the place ``(q, gdim)``.
         slope: of the gap outward across the side ``(q,)``.
@@ -75,6 +76,7 @@ class Sides:
     pair: Ints
     xi: Array
     b: Array
+    N: Array
     gap: Array
     t: Array
     slope: Array
