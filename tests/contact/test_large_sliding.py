@@ -13,7 +13,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, box, clamp, highest, lawful, modulus, scene, st_venant
+from helpers import at, blocks, box, clamp, highest, lawful, linear, modulus, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -135,6 +135,18 @@ def test_off_the_end_and_back(cell, normals):
         (force, u), (later, v) = states[k], states[16 - k]
         assert force[-1] > 0.0 and np.abs(force - later).max() < 1e-6 * force[-1]
         assert np.abs(u - v).max() < 1e-6
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("way", "held"), [(0.03, True), (0.2, False)])
+def test_an_end_holds_what_was_drawn_there(way, held, degree):
+    """Edges that coincide slide past each other by 0.06 of a facet and hold on, with forces in balance; by 0.4 of it they let go."""
+    b = blocks(COMM, "quadrilateral", 2, 2, degree=degree)
+    contact = uem.Contact(b.high, b.low)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0, value=way), *clamp(b.V, b.top, 1, value=-0.01)]
+    run(uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact]), 4)
+    lawful(contact)
+    assert contact.n_active == COMM.allreduce(len(contact.pair.nodes)) - (0 if held else 1)
 
 
 @pytest.mark.parametrize("normals", ["facet", pytest.param("averaged", marks=pytest.mark.slow)])

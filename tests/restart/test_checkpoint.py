@@ -165,7 +165,6 @@ def random_state(pair, seed):
         facets[:, 0],
         facets[:, 1:],
         counts[:, 0],
-        counts[:, 1],
         r[:, 0] > 0,
         r[:, 1] > 0,
         counts.sum(axis=1),

@@ -146,7 +146,7 @@ def slide_off(state: PairState, off: Bools) -> PairState:
     """
     gone = state.active & off
     active = state.active & ~off
-    return replace(state, active=active, slips=state.slips + gone, passed=(state.passed | gone) & ~active)
+    return replace(state, active=active, at_end=state.at_end | gone, passed=(state.passed | gone) & ~active)
 
 
 class Rule:

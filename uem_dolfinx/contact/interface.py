@@ -260,7 +260,7 @@ class Interface:
         """
         off = self.off
         if swept and self.thickness < np.inf:
-            off = off | (self.trial.slips > 0)
+            off = off | (self.trial.at_end & self.trial.passed)
         # an equation that was left out as dependent and does not hold is no contact
         apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
         # the facets of a corner are let go of one by one, which ``follow`` does
@@ -413,10 +413,9 @@ class Interface:
         """Make the trial state the committed one; to be followed by ``project``."""
         if self.friction is not None:
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
-        slips = np.where(self.trial.active, self.trial.slips, 0)
         self.barred = self.barred & (self.projection.gap < 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
-        fresh = replace(self.trial, changes=np.zeros_like(slips), slips=slips, passed=passed)
+        fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
         self.restore()
         self.discretisation.commit()

@@ -22,20 +22,14 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.corners import Corners
 
-#: A contactor past an open end by more than this part of its facet has slid off.
-#: [heuristic; length of the facet; -]
-SLID_OFF = 1e-6
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
-#: [heuristic; length of the facet; -]
+#: [heuristic; length of the facet; test_large_sliding.py::test_an_end_holds_what_was_drawn_there]
 END_HOLDS = 0.1
-#: So often a contactor slides off the end before the end holds it where it comes back.
-#: [heuristic; times; -]
-SLIDES_OFF = 1
 #: Contactors nearer than this many facets keep a row in the sparsity of P.
 #: [heuristic; length of the facet; -]
 NEAR = 1.0
@@ -91,7 +85,7 @@ class NodeToSurface(OnTarget):
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
-        i = np.flatnonzero(state.active & _held_at_end(state) & (nearest.beyond != 0).any(axis=1))
+        i = np.flatnonzero(state.active & state.at_end & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i) if len(i) else nearest
 
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
@@ -332,11 +326,12 @@ class NodalKinematics:
 
 
 def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
-    """Contactors that have slid past an open end of the target in a direction in which they can move ``(n,)``.
+    """Contactors that are past an open end of the target in a direction in which they can move ``(n,)``.
 
-    Round the end of a target of this ``thickness`` they come behind it, where a negative gap is no penetration.
+    The end holds those that came to it there; one that has slid off is out until it is in front of the target again. Round the end of a
+    target of this ``thickness`` they come behind it, where a negative gap is no penetration.
     """
-    limit = np.where(_held_at_end(state), END_HOLDS, SLID_OFF)
+    limit = np.where(state.at_end & ~state.passed, END_HOLDS, ON_SIDE)
     behind = state.passed & (p.gap < -thickness)
     return behind | (np.linalg.norm(p.beyond, axis=1) > limit * p.facet_size)
 
@@ -344,10 +339,6 @@ def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
 def near_target(p: Projection, state: PairState, off: Bools) -> Bools:
     """Contactors that are active or about a facet from the target, but for those that are ``off (n,)`` it: ``(n,)``."""
     return state.active | ((p.gap < NEAR * p.facet_size) & ~off)
-
-
-def _held_at_end(state: PairState) -> Bools:
-    return np.asarray(state.at_end | (state.slips > SLIDES_OFF))
 
 
 def _closing(normal: Array, gap: Array, free: Bools) -> Array:

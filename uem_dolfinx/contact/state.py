@@ -124,9 +124,9 @@ class PairState:
         facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
         held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
         changes: how often in this step it has changed facets across a bend ``(n,)``.
-        slips: how often it has slid off the target's end ``(n,)``; released there and pushed back it would go to and fro for ever.
         passed: has been past the target's end since it was last in front of it ``(n,)``.
-        at_end: came to the target, or was drawn, at its end, which has held it since ``(n,)``.
+        at_end: came to the target, or was drawn, at its end, which has held it since, or has slid off it in this step: released there
+            and pushed back it would go to and fro for ever ``(n,)``.
         cover: which of its facets a rigid target covers, or where a mesh leaves it a dual function, one bit each in an order that no
             partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
@@ -139,7 +139,6 @@ class PairState:
     facet: Ints
     held: Ints
     changes: Ints
-    slips: Ints
     passed: Bools
     at_end: Bools
     cover: Ints
@@ -161,7 +160,6 @@ class PairState:
             facet=np.full(n, -1, np.int64),
             held=np.full((n, gdim - 1), -1, np.int64),
             changes=np.zeros(n, np.int64),
-            slips=np.zeros(n, np.int64),
             passed=np.zeros(n, bool),
             at_end=np.zeros(n, bool),
             cover=np.zeros(n, np.int64),

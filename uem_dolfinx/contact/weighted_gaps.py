@@ -165,7 +165,7 @@ class MortarKinematics:
         if not self.of.target.n_nodes:
             return np.zeros(len(self.points), dtype=bool)
         past = past_end(self.projection, state, self.of.thickness)
-        return np.where(rows.covered, (state.slips > 0) & (rows.ratio < COVERED_AGAIN), past)
+        return np.where(rows.covered, state.at_end & (rows.ratio < COVERED_AGAIN), past)
 
     def at_end(self, state: PairState) -> Bools:
         """No end holds contactors: what is covered of them fades away."""
