@@ -1,4 +1,6 @@
-"""Contact pairs: what they refuse at the start."""
+"""Contact pairs: what they refuse at the start, and who has rows in P."""
+
+from dataclasses import replace
 
 from mpi4py import MPI
 
@@ -30,3 +32,15 @@ def test_default_bound_on_the_initial_penetration(part, refused):
         else:
             make()
             assert contact.initial_overlap == pytest.approx(depth, rel=1e-9)
+
+
+def test_who_has_rows():
+    """Those that touch first have rows alone; once another follows, so have all near the target, on any rank alike."""
+    b = blocks(COMM, "quadrilateral", 2, 4, gap=0.01)
+    contact = uem.Contact(b.high, b.low, normals="averaged")
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
+    pair, x = problem.pairs[0], problem.pairs[0].points[:, 0]
+    for reach, rows in ((-1.0, 0), (0.1, 1), (0.3, 5), (0.6, 5)):
+        pair.trial = replace(pair.trial, active=x < reach)
+        assert COMM.allreduce(len(pair.equations().contactor)) == rows
+        assert (pair.reserved | ~pair.trial.active).all()

@@ -342,11 +342,11 @@ class Interface:
     def equations(self) -> Constraints:
         """Uniting equations of the contactors that are or may become active (collective).
 
-        Contactors near the target keep rows in the sparsity of P; they are looked for anew when an active one lacks its row. Where
-        nothing touches at the start of a step, none has one until something does.
+        Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
         """
-        if (self.trial.active & ~self.reserved).any():
-            self.reserved = self.kinematics.near(self.trial)
+        lacks, known = self.config.comm.allreduce(np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
+        if lacks:
+            self.reserved = self.kinematics.near(self.trial) if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
         return own if self.friction is None else self.friction.equations(own, self.trial, self.kinematics)
 
