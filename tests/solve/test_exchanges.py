@@ -5,19 +5,23 @@ Read first: ``test_scenes_that_went_in_circles``.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from friction_scenes import driven
-from helpers import at, blocks, box, clamp, linear, modulus, raised, run, scene, st_venant
+from helpers import Body, at, blocks, box, clamp, linear, modulus, raised, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.contact.active_set import Rule, Wrong
+from uem_dolfinx.contact.friction import FrictionWrong, Seen
+from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.solve.exchanges import ALONG, Exchanges
 
 COMM = MPI.COMM_WORLD
@@ -31,7 +35,7 @@ class Nodes:
         config = SimpleNamespace(
             comm=COMM, X=X, gdim=X.shape[1], size=1.0, describe=lambda i: "(" + ", ".join(f"{c:.6g}" for c in X[i]) + ")"
         )
-        self.config, self.nodes, self.name, self.frictional = config, np.arange(len(X)), name, rough
+        self.config, self.nodes, self.name, self.frictional, self.friction = config, np.arange(len(X)), name, rough, None
         self.active, self.calmed, self.n_active = np.zeros(len(X), bool), False, len(X)
 
     @property
@@ -124,6 +128,40 @@ def test_convex_until_it_gets_better():
     assert not exchanges.convex
 
 
+def test_limits_are_held_until_they_settle():
+    """A mechanism takes back the exchange that has made it; limits are held until they change by less than a tenth of the largest."""
+    pair = Nodes([(float(i), 0.0) for i in range(4)], rough=True)
+    n, held = len(pair.nodes), []
+
+    def hold_limits(lam):
+        before = held[-1] if held else None
+        held.append(lam)
+        change = lam if before is None or lam is None else lam - before
+        return np.zeros(2) if lam is None else np.array([np.abs(change).max(initial=0.0), lam.max(initial=0.0)])
+
+    def seen(lam, slide=False):
+        none, zero = np.zeros(n, bool), np.zeros(n)
+        by = Seen(np.full(n, lam), np.zeros((n, 2)), zero, np.zeros((n, 2)), zero)
+        return [FrictionWrong(none, none, zero + slide, none | slide, none, none, by)]
+
+    pair.trial, pair.taken = PairState.initial(n, 2), []
+    pair.take = pair.taken.append
+    pair.friction = SimpleNamespace(pivot="before", hold_limits=hold_limits)
+    exchanges = Exchanges([pair])
+    start = pair.trial
+    exchanges.choose(seen(1.0, True), (), False, 1.0)
+    assert held == [None] and not exchanges.again
+    pair.trial, pair.friction.pivot = replace(start, slips=start.slips + 1), "after"
+    chosen = exchanges.choose(seen(1e9, True), (), False, 1e4)
+    assert exchanges.again and pair.friction.pivot == "before" and not chosen[0].which.any()
+    assert np.array_equal(pair.taken[0].slips, start.slips) and np.array_equal(held[-1], np.ones(n))
+    for lam, last in ((2.0, False), (2.1, True)):
+        exchanges.choose(seen(lam), (), False, 1.0)
+        assert exchanges.again and (held[-1] is None) == last
+    exchanges.choose(seen(2.1), (), False, 1.0)
+    assert not exchanges.again
+
+
 def test_states_that_come_again():
     """A state with no less than 0.9 of its residual has led nowhere; bends are left out then, and the sixth time is an error."""
     pair = Nodes([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)])
@@ -195,9 +233,48 @@ def leaves(mu):
     return uem.UnitedProblem(st_venant(u, 1.0), u, bcs=bcs, contacts=contacts), 1
 
 
+def bolt(mu, coupling):
+    """Two plates that a bolt draws together, which friction alone holds."""
+
+    def grid(x, y, z, inside):
+        body = box("hexahedron", [0.0] * 3, [len(x) - 1.0, len(y) - 1.0, len(z) - 1.0], [len(x) - 1, len(y) - 1, len(z) - 1])
+        places = np.stack([np.interp(body.x[:, i], np.arange(len(a)), a) for i, a in enumerate((x, y, z))], axis=1)
+        used, cells = np.unique(body.cells[inside(np.abs(places[body.cells].mean(axis=1)))], return_inverse=True)
+        return Body(places[used], cells.reshape(-1, 8))
+
+    plate = np.array([-2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0])
+    low, high = (
+        grid(plate, plate, z, lambda m: m[:, :2].max(axis=1) > 0.6) for z in (np.array([-1.0, 0.0]), np.array([0.0, 1.0]))
+    )
+    across, along = np.array([-1.0, -0.4, 0.0, 0.4, 1.0]), np.array([-1.5, -1.0, 0.0, 1.0, 1.5])
+    shank = grid(across, across, along, lambda m: (m[:, 2] > 1.0) | (m[:, :2].max(axis=1) < 0.4))
+    s = scene(COMM, "hexahedron", [low, high, shank])
+    V = compat.function_space(s.mesh, 1, (3,))
+    u, strain = fem.Function(V), fem.Constant(s.mesh, 0.0)
+
+    def ring(z):
+        return lambda x: at(2, z)(x) & (np.abs(x[:, :2]).max(axis=1) > 0.3)
+
+    how = {"friction": mu, "coupling": coupling}
+    contacts = [uem.Contact(s.tag("over", 1, at(2, 0.0)), s.tag("under", 0, at(2, 0.0)), **how)]
+    contacts += [
+        uem.Contact(s.tag(f"ring {b}", 2, ring(z)), s.tag(f"face {b}", b, at(2, z)), **how) for b, z in ((0, -1.0), (1, 1.0))
+    ]
+    F = linear(u, 100.0) + 100.0 * modulus(s, 0.0, 0.0, 1.0) * strain * ufl.TestFunction(u.function_space)[2].dx(2) * ufl.dx
+    load = {strain: 0.01}
+    return uem.UnitedProblem(F, u, bcs=clamp(V, s.tag("left", 0, at(0, -2.0))), contacts=contacts, load=load), 1
+
+
 @pytest.mark.parametrize(
     ("make", "how", "most"),
-    [(belt, (1.0, 3), 150), (belt, (1.0, 5), 100), (pressed, (4, 5), 60), (leaves, (0.2,), 120)],
+    [
+        (belt, (1.0, 3), 150),
+        (belt, (1.0, 5), 100),
+        (pressed, (4, 5), 60),
+        (leaves, (0.2,), 120),
+        (bolt, (0.2, "node_to_surface"), 60),
+        (bolt, (0.2, "mortar"), 60),
+    ],
 )
 def test_scenes_that_went_in_circles(make, how, most):
     """At the end of the load without a cut, after so many linear solves at most; the states are checked by ``conftest``."""

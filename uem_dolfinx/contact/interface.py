@@ -193,6 +193,10 @@ class Interface:
         """Take over a state of which only the active set is another (collective)."""
         if self.friction is not None:
             state = self.friction.come_and_go(state, self.trial.active)
+        self.take(state)
+
+    def take(self, state: PairState) -> None:
+        """Take a trial state that belongs to where the contactors are now (collective)."""
         self.trial = state
         self._replace(self.kinematics.with_active(state))
 
@@ -215,18 +219,11 @@ class Interface:
         return int(self.config.comm.allreduce(int(came.sum())))
 
     def _at_end(self, state: PairState) -> Bools:
-        """Contactors that an end of the target holds in the next step ``(n,)``.
-
-        Where the surfaces follow each other none needs to be: past the end, it is the end that touches.
-        """
+        """Contactors that an end of the target holds in the next step ``(n,)``: where surfaces follow each other, the end touches."""
         return self.kinematics.at_end(state) & (not self.mutual)
 
     def follow(self) -> bool:
-        """Let go of contactors past an end of the target, follow the others from facet to facet (collective).
-
-        Returns:
-            Whether any rank changed what its contactors are united to.
-        """
+        """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes."""
         off = self.off
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))

@@ -45,6 +45,7 @@ class Sliding:
 
     Attributes:
         frame: directions along the target and relative motions, of the last placement.
+        pivot: what the exchanges of the present linearised problem have done.
         left_out: tangents whose equations depend on others and were left out ``(n, gdim - 1)``.
     """
 
@@ -67,12 +68,14 @@ class Sliding:
         n, g = len(nodes), config.gdim
         self._areas = areas() if law.per_area else np.zeros(n)
         self.area = self._areas
+        #: Limits that stay while forces along the normal change ``(n,)``.
+        self._held: Array | None = None
         self.set(value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
         self._beside: Array = np.zeros((n, 0, g))
         self._anchors: Array = np.zeros((n, g))
         self._last: LastStep | None = None
-        self._pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+        self.pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
     def set(self, value: Array) -> None:
         """Take other values of the law's parameter ``(n,)``."""
@@ -139,11 +142,26 @@ class Sliding:
 
     def bound(self, lam: Array) -> Array:
         """Largest force along the target with forces ``lam (n,)`` along the normal ``(n,)``."""
-        return self.law.limit(self.value, np.maximum(lam, 0.0), self.area)[0]
+        return self.law.limit(self.value, np.maximum(lam, 0.0), self.area)[0] if self._held is None else self._held
+
+    def hold_limits(self, lam: Array | None) -> Array:
+        """Let limits be those of forces ``lam (n,)`` along the normal whatever these become, as in Tresca's law; None lets them follow.
+
+        Returns:
+            By how much a limit that was held has changed at most, and the largest one, on this rank ``(2,)``.
+        """
+        before, self._held = self._held, None
+        if lam is None:
+            return np.zeros(2)
+        self._held = self.bound(lam)
+        change = self._held if before is None else np.abs(self._held - before)
+        return np.array([change.max(initial=0.0), self._held.max(initial=0.0)])
 
     def _cone(self, state: PairState) -> tuple[Array, Array]:
         """The limit as a linear function of the force along the normal, about that of the state: its value at 0 and slope ``(n,)``."""
         lam = np.maximum(state.lam, 0.0)
+        if self._held is not None:
+            return self._held, np.zeros_like(lam)
         limit, slope = self.law.limit(self.value, lam, self.area)
         rest = limit - slope * lam
         return np.where(np.abs(rest) > ROUNDING * limit, rest, 0.0), slope
@@ -215,7 +233,7 @@ class Sliding:
             The state, and whether any slip ahead.
         """
         assert isinstance(wrong, friction.FrictionWrong)
-        seen, pivot, share = wrong.seen, self._pivot, kinematics.force_per_multiplier[:, None]
+        seen, pivot, share = wrong.seen, self.pivot, kinematics.force_per_multiplier[:, None]
         tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, wrong.driven
         space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
         if ahead:
@@ -239,14 +257,14 @@ class Sliding:
         q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
         released, turned = pivot.released | wrong.release, pivot.turned | turns
-        self._pivot = replace(pivot, released=released, turned=turned, q=q, tau=of_q)
+        self.pivot = replace(pivot, released=released, turned=turned, q=q, tau=of_q)
         return state, ahead and bool(self.config.comm.allreduce(pivot.taken.any(), op=MPI.LOR))
 
     def _next_in_line(self, wrong: friction.FrictionWrong, state: PairState, points: Array, tau: Array) -> tuple[Bools, Array]:
         """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
         stick, begin = self.active(state) & _of(state).stick, wrong.slide & ~wrong.driven
-        back = bool((self._pivot.taken & stick).any())
-        near, force = self._pivot.front.move(points[begin], tau[begin], back, points)
+        back = bool((self.pivot.taken & stick).any())
+        near, force = self.pivot.front.move(points[begin], tau[begin], back, points)
         near &= stick & ~begin & ~wrong.release
         return near, np.where(near[:, None], self.frame.tangential(force), tau)
 
@@ -260,7 +278,7 @@ class Sliding:
         """
         frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
         if self.config.gdim == 2:
-            self._pivot = Pivot.begin(Front(self.config.comm), np.zeros(len(none)), none, none)
+            self.pivot = Pivot.begin(Front(self.config.comm), np.zeros(len(none)), none, none)
             return state
         c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
@@ -269,7 +287,7 @@ class Sliding:
         goes = frame.forced(frame.away, self._lost) > GAP_ROUNDING * self.config.size
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], friction.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
-        self._pivot = Pivot.begin(Front(self.config.comm), c, q, tau)
+        self.pivot = Pivot.begin(Front(self.config.comm), c, q, tau)
         return replace(state, friction=friction.turned(_of(state), self.slipping(state), q))
 
     # -- equations and forces --------------------------------------------------------------------------------------------
@@ -333,7 +351,7 @@ class Sliding:
         if du is not None and self.config.gdim == 3:
             projector, stiffness, part = self._turning(state, kinematics)
             i = np.flatnonzero(self.slipping(state))
-            taken = stiffness[:, None] * self.frame.ties.relative(du)[i] + part[:, None] * self._pivot.tau[i]
+            taken = stiffness[:, None] * self.frame.ties.relative(du)[i] + part[:, None] * self.pivot.tau[i]
             tau[i] -= np.einsum("kgh,kh->kg", projector, taken)
         at_contactors = tau
         if not self.discretisation.pointwise:
@@ -355,7 +373,7 @@ class Sliding:
         across = np.einsum("krg,krh->kgh", T, T) - s[:, :, None] * s[:, None, :]
         across[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
         bound = (self.bound(state.lam) / kinematics.force_per_multiplier)[i]
-        return across, *friction.turn_stiffness(np.linalg.norm(self._pivot.q[i], axis=1), bound, self._pivot.stiffness[i])
+        return across, *friction.turn_stiffness(np.linalg.norm(self.pivot.q[i], axis=1), bound, self.pivot.stiffness[i])
 
     def slip_terms(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array, Array] | None:
         """What holds the directions of slip back in space; see ``Interface``."""
@@ -366,7 +384,7 @@ class Sliding:
         nodes, share = self.frame.ties.table(i)
         k, m, g = *share.shape, self.config.gdim
         blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, share, across).reshape(k, m * g, m * g)
-        forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self._pivot.tau[i]).reshape(k, m * g)
+        forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self.pivot.tau[i]).reshape(k, m * g)
         return nodes, blocks, forces
 
     def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:

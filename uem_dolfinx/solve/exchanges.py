@@ -2,13 +2,18 @@
 
 A state that comes again is noticed when it does. Another rule takes over then; where none is left, an error names the contactors that
 change sides for ever.
+
+Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
+are: the united matrix is singular, and what it foresees is far beyond the bodies. From the state before, limits of friction are then held
+at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric. The forces that follow make the next limits,
+until these settle, and Coulomb's law goes on from there.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 from mpi4py import MPI
@@ -17,9 +22,12 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.active_set import TOUCHING, Pivoting, Rule, Wrong
+from uem_dolfinx.contact.friction import FrictionWrong
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.state import PairState, Pivot
 from uem_dolfinx.errors import ConvergenceError, FrictionError
 from uem_dolfinx.solve.first_touch import deepest_of
+from uem_dolfinx.solve.floating import FAR
 
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
 #: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
@@ -39,6 +47,9 @@ MOST_ROUNDS = 6
 #: A state that has come again so often although no contactor changes gets a convex tangent the next time.
 #: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]
 OFTEN = 3
+#: Limits of friction that change by less than this part of the largest are near enough to begin with Coulomb's law.
+#: [convention; the largest limit; test_exchanges.py::test_limits_are_held_until_they_settle]
+LIMITS_NEAR = 0.1
 #: So many of the contactors that change sides for ever are named.
 #: [convention; contactors; test_exchanges.py::test_who_goes_in_a_circle_is_named]
 NAMED = 3
@@ -72,6 +83,7 @@ class Exchanges:
         convex: whether the curvature of contact has to do without what could make the tangent indefinite: Newton's method does not
             leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
         frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
+        again: whether the linearised problem is to be solved with other limits of friction, whoever changes sides.
     """
 
     def __init__(self, pairs: Sequence[Interface]):
@@ -89,8 +101,14 @@ class Exchanges:
 
     def begin(self) -> None:
         """Begin another linearised problem."""
-        self._pivoting, self.straight, self.frozen = Pivoting(), False, False
+        self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
         self._number, self._rule = 0, Rule.ALL
+        #: Whether limits of friction are held, and the last states without a mechanism.
+        self._held = False
+        self._known: list[tuple[PairState, Pivot] | None] | None = None
+        for pair in self._pairs:
+            if pair.friction is not None:
+                pair.friction.hold_limits(None)
         #: Contactors exchanged in this problem, and of these by the present rule.
         self._changed, self._lately = self._none(), self._none()
 
@@ -103,13 +121,14 @@ class Exchanges:
         """See ``Pivoting``."""
         self._pivoting.start_again()
 
-    def choose(self, wrong: list[Wrong], gaps: Sequence[Array], curved: bool) -> list[Wrong]:
+    def choose(self, wrong: list[Wrong], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Wrong]:
         """Which of the wrong contactors are exchanged now; none if no contactor is to.
 
         Args:
             wrong: of every pair.
             gaps: that decide on contact, of every pair ``(n,)``.
             curved: whether the linearised problem has a curvature of contact.
+            way: how far a node goes at most, a length.
 
         Raises:
             ConvergenceError, FrictionError: if no rule is left; it names the contactors that are wrong by turns.
@@ -117,9 +136,16 @@ class Exchanges:
         comm = self._pairs[0].config.comm
         if self.frozen:
             wrong = [w.of_contact() for w in wrong]
-        number = count(self._pairs, wrong)
+        self.again, number = False, count(self._pairs, wrong)
         if not number:
+            if self._held:
+                self._let_limits_follow(wrong)
             return wrong
+        if self._rough and not self._held:
+            if way > FAR * self._pairs[0].config.size and self._known is not None:
+                self._hold_limits()
+                return [w.among(np.zeros_like(w.enter)) for w in wrong]
+            self._known = self._here(wrong)
         chosen, rule = wrong, self._pivoting.choose(number, self._state())
         if rule >= Rule.FIRST and curved and not self.straight:
             # with curvature the problem may have no solution, or several; without there is one
@@ -139,10 +165,49 @@ class Exchanges:
         if rule != self._rule:
             self._rule, self._lately = rule, self._none()
         self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
+        self._solve_again()
+        return chosen
+
+    def _solve_again(self) -> None:
         self._number += 1
         if self._number > MOST_EXCHANGES:
             raise self._circle(self._lately)
-        return chosen
+
+    def _here(self, wrong: Sequence[Wrong]) -> list[tuple[PairState, Pivot] | None]:
+        """States of the pairs with friction, with the forces along the normal that are foreseen."""
+        here: list[tuple[PairState, Pivot] | None] = []
+        for pair, w in zip(self._pairs, wrong):
+            if pair.friction is None or not isinstance(w, FrictionWrong):
+                here.append(None)
+            else:
+                here.append((replace(pair.trial, lam=w.seen.lam), pair.friction.pivot))
+        return here
+
+    def _hold_limits(self) -> None:
+        """Go back to the last state without a mechanism, and hold the limits that its forces make (collective)."""
+        for pair, known in zip(self._pairs, self._known or ()):
+            if pair.friction is not None and known is not None:
+                state, pair.friction.pivot = known
+                pair.take(state)
+                pair.friction.hold_limits(state.lam)
+        self._pivoting, self._held, self.again = Pivoting(), True, True
+        self._solve_again()
+
+    def _let_limits_follow(self, wrong: Sequence[Wrong]) -> None:
+        """Take the limits that held ones have led to, or Coulomb's law where these are near (collective)."""
+        self._known, each = self._here(wrong), np.zeros(2)
+        for pair, known in zip(self._pairs, self._known):
+            if pair.friction is not None and known is not None:
+                pair.trial = known[0]
+                each = np.maximum(each, pair.friction.hold_limits(pair.trial.lam))
+        self._pairs[0].config.comm.Allreduce(MPI.IN_PLACE, each, op=MPI.MAX)
+        if each[0] <= LIMITS_NEAR * each[1]:
+            for pair in self._pairs:
+                if pair.friction is not None:
+                    pair.friction.hold_limits(None)
+            self._held = False
+        self._pivoting, self.again = Pivoting(), True
+        self._solve_again()
 
     def _none(self) -> list[Bools]:
         return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]

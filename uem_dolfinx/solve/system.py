@@ -235,10 +235,7 @@ class BodySystem:
         )
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
-        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if it shows none (collective).
-
-        What ``du`` shows are gaps to first order and the contact forces that balance ``F + K du``.
-        """
+        """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
         if not self.pairs:
             return None
         assert isinstance(state, BodyState)
@@ -247,7 +244,8 @@ class BodySystem:
             increment = du.array_r.reshape(-1, self.config.gdim)
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             left = 0.0 if self.solver.exact else accuracy
-            near = max(FORESEEN, left) * float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            way = float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            near = max(FORESEEN, left) * way
             foreseen = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
@@ -256,8 +254,8 @@ class BodySystem:
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 wrong.append(pair.wrong(gap, seen, along, least, near, self._swept, moved))
-            chosen = wrong if self._adrift else self.exchanges.choose(wrong, foreseen, self._curvature is not None)
-            settled = not count(self.pairs, chosen)
+            chosen = wrong if self._adrift else self.exchanges.choose(wrong, foreseen, self._curvature is not None, way)
+            settled = not (self.exchanges.again or count(self.pairs, chosen))
             if settled and sliding is not None and not self.exchanges.frozen:
                 raise FrictionError(
                     "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
