@@ -151,10 +151,10 @@ def test_limits_are_held_until_they_settle():
     start = pair.trial
     exchanges.choose(seen(1.0, True), (), False, 1.0)
     assert held == [None] and not exchanges.again
-    pair.trial, pair.friction.pivot = replace(start, slips=start.slips + 1), "after"
+    pair.trial, pair.friction.pivot = replace(start, changes=start.changes + 1), "after"
     chosen = exchanges.choose(seen(1e9, True), (), False, 1e4)
     assert exchanges.again and pair.friction.pivot == "before" and not chosen[0].which.any()
-    assert np.array_equal(pair.taken[0].slips, start.slips) and np.array_equal(held[-1], np.ones(n))
+    assert np.array_equal(pair.taken[0].changes, start.changes) and np.array_equal(held[-1], np.ones(n))
     for lam, last in ((2.0, False), (2.1, True)):
         exchanges.choose(seen(lam), (), False, 1.0)
         assert exchanges.again and (held[-1] is None) == last
