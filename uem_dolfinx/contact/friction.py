@@ -18,19 +18,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.state import FrictionState
 
 #: A tangential direction of which prescribed components leave less than this part is prescribed.
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
-#: The stiffness c of a contactor that slips in space, as part of the diagonal of K: from 0.5 on the direction of slip does not settle.
+#: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 0.5 on the direction of slip does not settle.
 #: [heuristic; the diagonal of K; -]
 SLIP_STIFFNESS = 0.1
 #: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
 #: [heuristic; the force q; -]
-LEAST_TURN = 0.99
+LEAST_TURN = 0.999
 
 
 @dataclass(frozen=True)
@@ -174,6 +174,24 @@ def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
     i = which & (size > 0)
     direction = np.where(i[:, None], q / np.where(i, size, 1.0)[:, None], state.direction)
     return replace(state, direction=direction, stick=state.stick & ~i)
+
+
+def slip_stiffness(own: Array, row: Ints, weight: Array, followed: Array) -> Array:
+    """Stiffness c of contactors that slip in space ``(n,)``.
+
+    The contactor and what it follows resist a relative motion one behind the other: ``1 / k = 1 / k_i + sum_a N_a^2 / k_a``, with the
+    diagonal of K for the stiffness at each node. That of a contactor alone, were it much stiffer than its target, would turn the slip
+    by far less than it turns.
+
+    Args:
+        own: diagonal of K at the contactors ``(n,)``.
+        row: contactor of each term ``(k,)``.
+        weight: by which it follows a node ``(k,)``.
+        followed: diagonal of K there ``(k,)``; zero where nothing is known.
+    """
+    seen = (followed > 0) & (own[row] > 0)
+    there = np.bincount(row[seen], weight[seen] ** 2 * own[row[seen]] / followed[seen], len(own))
+    return SLIP_STIFFNESS * own / (1.0 + there)
 
 
 def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:

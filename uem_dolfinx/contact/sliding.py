@@ -274,13 +274,14 @@ class Sliding:
         Args:
             state: of the interface.
             kinematics: of the contactors.
-            stiffness: diagonal of K at them ``(n, gdim)``.
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``.
         """
         frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
         if self.config.gdim == 2:
             self.pivot = Pivot.begin(Front(self.config.comm), np.zeros(len(none)), none, none)
             return state
-        c = friction.SLIP_STIFFNESS * np.abs(stiffness).mean(axis=1)
+        k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
+        c = friction.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
         # friction has no part in what is prescribed to stand still, and none but of the motion where all of that is prescribed
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
@@ -392,8 +393,7 @@ class Sliding:
         which = np.flatnonzero(self.slipping(state) & (state.lam > 0))
         if not self.config.comm.allreduce(len(which)):
             return []
-        limit = self._limit(state, state.lam) / kinematics.force_per_multiplier
-        tau = -limit[which, None] * self.directions(state)[which]
+        tau = -(self._limit(state, state.lam) / kinematics.force_per_multiplier)[which, None] * self.directions(state)[which]
         return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau)]
 
     # -- from step to step -----------------------------------------------------------------------------------------------

@@ -300,10 +300,10 @@ class BodySystem:
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
 
     def _turn(self) -> None:
-        """Take the directions of friction from where the contactors are."""
+        """Take the directions of friction from where the contactors are (collective)."""
         for pair in self.pairs:
             assert self.forces.stiffness is not None
-            pair.turn(self.forces.stiffness[pair.nodes])
+            pair.turn(self.forces.stiffness)
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
