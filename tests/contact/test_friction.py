@@ -4,6 +4,7 @@ The tests to read first are ``test_a_block_slides_at_mu_times_its_load`` and ``t
 """
 
 from dataclasses import replace
+from itertools import product
 
 from mpi4py import MPI
 
@@ -149,11 +150,13 @@ def test_what_slides_away():
     assert abs(scene.contact.resultant().force[0] - 0.29999) <= 1e-9
 
 
-@pytest.mark.parametrize("cell, law", [("quadrilateral", st_venant), ("tetrahedron", st_venant)])
-@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
-def test_slip_converges_quadratically(cell, law, coupling):
+@pytest.mark.parametrize(
+    ("cell", "coupling"),
+    [*product(("quadrilateral", "tetrahedron"), ("node_to_surface", "mortar")), ("hexahedron", "node_to_surface")],
+)
+def test_slip_converges_quadratically(cell, coupling):
     """Finite sliding and finite strains over a base that bends: the tangent of the tilted rows is exact."""
-    scene = driven(cell, 0.4, law=law, n=(2, 3), how={"coupling": coupling}, options={"rtol": 1e-11})
+    scene = driven(cell, 0.4, law=st_venant, n=(2, 3), how={"coupling": coupling}, options={"rtol": 1e-11})
     g = scene.problem.config.gdim
     side = [0.03] * (g - 2)
     scene.to(*[0.0] * (g - 1), -0.05)
@@ -161,8 +164,7 @@ def test_slip_converges_quadratically(cell, law, coupling):
     for x in (0.1, 0.14, 0.18):
         found += factors(scene.to(x, *side, -0.05))
     assert scene.states[0] == 0
-    # in space the direction of slip is told by weights at the foot, not at the anchor
-    assert len(found) >= 3 and max(found if g == 2 else [b for b in found if b < 1e3]) <= 50.0
+    assert len(found) >= 3 and max(found) <= 50.0
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])

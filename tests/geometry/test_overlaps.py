@@ -117,6 +117,26 @@ def test_facets_that_are_affine():
     assert counts[0] == counts[1] < counts[2]
 
 
+def test_slivers_change_no_integrals():
+    """A side of the target that lies on the facet's and turns by 1e-9 either way cuts off a corner more or less, and changes little."""
+    turn, sizes = [1, 3, 0, 2], set()
+    for first in range(4):
+        found = []
+        for angle in (-1e-9, 0.0, 1e-9):
+            shape, x, y = pair_of("quadrilateral", 0.0)
+            x[3] += [0.007, -0.006, 0.05]
+            y = y * [2.0, 0.7, 0.0] - [0.4, 0.0, 0.0] + [[0, 0, 0], [0, 0, 0], [0.005, 0.005, 0.1], [0, 0, 0.1]]
+            y[:, 1] += angle * (y[:, 0] - 0.3)
+            for _ in range(first):
+                y = y[turn]
+            planes = Planes.of(shape, x[None], np.array([1.0]))
+            s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]))
+            sizes.add(len(s.pair))
+            found.append([s.weight.sum(), (s.weight * s.gap).sum(), (s.weight * s.gap * s.xi[:, 0] * s.eta[:, 1]).sum()])
+        assert np.ptp(found, axis=0).max() <= 5e-10
+    assert len(sizes) > 1
+
+
 def test_products_that_are_no_polynomials():
     """The integrals of shape functions of a crooked quadrilateral, piece by piece, to 1e-11 of a fine rule's; at few points each."""
     shape, x, y = pair_of("quadrilateral", 0.0)

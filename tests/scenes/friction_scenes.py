@@ -46,7 +46,7 @@ def driven(
     *,
     rigid: bool = False,
     law: Any = linear,
-    E: float = 1.0,
+    E: float | tuple[float, float] = 1.0,
     n: Any = (3, 4),
     comm: MPI.Comm = MPI.COMM_WORLD,
     target: Any = None,
@@ -59,7 +59,8 @@ def driven(
 ) -> Driven:
     """A block on another one that is wider, or on a plane; all of its top is driven.
 
-    ``walls`` hold it in the second direction, ``flat`` holds the surface of the other block, ``swap`` makes this the contactor.
+    ``E`` is the modulus of both, or of the lower and the upper; ``walls`` hold it in the second direction, ``flat`` holds the surface of
+    the other block, ``swap`` makes this the contactor.
     """
     b = blocks(comm, cell, *n, overhang=0.5, **scene)
     g = b.gdim
@@ -74,7 +75,9 @@ def driven(
         *clamp(b.V, b.low if flat else b.bottom),
         fem.dirichletbc(top, fem.locate_dofs_topological(b.V, b.top.dim, b.top.entities)),
     ]
-    problem = uem.UnitedProblem(law(b.u, modulus(b.scene, E, E)), b.u, bcs=bcs, contacts=[contact], **(options or {}))
+    problem = uem.UnitedProblem(
+        law(b.u, modulus(b.scene, *np.broadcast_to(E, 2))), b.u, bcs=bcs, contacts=[contact], **(options or {})
+    )
     return Driven(b, problem, contact, top)
 
 

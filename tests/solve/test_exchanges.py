@@ -274,6 +274,7 @@ def bolt(mu, coupling):
         (leaves, (0.2,), 120),
         (bolt, (0.2, "node_to_surface"), 60),
         (bolt, (0.2, "mortar"), 60),
+        (bolt, (0.5, "mortar"), 30),
     ],
 )
 def test_scenes_that_went_in_circles(make, how, most):
@@ -282,6 +283,29 @@ def test_scenes_that_went_in_circles(make, how, most):
     steps = run(problem, number)
     assert len(steps) == number and not any(step.cuts for step in steps)
     assert sum(step.newton_iterations + step.exchanges for step in steps) <= most
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize(
+    ("cell", "n", "ratio", "mu"),
+    [
+        ("quadrilateral", (5, 7), 1e4, 0.5),
+        ("hexahedron", (3, 4), 1e4, 0.3),
+        ("hexahedron", (3, 4), 1e2, 1.0),
+        ("tetrahedron", (2, 3), 1e4, 0.5),
+    ],
+)
+def test_a_stiff_block_is_dragged_over_a_soft_one_and_back(cell, n, ratio, mu, coupling):
+    """The contactor is the stiffer by so much: no more than eight iterations and 100 exchanges a step, and Coulomb's law at the end."""
+    d = driven(cell, mu, law=st_venant, E=(1.0, ratio), n=n, how={"coupling": coupling})
+    beside = [0.0] * (d.blocks.gdim - 2)
+    ways = [(0.03 * k, -0.02) for k in range(5)] + [(0.12 - 0.03 * k, -0.03) for k in range(1, 5)]
+    for way, depth in ways:
+        history = d.to(way, *beside, depth)
+        assert len(history) - 1 <= 8 and sum(i.exchanges for i in history) <= 100
+    force = d.contact.resultant().force
+    assert abs(force[0]) <= mu * abs(force[-1]) * (1 + 1e-6)
+    assert sum(d.states) > 0 and force[0] * force[-1] != 0
 
 
 def test_signals_are_heeded_between_exchanges():

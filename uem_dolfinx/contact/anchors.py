@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.contact.state import FrictionState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -45,12 +45,24 @@ def anchored(
     )
 
 
-def anchors_of(f: FrictionState, target: Target) -> Array:
-    """Where contactors are anchored on the target where it is now ``(n, gdim)`` (collective)."""
+def anchors_of(f: FrictionState, target: Target, terms: bool) -> tuple[Array, tuple[Ints, Ints, Array] | None]:
+    """Where contactors are anchored on the target where it is now ``(n, gdim)``, and which nodes move these places (collective).
+
+    Args:
+        f: state of friction.
+        target: that they are anchored to.
+        terms: whether contactors, global nodes and weights ``(k,)`` of a mesh are asked for.
+    """
     if isinstance(target, MeshTarget):
-        return target.places(f.facet, f.xi) + f.anchor
+        N, own = target.shape.tabulate(f.xi).N, target.facets.current()
+        here = np.einsum("na,nag->ng", N, target.of_facets(f.facet, own.x)) + f.anchor
+        if not terms:
+            return here, None
+        nodes = target.of_facets(f.facet, own.nodes)
+        row, a = np.nonzero(nodes >= 0)
+        return here, (row.astype(np.int64), nodes[row, a], N[row, a])
     motion: Motion | None = target.motion
-    return f.anchor if motion is None else motion.carry(f.anchor)
+    return f.anchor if motion is None else motion.carry(f.anchor), None
 
 
 def way_since(config: Configuration, nodes: Indices, before: Array, motion: Motion | None, now: Motion | None) -> Array:

@@ -18,7 +18,8 @@ class Frame:
     """What friction sees of one placement: a value.
 
     Attributes:
-        ties: by what contactors follow other nodes.
+        ties: by what contactors follow other nodes, and hand friction on to them.
+        way: by what they are ``away``.
         away: how far contactors are from their anchors, or have moved relative to what they follow since the last step ``(n, gdim)``.
         tangents: directions along the target ``(n, gdim - 1, gdim)``.
         free_tangents: those in which nothing prescribes the relative motion ``(n, gdim - 1, gdim)``.
@@ -28,6 +29,7 @@ class Frame:
     """
 
     ties: Ties
+    way: Ties
     away: Array
     tangents: Array
     free_tangents: Array
@@ -36,8 +38,8 @@ class Frame:
     cornered: Bools
 
     @classmethod
-    def of(cls, kinematics: Kinematics, away: Array, beside: Array, prescribed: bool) -> Frame:
-        """The frame of contactors that are this far ``away (n, gdim)``; other arguments as the attributes (collective)."""
+    def of(cls, kinematics: Kinematics, away: Array, way: Ties | None, beside: Array, prescribed: bool) -> Frame:
+        """The frame of contactors that are this far ``away (n, gdim)``, by what others than now; other arguments as the attributes."""
         normals, ties, c = kinematics.normal[:, None], kinematics.ties, kinematics.corners
         n, g = away.shape
         cornered = np.zeros(n, dtype=bool)
@@ -49,7 +51,7 @@ class Frame:
         if prescribed or beside.shape[1]:
             moves = ties.moves if prescribed else free
             told = friction.tangents(np.concatenate([normals, beside], axis=1), moves)
-        return cls(ties, away, every, told, beside, prescribed, cornered)
+        return cls(ties, way or ties, away, every, told, beside, prescribed, cornered)
 
     def along(self, way: Array) -> Array:
         """Parts of relative motions ``(n, gdim)`` along the target; of what is prescribed, only of the motion itself."""

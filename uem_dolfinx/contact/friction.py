@@ -25,9 +25,9 @@ from uem_dolfinx.contact.state import FrictionState
 #: A tangential direction of which prescribed components leave less than this part is prescribed.
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
-#: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 0.5 on the direction of slip does not settle.
+#: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
 #: [heuristic; the diagonal of K; -]
-SLIP_STIFFNESS = 0.1
+SLIP_STIFFNESS = 0.2
 #: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
 #: [heuristic; the force q; -]
 LEAST_TURN = 0.999

@@ -396,7 +396,7 @@ class Interface:
         return parts if self.friction is None else parts + self.friction.curvature(self.trial, self.kinematics)
 
     def turn(self, stiffness: Array) -> None:
-        """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)`` is the diagonal of K (collective)."""
+        """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
         if self.friction is not None:
             self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
 

@@ -12,17 +12,18 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import friction
 from uem_dolfinx.contact.active_set import GAP_ROUNDING, Wrong
 from uem_dolfinx.contact.anchors import anchored, anchors_of, way_since
 from uem_dolfinx.contact.corners import friction_in
 from uem_dolfinx.contact.frame import Frame
-from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.friction_rows import with_friction
+from uem_dolfinx.contact.kinematics import Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import FrictionState, LastStep, PairState, Pivot
+from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 
 #: What is left of a limit that is proportional to the force along the normal, below this part of it, is rounding.
@@ -74,6 +75,7 @@ class Sliding:
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
         self._beside: Array = np.zeros((n, 0, g))
         self._anchors: Array = np.zeros((n, g))
+        self._held_by: tuple[Ints, Ints, Array] | None = None
         self._last: LastStep | None = None
         self.pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
@@ -88,7 +90,7 @@ class Sliding:
     def place(self, kinematics: Kinematics, state: FrictionState) -> None:
         """Find the anchors, or how far contactors have moved, where bodies and target are now (collective)."""
         if self.discretisation.pointwise:
-            self._anchors = anchors_of(state, self.discretisation.target)
+            self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
         elif self._last is None:
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
@@ -99,11 +101,13 @@ class Sliding:
     def replace(self, kinematics: Kinematics) -> None:
         """Take other kinematics at the same displacement (collective)."""
         if self.discretisation.pointwise:
+            way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
             away = kinematics.points - self._anchors
         else:
             assert self._last is not None
-            away = self._last.ties.relative(self._way_since(self._last))
-        self.frame = Frame.of(kinematics, away, self._beside, self.discretisation.prescribed)
+            way = self._last.ties
+            away = way.relative(self._way_since(self._last))
+        self.frame = Frame.of(kinematics, away, way, self._beside, self.discretisation.prescribed)
 
     def _way_since(self, last: LastStep) -> Array:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
@@ -198,7 +202,7 @@ class Sliding:
         """
         away, tau = self.frame.away, _of(state).tau
         if du is not None and seen.tau is not None:
-            away, tau = away + self.frame.ties.relative(du), seen.tau
+            away, tau = away + self.frame.way.relative(du), seen.tau
         lam, forced = seen.lam, self.frame.forced(away, self._lost)
         by = friction.Seen(lam, self.frame.tangential(tau), self.bound(lam), self.frame.along(away), forced)
         turned = replace(_of(state), direction=self.directions(state))
@@ -295,42 +299,15 @@ class Sliding:
 
     def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
         """Equations with those along the target, and tilted test rows where contactors slip (collective)."""
-        g, f, frame = self.config.gdim, _of(state), self.frame
-        normal = np.flatnonzero(own.kind == NORMAL)
-        who, test = own.contactor[normal], own.test
-        place = np.full(len(self.nodes), -1, dtype=np.int64)
-        place[who] = np.arange(len(who))
-        row, followed, weight = frame.ties.row, frame.ties.followed, frame.ties.weight
-        there = place[row] >= 0
-        row, followed, weight = place[row[there]], followed[there], weight[there, None]
-
-        def along(t: Array, gap: Array, active: Bools) -> UnitingEquations:
-            return UnitingEquations(test.node[normal], t, gap, active, row, followed, weight * t[row])
-
-        T, rubbing, slipping = frame.free_tangents[who], self.active(state)[who], self.slipping(state)[who]
-        away = np.einsum("nrg,ng->nr", T, frame.away[who])
-        resisted = [rubbing & T[:, r].any(axis=1) for r in range(g - 1)]
-        parts = [along(T[:, r], away[:, r], resisted[r] & f.stick[who]) for r in range(g - 1)]
-        frictionless = tilted = UnitingEquations.join([test, *parts], g)
-        trial = frictionless if own.trial is test else UnitingEquations.join([own.trial, *parts], g)
-        if self.config.comm.allreduce(int(slipping.any())):
-            size = (self._cone(state)[1] * kinematics.cone)[who, None]
-            tilt = np.where(slipping[:, None], -size * self.directions(state)[who], 0.0)
-            if self.config.comm.allreduce(bool(tilt.any()), op=MPI.LOR):
-                tilted = _tilted(frictionless, normal, tilt, (row, followed, weight))
-        stopping = trial
-        if g == 3:
-            across = np.cross(kinematics.normal[who], self.directions(state)[who])
-            stopping = UnitingEquations.join([trial, along(across, np.zeros(len(who)), slipping)], g)
-        return Constraints(
-            trial,
-            tilted,
-            frictionless,
-            replace(trial, active=np.concatenate([own.trial.active, *resisted])),
-            stopping,
-            np.concatenate([own.contactor, *[who] * (g - 1)]),
-            np.concatenate([own.kind, *[np.full(len(who), NORMAL)] * (g - 1)]),
-            np.concatenate([own.tangent, *(np.full(len(who), r) for r in range(g - 1))]),
+        return with_friction(
+            own,
+            self.frame,
+            rubbing=self.active(state),
+            stick=_of(state).stick,
+            directions=self.directions(state),
+            slope=self._cone(state)[1] * kinematics.cone,
+            normal=kinematics.normal,
+            pointwise=self.discretisation.pointwise,
         )
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
@@ -352,7 +329,7 @@ class Sliding:
         if du is not None and self.config.gdim == 3:
             projector, stiffness, part = self._turning(state, kinematics)
             i = np.flatnonzero(self.slipping(state))
-            taken = stiffness[:, None] * self.frame.ties.relative(du)[i] + part[:, None] * self.pivot.tau[i]
+            taken = stiffness[:, None] * self.frame.way.relative(du)[i] + part[:, None] * self.pivot.tau[i]
             tau[i] -= np.einsum("kgh,kh->kg", projector, taken)
         at_contactors = tau
         if not self.discretisation.pointwise:
@@ -382,9 +359,9 @@ class Sliding:
             return None
         i = np.flatnonzero(self.slipping(state))
         across, stiffness, part = self._turning(state, kinematics)
-        nodes, share = self.frame.ties.table(i)
+        nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
         k, m, g = *share.shape, self.config.gdim
-        blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, share, across).reshape(k, m * g, m * g)
+        blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, moved, across).reshape(k, m * g, m * g)
         forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self.pivot.tau[i]).reshape(k, m * g)
         return nodes, blocks, forces
 
@@ -435,16 +412,3 @@ class Sliding:
 def _of(state: PairState) -> FrictionState:
     assert state.friction is not None
     return state.friction
-
-
-def _tilted(equations: UnitingEquations, which: Ints, tilt: Array, terms: tuple[Ints, Ints, Array]) -> UnitingEquations:
-    """Equations ``which (k,)`` of which have ``tilt (k, gdim)`` added, by the rows, nodes and weights of ``terms``."""
-    direction, (row, followed, weight) = equations.direction.copy(), terms
-    direction[which] += tilt
-    return replace(
-        equations,
-        direction=direction,
-        row=np.concatenate([equations.row, which[row]]),
-        followed=np.concatenate([equations.followed, followed]),
-        coefficients=np.concatenate([equations.coefficients, weight * tilt[row]]),
-    )

@@ -85,6 +85,18 @@ class Ties:
         nodes[row, column + 1], share[row, column + 1] = self.followed[order], -self.weight[order]
         return nodes[which], share[which]
 
+    def tables(self, way: Ties, which: Ints) -> tuple[Ints, Array, Array]:
+        """``table``, with what moves contactors by other weights beside it: nodes, these weights and the others ``(k, m)``."""
+        nodes, share = self.table(which)
+        if way is self:
+            return nodes, share, share
+        more, other = way.table(which)
+        return (
+            np.concatenate([nodes, more], axis=1),
+            np.concatenate([share, np.zeros_like(other)], axis=1),
+            np.concatenate([np.zeros_like(share), other], axis=1),
+        )
+
     def handed_on(self, tau: Array) -> tuple[Ints, Array]:
         """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``tau (n, gdim)`` along the target, on both bodies."""
         nodes = np.concatenate([self.config.to_global(self.nodes), self.followed])

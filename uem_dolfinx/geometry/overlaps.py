@@ -162,11 +162,18 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, ru
     # counter-clockwise about the outward normal
     frame = np.where(sign[:, None, None] > 0, frame, frame[:, ::-1])
     corners, count = clip(its[:, other.ring, :2], frame)
-    doubled = 2 * np.abs(_areas(corners, count))
+    doubled = np.abs(_fan(corners, count)[0].sum(axis=1))
     found = np.flatnonzero(doubled > 2 * SLIVER * planes.size)
     corners, count = corners[found], count[found]
-    polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
-    a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
+    if shape.affine and other.affine:
+        polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
+        a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
+    else:
+        # no rule is exact here: where sides coincide, a sliver more or less would change all triangles about a corner
+        i = np.arange(corners.shape[1])
+        polygon, first = np.nonzero(i < count[:, None])
+        after = np.where(i + 1 < count[:, None], i + 1, 0)
+        a, b, c = _centroids(corners, count)[polygon], corners[polygon, first], corners[polygon, after[polygon, first]]
     area = 0.5 * np.abs(cross(b - a, c - a))
     at = np.einsum("qk,kpg->pqg", points, np.stack([a, b, c]))
     return np.repeat(found[polygon], len(weights)), at.reshape(-1, 2), (area[:, None] * weights).ravel()
@@ -213,11 +220,18 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     return left, count
 
 
-def _areas(corners: Array, count: Ints) -> Array:
-    """Signed areas of polygons ``(m,)``."""
+def _fan(corners: Array, count: Ints) -> tuple[Array, Array]:
+    """Twice the signed areas of the triangles about the first corner ``(m, k - 2)``, and the arms to the others ``(m, k, 2)``."""
     arm = corners - corners[:, :1]
     part = cross(arm[:, 1:-1], arm[:, 2:])
-    return 0.5 * np.where(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1, part, 0.0).sum(axis=1)
+    return np.where(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1, part, 0.0), arm
+
+
+def _centroids(corners: Array, count: Ints) -> Array:
+    """Centroids of polygons ``(m, 2)``."""
+    part, arm = _fan(corners, count)
+    moment = np.einsum("mk,mkf->mf", part, arm[:, 1:-1] + arm[:, 2:])
+    return np.asarray(corners[:, 0] + moment / (3 * part.sum(axis=1))[:, None])
 
 
 def cross(a: Array, b: Array) -> Array:

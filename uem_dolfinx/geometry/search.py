@@ -101,11 +101,6 @@ class MeshTarget:
         """Where ``points (n, gdim)`` stand relative to given places ``xi (n, fdim)`` of facets (collective)."""
         return self._ask(self._to_owners(facet), self.facets.current(), points, facet, xi)[0]
 
-    def places(self, facet: Ints, xi: Array) -> Array:
-        """Where places ``xi (n, fdim)`` of the facets numbered ``facet (n,)`` are; no place for -1 ``(n, gdim)`` (collective)."""
-        x = self.of_facets(facet, self.facets.current().x)
-        return np.asarray(np.einsum("na,nag->ng", self.shape.tabulate(xi).N, x))
-
     def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
         """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
         new, _ = self._ask(self._to_owners(old.facet), self.facets.current(), points, old.facet, old.xi)

@@ -6,7 +6,7 @@ change sides for ever.
 Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
 are: the united matrix is singular, and what it foresees is far beyond the bodies. From the state before, limits of friction are then held
 at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric. The forces that follow make the next limits,
-until these settle, and Coulomb's law goes on from there.
+until these settle, and Coulomb's law goes on from there. So they are once in every linearised problem where contactors would go one by one.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ class Exchanges:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
         self._number, self._rule = 0, Rule.ALL
-        #: Whether limits of friction are held, and the last states without a mechanism.
-        self._held = False
+        #: Whether limits of friction are held, whether they have been, and the last states without a mechanism.
+        self._held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
         for pair in self._pairs:
             if pair.friction is not None:
@@ -141,12 +141,14 @@ class Exchanges:
             if self._held:
                 self._let_limits_follow(wrong)
             return wrong
-        if self._rough and not self._held:
-            if way > FAR * self._pairs[0].config.size and self._known is not None:
-                self._hold_limits()
-                return [w.among(np.zeros_like(w.enter)) for w in wrong]
+        free = self._rough and not self._held
+        far = free and way > FAR * self._pairs[0].config.size and self._known is not None
+        if free and not far:
             self._known = self._here(wrong)
-        chosen, rule = wrong, self._pivoting.choose(number, self._state())
+        chosen, rule = wrong, self._rule if far else self._pivoting.choose(number, self._state())
+        if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
+            self._hold_limits()
+            return [w.among(np.zeros_like(w.enter)) for w in wrong]
         if rule >= Rule.FIRST and curved and not self.straight:
             # with curvature the problem may have no solution, or several; without there is one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
@@ -190,7 +192,7 @@ class Exchanges:
                 state, pair.friction.pivot = known
                 pair.take(state)
                 pair.friction.hold_limits(state.lam)
-        self._pivoting, self._held, self.again = Pivoting(), True, True
+        self._pivoting, self._held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
 
     def _let_limits_follow(self, wrong: Sequence[Wrong]) -> None:

@@ -1,0 +1,95 @@
+"""Equations of an interface with friction: those along the target of contactors that stick, and tilted test rows of those that slip."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.frame import Frame
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints
+from uem_dolfinx.contact.ties import Ties
+
+
+def with_friction(
+    own: Constraints,
+    frame: Frame,
+    *,
+    rubbing: Bools,
+    stick: Bools,
+    directions: Array,
+    slope: Array,
+    normal: Array,
+    pointwise: bool,
+) -> Constraints:
+    """Equations with those along the target, and tilted test rows where contactors slip (collective).
+
+    Args:
+        own: equations across the target.
+        frame: directions along it and relative motions.
+        rubbing: active contactors that friction acts on ``(n,)``.
+        stick: those that stick when they are ``(n,)``.
+        directions: of slip ``(n, gdim)``.
+        slope: by how much the limit of friction grows with the multiplier across the target ``(n,)``.
+        normal: of the contactors ``(n, gdim)``.
+        pointwise: whether contactors that stick stand on their anchors, so that both are followed by the same weights.
+    """
+    comm, g = frame.ties.config.comm, normal.shape[1]
+    across = np.flatnonzero(own.kind == NORMAL)
+    who, test = own.contactor[across], own.test
+    place = np.full(len(normal), -1, dtype=np.int64)
+    place[who] = np.arange(len(who))
+
+    def along(t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
+        there = place[ties.row] >= 0
+        row, weight = place[ties.row[there]], ties.weight[there, None]
+        return UnitingEquations(test.node[across], t, gap, active, row, ties.followed[there], weight * t[row])
+
+    T, rubbing, stick = frame.free_tangents[who], rubbing[who], stick[who]
+    away = np.einsum("nrg,ng->nr", T, frame.away[who])
+    resisted = [rubbing & T[:, r].any(axis=1) for r in range(g - 1)]
+
+    def with_those_along(rows: UnitingEquations, ties: Ties) -> UnitingEquations:
+        return UnitingEquations.join([rows, *(along(T[:, r], away[:, r], resisted[r] & stick, ties) for r in range(g - 1))], g)
+
+    frictionless = tilted = trial = with_those_along(test, frame.ties)
+    slipping = rubbing & ~stick
+    tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
+    slips = comm.allreduce(bool(tilt.any()), op=MPI.LOR)
+    # where none slips on parallel facets rows stay symmetric
+    if own.trial is not test or (slips and not pointwise):
+        trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)
+    if slips:
+        tilted = _tilted(frictionless, across, tilt, place, frame.ties)
+    stopping = trial
+    if g == 3:
+        beside = along(np.cross(normal[who], directions[who]), np.zeros(len(who)), slipping, frame.ties)
+        stopping = UnitingEquations.join([trial, beside], g)
+    return Constraints(
+        trial,
+        tilted,
+        frictionless,
+        replace(trial, active=np.concatenate([own.trial.active, *resisted])),
+        stopping,
+        np.concatenate([own.contactor, *[who] * (g - 1)]),
+        np.concatenate([own.kind, *[np.full(len(who), NORMAL)] * (g - 1)]),
+        np.concatenate([own.tangent, *(np.full(len(who), r) for r in range(g - 1))]),
+    )
+
+
+def _tilted(equations: UnitingEquations, which: Ints, tilt: Array, place: Ints, ties: Ties) -> UnitingEquations:
+    """Equations ``which (k,)`` of which have ``tilt (k, gdim)`` added; ``place (n,)`` of contactors among these, -1 for none."""
+    there = place[ties.row] >= 0
+    row, direction = place[ties.row[there]], equations.direction.copy()
+    direction[which] += tilt
+    return replace(
+        equations,
+        direction=direction,
+        row=np.concatenate([equations.row, which[row]]),
+        followed=np.concatenate([equations.followed, ties.followed[there]]),
+        coefficients=np.concatenate([equations.coefficients, ties.weight[there, None] * tilt[row]]),
+    )
