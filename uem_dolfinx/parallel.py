@@ -138,6 +138,11 @@ class Exchange:
         ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
         return cls(comm, [order[a:b] for a, b in pairwise(ends)])
 
+    @property
+    def origins(self) -> Ints:
+        """Ranks that the rows received come from ``(n_received,)``."""
+        return np.repeat(np.arange(self.comm.size), self._received)
+
     def send(self, *arrays: AnyArray) -> list[AnyArray]:
         """Rows of ``arrays (n, ...)`` that other ranks and this one send here ``(n_received, ...)``, in their order (collective)."""
         return self._exchange([a[self._picked] for a in arrays], self._sent, self._received)

@@ -21,7 +21,6 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.options import has_mumps
-from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -85,13 +84,11 @@ class Deflation:
 
 def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
     """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)`` (collective)."""
-    followed, pressed = np.zeros((2, space.n_owned), dtype=bool)
+    followed = np.zeros(space.n_owned, dtype=bool)
     followed[space.gather_owned(P.followed(P.equations.active))] = True
     followed[P.nodes] = False
-    part = Part(space, followed)
-    stiffness, own = (part.of(M).getDiagonal().array_r.reshape(-1, space.block) for M in (A, K))
-    pressed[part.nodes] = (P.used[part.nodes] & (stiffness > MUCH_STIFFER * own)).any(axis=1)
-    return pressed
+    stiffness, own = (M.getDiagonal().array_r.reshape(-1, space.block) for M in (A, K))
+    return followed & (P.used & (stiffness > MUCH_STIFFER * own)).any(axis=1)
 
 
 def without(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:

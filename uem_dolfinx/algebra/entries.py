@@ -83,3 +83,13 @@ def entries_of(which: Ints, starts: Ints) -> tuple[Ints, Ints]:
     return places + np.repeat(starts[which] - ends + lengths, lengths), np.repeat(
         np.arange(len(which), dtype=starts.dtype), lengths
     )
+
+
+def blocks_of(lines: Ints, starts: Ints, g: int) -> tuple[Ints, Ints, Ints]:
+    """Places where blocks of lines of nodes begin, which of ``lines (k,)`` each is in, and how many entries a line of it has.
+
+    ``starts`` are the first entry of every line of components, g of them to a node, whose entries are in the same columns.
+    """
+    places, i = entries_of((g * lines).astype(starts.dtype), starts)
+    width = starts[g * lines + 1] - starts[g * lines]
+    return places[::g], i[::g], width[i[::g]]

@@ -1,12 +1,13 @@
 """The united matrix ``Q'(K + G)P`` from its changes: K's values in a pattern that lasts, and products near the contact only.
 
-P and Q are the identity but for the rows of eliminated nodes and for prescribed components, which Z crosses out. With H, the entries
-of K between a part of the nodes, which has all that are coupled with an eliminated one,
+P and Q are the identity in free components but for the rows of eliminated nodes, P_E and Q_E. With K_E, the rows of these nodes, and Z,
+which crosses out their components and those that are prescribed,
 
-    Q'(K + G)P = Z(K - H)Z + Q'(H + G)P
+    Q'KP = ZKZ + ZK P_E + Q_E'K_E (Z + P_E)
 
-so that only matrices of that part are multiplied, and all that grows with the bodies is a copy of values. ZKZ, with the diagonal of K
-where Z crosses out, is kept as well: its entries go line by line to where the matrix has them, in one piece between lines that have more.
+so that only blocks of these nodes and their neighbours are multiplied, by each rank its own rows, and all that grows with the bodies is a
+copy of values. K without prescribed components, with its diagonal where these are, is kept as well: its entries go line by line to where
+the matrix has them, in one piece between lines that have more.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.entries import Entries, entries_of
-from uem_dolfinx.algebra.parts import Part
+from uem_dolfinx.algebra.blocks import Blocks, product, summed, to_owners, together
+from uem_dolfinx.algebra.entries import Entries, blocks_of, entries_of
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange
 
 #: Places of earlier products are kept while there are no more than this times as many of them as of the present one's.
 #: [convention; number of entries that K lacks; test_linear_solver.py::test_places_of_earlier_products]
@@ -39,7 +41,7 @@ class UnitedMatrix:
     def __init__(self, space: Nodes, reserving: bool):
         self.space, self.reserving = space, reserving
         self._first, self._n = space.block * int(space.index_map.local_range[0]), space.block * space.n_owned
-        self._size = int(space.block * space.index_map.size_global)
+        self._size = int(space.index_map.size_global)
         #: K and the free components that the matrix was made for, and the state of K's values that it holds.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
@@ -47,7 +49,7 @@ class UnitedMatrix:
         self._K: Any = None
         self._crossed: Ints = np.zeros(0, np.int64)
         self._A: Any = None
-        #: Keys of the entries that K lacks, line times size plus column, sorted.
+        #: Keys of the blocks that K lacks, line of nodes times their number plus column, sorted.
         self._filled: Ints = np.zeros(0, np.int64)
         #: Whether a step begins.
         self._begins = False
@@ -61,30 +63,23 @@ class UnitedMatrix:
     def update(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> PETSc.Mat:
         """Give the matrix its values for this P and Q, with the diagonal of K in idle columns (collective)."""
         with timed("restriction matrix P"):
-            changed = self._know(P, K)
-            part = self._part(P, P.united, P.equations.active, curvature)
-            rows, test = P.matrix(part), None if P is Q else Q.matrix(part)
+            trial = P.rows()
+            test = trial if P is Q else Q.rows()
         with timed("united matrix P'KP" if P is Q else "united matrix Q'KP"):
-            if changed:
+            if self._know(P, K):
                 self._take(K)
-            self._fill(P, Q, part, curvature, rows, test)
+            G = None if curvature is None else self._crossed_out(curvature, P.free)
+            self._fill(P, Q, trial, test, G)
             return self._A.mat
 
-    def _fill(self, P: Restriction, Q: Restriction, part: Part, curvature: PETSc.Mat | None, trial: Any, test: Any) -> None:
-        """Bring K's values and the product of the part into the matrix (collective)."""
-        H = part.of(self._made_for[0])
-        diagonal = H.getDiagonal().array_r
-        lines, columns, product = self._entries(_product(_sum(H, curvature, part), trial, test), part)
+    def _fill(self, P: Restriction, Q: Restriction, trial: Blocks, test: Blocks, G: Blocks | None) -> None:
+        """Bring K's values and the products into the matrix (collective)."""
+        changes, adding = self._changes(trial, test, G)
         begins = self._A is None or self._begins
-        places, there = (lines, np.zeros(0, dtype=bool)) if begins else self._A.find(lines, columns)
+        places, there = self._find(self._K if begins else self._A, changes)
         if begins or self.space.comm.allreduce(int(not there.all())):
-            self._make_room(begins, lines, columns, P, Q, curvature)
-            places, _ = self._A.find(lines, columns)
-        taken, _ = self._A.of(self._lines(part.components))
-        taken = taken[part.has(self._A.columns[taken])]
-        idle = np.flatnonzero(~P.used.ravel()[part.components])
-        own = part.components[idle]
-        held, _ = self._A.find(own, own + self._first)
+            self._make_room(begins, changes, P, Q, G)
+            places, _ = self._find(self._A, changes)
         values = self._A.values
         if self._changed is None:
             for to, here in self._runs:
@@ -93,12 +88,94 @@ class UnitedMatrix:
             values[self._empty] = 0.0
         else:
             values[self._changed[0]] = self._changed[1]
-        at = np.concatenate([taken, places])
+        g, nodes = self.space.block, P.united
+        idle = (g * nodes[:, None] + np.arange(g))[~P.used[nodes]].astype(np.int64)
+        held, own = (entries.find(idle, idle + self._first)[0] for entries in (self._A, self._K))
+        at = np.concatenate([places.ravel(), held])
         self._changed = at, values[at]
-        values[taken] = 0.0
-        values[places] = product
-        values[held] = diagonal[idle]
+        values[places] = np.where(adding[:, None, None], values[places], 0.0) + changes.value
+        values[held] = self._K.values[own]
         self._A.mat.assemble()
+
+    def _changes(self, trial: Blocks, test: Blocks, G: Blocks | None) -> tuple[Blocks, Bools]:
+        """Blocks of the products in owned rows, each place once, and which of them are added to what K has there ``(k,)`` (collective).
+
+        Args:
+            trial: rows of P at this rank's eliminated nodes; each has a block of its own.
+            test: rows of Q there.
+            G: curvature in owned rows, if any.
+        """
+        space, (first, last) = self.space, self.space.index_map.local_range
+        own = np.unique(trial.row)
+        eliminated = np.zeros(last - first, dtype=bool)
+        eliminated[own - first] = True
+        # K and G have blocks on both sides: who has a column in an eliminated node's row has the node in a row of his own
+        rows = together(self._inside(own - first), self._outside(np.isin(self._beyond.row, own)))
+        coupled = rows if G is None else together(rows, G.some(eliminated[G.row - first]))
+        trial = self._handed_on(trial, coupled)
+        seen = np.unique(trial.row)
+        inside = (rows.column >= first) & (rows.column < last)
+        near = self._inside(np.setdiff1d(rows.column[inside], own) - first, eliminated)
+        others = self._outside(np.isin(self._beyond.column, seen) & ~eliminated[self._beyond.row - first])
+        left = together(rows, near, others, *([] if G is None else [G]))
+        on = np.isin(left.column, seen)
+        X = together(left.some(~on), product(left.some(on), trial))
+        at = eliminated[X.row - first]
+        changes = summed(together(X.some(~at), to_owners(space, product(test.transposed, X.some(at)))))
+        return changes, np.logical_not(eliminated[changes.row - first] | np.isin(changes.column, seen))
+
+    def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
+        """Rows of P at eliminated nodes of this rank, and at those of others that are ``coupled`` with nodes here (collective)."""
+        comm = self.space.comm
+        if comm.size == 1:
+            return trial
+        pairs = np.unique(np.column_stack([self.space.owner_of(coupled.column), coupled.row]), axis=0)
+        lists = [np.flatnonzero(np.isin(trial.row, pairs[pairs[:, 0] == rank, 1])) for rank in range(comm.size)]
+        lists[comm.rank] = np.arange(len(trial.row))
+        return Blocks(*Exchange(comm, lists).send(*trial))
+
+    # -- blocks of K and of curvature --------------------------------------------------------------------------------------
+
+    def _inside(self, nodes: Ints, columns: Bools | None = None) -> Blocks:
+        """Blocks of K in rows and columns of owned nodes, in rows ``nodes (k,)``, and in some ``columns (n_owned,)`` alone if told."""
+        g, first = self.space.block, self._first // self.space.block
+        places, i, width = blocks_of(nodes, self._K.indptr, g)
+        column = self._K.columns[places] // g
+        if columns is not None:
+            kept = columns[column - first]
+            places, i, width, column = places[kept], i[kept], width[kept], column[kept]
+        return Blocks(nodes[i] + first, column.astype(np.int64), self._values(places, width))
+
+    def _outside(self, which: Bools) -> Blocks:
+        """Some of the blocks of K in owned rows and other ranks' columns, of which ``_beyond`` has the places."""
+        there = self._beyond.some(which)
+        return there._replace(value=self._values(*there.value.T.astype(np.int64)))
+
+    def _values(self, places: Ints, width: Ints) -> Array:
+        """Values of blocks of K from the places where they begin, and the number of entries in their lines."""
+        k = np.arange(self.space.block)
+        return self._K.values[places[:, None, None] + width[:, None, None] * k[:, None] + k]
+
+    def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
+        """Blocks of G in owned rows without prescribed components (collective)."""
+        g, first = self.space.block, self._first // self.space.block
+        indptr, columns, values = G.getValuesCSR()
+        nodes = np.flatnonzero(np.diff(indptr[::g]))
+        places, i, width = blocks_of(nodes, indptr, g)
+        row, column = nodes[i] + first, columns[places].astype(np.int64) // g
+        k = np.arange(g)
+        value = values[places[:, None, None] + width[:, None, None] * k[:, None] + k] * free[row - first][:, :, None]
+        asked, at = np.unique(column, return_inverse=True)
+        return Blocks(row, column, value * self.space.ask_owners(asked, free.astype(float))[at][:, None, :])
+
+    def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:
+        """Places of blocks in owned rows ``(k, g, g)``, and whether they are there ``(k,)``."""
+        g = self.space.block
+        inside = self.space.owner_of(blocks.column) == self.space.comm.rank
+        line = g * blocks.row - self._first + np.where(inside, 0, self._n)
+        column = np.repeat(g * blocks.column, g)
+        places, there = entries.find((line[:, None] + np.arange(g)).ravel(), column)
+        return places.reshape(-1, g, 1) + np.arange(g), there.reshape(-1, g).all(axis=1)
 
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
         """Take K's places if they are new; whether its values are (collective)."""
@@ -113,6 +190,7 @@ class UnitedMatrix:
             held = np.flatnonzero(~P.free)
             self._K.values[self._K.find(held, held + self._first)[0]] = 1.0
             self._crossed = np.flatnonzero(self._K.values == 0.0)
+            self._beyond = self._places_beyond()
         return bool(changed)
 
     def _take(self, K: PETSc.Mat) -> None:
@@ -121,47 +199,21 @@ class UnitedMatrix:
         self._K.values[self._crossed] = 0.0
         self._state, self._changed = K.stateGet(), None
 
-    def _part(self, P: Restriction, nodes: Indices, which: Bools, curvature: PETSc.Mat | None) -> Part:
-        """The nodes that have an entry of K at ``nodes`` of any rank, those that ``which`` equations follow, and the curvature's."""
+    def _places_beyond(self) -> Blocks:
+        """Blocks of K in owned rows and other ranks' columns; as values, where they begin and how many entries their lines have."""
         g, n = self.space.block, self.space.n_owned
-        first = self._first // g
-        # components of a node have the same neighbours, and K's pattern is symmetric
-        at, _ = self._K.of(self._lines(g * nodes.astype(np.int64)))
-        touched = np.union1d(self._K.columns[at] // g, P.followed(which)).astype(np.int64)
-        near = np.zeros(n, dtype=bool)
-        own = (touched >= first) & (touched < first + n)
-        near[touched[own] - first] = True
-        near[self.space.gather_owned(touched[~own])] = True
-        if curvature is not None:
-            # a node with a row of it is coupled with itself
-            near |= np.diff(curvature.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
-        return Part(self.space, near)
+        lines = np.arange(n, n + n if self.space.comm.size > 1 else n)
+        places, i, width = blocks_of(lines, self._K.indptr, g)
+        row, column = lines[i] - n + self._first // g, self._K.columns[places] // g
+        return Blocks(row, column.astype(np.int64), np.column_stack([places, width]))
 
-    def _lines(self, components: Ints) -> Bools:
-        """Which lines have entries of owned components."""
-        lines = np.zeros(len(self._K.indptr) - 1, dtype=bool)
-        lines[components] = True
-        if self.space.comm.size > 1:
-            lines[components + self._n] = True
-        return lines
-
-    def _entries(self, A: PETSc.Mat, part: Part) -> tuple[Ints, Ints, Array]:
-        """Lines, columns and values of the entries of a part's matrix, in the whole (collective)."""
-        indptr, columns, values = A.getValuesCSR()
-        rows, columns = np.repeat(part.components, np.diff(indptr)), part.in_whole(columns)
-        return np.where((columns >= self._first) & (columns < self._first + self._n), rows, rows + self._n), columns, values
-
-    def _make_room(
-        self, begins: bool, lines: Ints, columns: Ints, P: Restriction, Q: Restriction, curvature: PETSc.Mat | None
-    ) -> None:
+    def _make_room(self, begins: bool, changes: Blocks, P: Restriction, Q: Restriction, G: Blocks | None) -> None:
         """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective)."""
         comm = self.space.comm
-        wanted = self._missing(lines, columns)
+        wanted = self._missing(changes)
         if self.reserving:
-            part = self._part(P, P.nodes, np.ones_like(P.equations.active), curvature)
-            H = _sum(part.of(self._made_for[0]), curvature, part)
-            more = _product(H, P.reserved(part), None if Q is P else Q.reserved(part))
-            wanted = np.union1d(wanted, self._missing(*self._entries(more, part)[:2]))
+            more, _ = self._changes(P.reserved(), P.reserved() if Q is P else Q.reserved(), G)
+            wanted = np.union1d(wanted, self._missing(more))
         self._begins = False
         if begins:
             same = self._A is not None and np.array_equal(wanted, self._filled)
@@ -174,15 +226,22 @@ class UnitedMatrix:
             self._filled = both if few else wanted
         self._create()
 
-    def _missing(self, lines: Ints, columns: Ints) -> Ints:
-        """Keys of those entries that K lacks."""
-        _, there = self._K.find(lines, columns)
-        return np.unique(lines[~there] * self._size + columns[~there])
+    def _missing(self, blocks: Blocks) -> Ints:
+        """Keys of those blocks that K lacks."""
+        _, there = self._find(self._K, blocks)
+        new = blocks.some(~there)
+        first = self._first // self.space.block
+        line = new.row - first + np.where(self.space.owner_of(new.column) == self.space.comm.rank, 0, self.space.n_owned)
+        return np.unique(line * self._size + new.column)
 
     def _create(self) -> None:
         """Make the matrix, with the entries of K and those that were filled (collective)."""
-        K = self._K
-        new, columns = np.divmod(self._filled, self._size)
+        K, g = self._K, self.space.block
+        k = np.arange(g)
+        line, column = np.divmod(self._filled, self._size)
+        shape = (len(line), g, g)
+        new = np.broadcast_to((g * line[:, None] + k)[:, :, None], shape).ravel()
+        columns = np.broadcast_to((g * column[:, None] + k)[:, None, :], shape).ravel()
         counts = np.bincount(new, minlength=len(K.indptr) - 1)
         shift, grown = np.append(0, np.cumsum(counts)), counts > 0
         starts = (K.indptr + shift).astype(K.indptr.dtype)
@@ -207,15 +266,3 @@ class UnitedMatrix:
         self._A, self._changed = Entries(starts, all_columns, K.mat), None
         #: Where K has no entry.
         self._empty = place[len(old) :]
-
-
-def _sum(H: PETSc.Mat, curvature: PETSc.Mat | None, part: Part) -> PETSc.Mat:
-    """H with the curvature of a part of the nodes."""
-    if curvature is not None:
-        H.axpy(1.0, part.of(curvature), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-    return H
-
-
-def _product(H: PETSc.Mat, P: PETSc.Mat, Q: PETSc.Mat | None) -> PETSc.Mat:
-    """``Q'HP``, with P in place of Q if that is None."""
-    return H.PtAP(P) if Q is None else Q.transposeMatMult(H.matMult(P))

@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from uem_dolfinx.algebra.blocks import Blocks, product, rows_at, summed, together
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
-from uem_dolfinx.algebra.parts import Part
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Nodes
@@ -81,7 +81,7 @@ class Restriction:
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
         self.d = self.vector(closure)
         #: Rows of the eliminated nodes, columns of the nodes they follow.
-        self.M: Any = self._matrix(*self._coupling_entries(equations.active)) if self._n_rows else None
+        self.M: Any = self._matrix(*self._entries(self._couplings(equations.active))) if self._n_rows else None
         #: Whether equations follow each other in circles, and the number of terms with M in the series of P and c.
         self.circular = False
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
@@ -142,14 +142,6 @@ class Restriction:
         sizes = sizes or self._sizes
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=sizes[0][0]))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
-
-    def _coupling_entries(self, which: Bools) -> tuple[Ints, Ints, Array]:
-        """Local rows, global columns and values of M for some equations, zeros stored so that no place depends on directions."""
-        g, eq = self.space.block, self.equations.select(which)
-        values = self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :]
-        rows = np.broadcast_to((eq.node[eq.row, None] * g + np.arange(g))[:, :, None], values.shape)
-        columns = np.broadcast_to((eq.followed[:, None] * g + np.arange(g))[:, None, :], values.shape)
-        return _sum_duplicates(rows.ravel().astype(np.int64), columns.ravel(), values.ravel())
 
     def _longest_chain(self) -> int:
         """How many equations follow one another from node to node, till they end or what is left is rounding (collective).
@@ -214,60 +206,60 @@ class Restriction:
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
-    @cached_property
-    def P(self) -> PETSc.Mat:
-        """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal."""
-        return self.matrix(Part(self.space, np.ones(self.space.n_owned, dtype=bool)))
+    def rows(self) -> Blocks:
+        """Rows of P at the owned eliminated nodes; all others are those of the identity in free components (collective)."""
+        T = self._turned(self.united)
+        if self.chain == 0:
+            return T
+        M = self._couplings(self.equations.active)
+        asked = np.unique(M.column)
+        terms, power = [T], product(M, Blocks(asked, asked, self.space.ask_owners_for(asked, lambda i: self._turned(i).value)))
+        while True:
+            terms.append(power)
+            if len(terms) > self.chain:
+                return summed(together(*terms))
+            if self.circular:
+                power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
+            power = product(M, rows_at(self.space, power, asked))
+
+    def reserved(self) -> Blocks:
+        """Places of ``rows``, and those that all equations would take if they held and followed no others."""
+        return together(self._turned(self.nodes), self._couplings(np.ones_like(self.equations.active)))
 
     def followed(self, which: Bools) -> Ints:
         """Global nodes that some of the equations follow, each once."""
         eq = self.equations
         return np.unique(eq.followed[which[eq.row]])
 
-    def matrix(self, part: Part) -> PETSc.Mat:
-        """P of a part of the nodes that has the eliminated ones and those they follow (collective)."""
-        P = self._rotation(part)
-        if self.chain == 0:
-            return P
-        power, reach = part.of(self.M), 1
-        # (1 + M)(1 + M^2)(1 + M^4)... T: twice as many equations follow one another with each product
-        while True:
-            P.axpy(1.0, power.matMult(P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-            reach *= 2
-            if reach > self.chain:
-                return P
-            power = power.matMult(power)
-            if self.circular:
-                power = self._faded(power)
+    def _turned(self, nodes: npt.NDArray[np.integer]) -> Blocks:
+        """T at owned nodes ``(k,)``."""
+        value = self.free[nodes, None, :] * np.eye(self.space.block)
+        if len(self.nodes):
+            at = np.minimum(np.searchsorted(self.nodes, nodes), len(self.nodes) - 1)
+            here = self.nodes[at] == nodes
+            value[here] = self.frames[at[here]]
+        numbers = nodes + int(self.space.index_map.local_range[0])
+        return Blocks(numbers.astype(np.int64), numbers.astype(np.int64), value)
 
-    def _faded(self, power: PETSc.Mat) -> PETSc.Mat:
-        """A power of M without what is rounding, which would fill P in the end."""
-        indptr, columns, values = power.getValuesCSR()
-        kept = np.abs(values) > FADED
-        rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-        return self._matrix(rows[kept], columns[kept], values[kept], power.getSizes())
+    def _couplings(self, which: Bools) -> Blocks:
+        """M for some equations."""
+        eq = self.equations.select(which)
+        rows = eq.node[eq.row] + int(self.space.index_map.local_range[0])
+        return Blocks(rows.astype(np.int64), eq.followed, self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :])
 
-    def reserved(self, part: Part) -> PETSc.Mat:
-        """A matrix with the places of P, and with those that equations would take if they held and followed no others (collective)."""
-        P = self._rotation(part)
-        if self._n_rows:
-            M = self._matrix(*self._coupling_entries(np.ones_like(self.equations.active)))
-            P.axpy(1.0, part.of(M), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        return P
+    @cached_property
+    def P(self) -> PETSc.Mat:
+        """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal (collective)."""
+        others = np.setdiff1d(np.arange(self.space.n_owned), self.united)
+        return self._matrix(*self._entries(together(self._turned(others), self.rows())))
 
-    def _rotation(self, part: Part) -> PETSc.Mat:
-        """T of a part of the nodes."""
-        g = self.space.block
-        k, row = np.arange(g), np.arange(len(part.components)).reshape(-1, g)
-        has = np.isin(self.nodes, part.nodes)
-        turned = np.isin(part.nodes, self.nodes)
-        counts = np.where(turned, g, 1)[:, None].repeat(g, axis=1).ravel()
-        indptr = np.append(0, np.cumsum(counts)).astype(PETSc.IntType)
-        columns, values = np.empty(indptr[-1], PETSc.IntType), np.empty(indptr[-1])
-        alone, block = row[~turned].ravel(), indptr[row[turned]][:, :, None] + k
-        columns[indptr[alone]], values[indptr[alone]] = part.first + alone, self.free.ravel()[part.components[alone]]
-        columns[block], values[block] = part.first + row[turned][:, None, :], self.frames[has]
-        return PETSc.Mat().createAIJ(part.sizes, bsize=g, csr=(indptr, columns, values), comm=self.comm)
+    def _entries(self, blocks: Blocks) -> tuple[Ints, Ints, Array]:
+        """Sorted local rows, global columns and values of blocks in owned rows, zeros stored; equal places added."""
+        g, value = self.space.block, blocks.value
+        k = np.arange(g)
+        rows = np.broadcast_to((blocks.row[:, None] * g + k - self._first)[:, :, None], value.shape)
+        columns = np.broadcast_to((blocks.column[:, None] * g + k)[:, None, :], value.shape)
+        return _sum_duplicates(rows.ravel(), columns.ravel(), value.ravel())
 
     def cross_out(self, A: PETSc.Mat) -> None:
         """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -93,10 +94,15 @@ class Nodes:
 
     def ask_owners(self, nodes: Ints, values: Array) -> Array:
         """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
+        return self.ask_owners_for(nodes, lambda own: values[own])
+
+    def ask_owners_for(self, nodes: Ints, values: Callable[[Ints], Array]) -> Array:
+        """What owners answer for global ``nodes (m,)``: ``values`` of their local numbers ``(k,)``, in rows of any shape (collective)."""
         exchange = Exchange.to(self.comm, self.owner_of(nodes))
         (asked,) = exchange.send(nodes)
-        out = np.empty((len(nodes), values.shape[1]))
-        (out[exchange.rows],) = exchange.back(values[asked - self._first_nodes[self.comm.rank]])
+        (told,) = exchange.back(values(asked - self._first_nodes[self.comm.rank]))
+        out = np.empty((len(nodes), *told.shape[1:]), told.dtype)
+        out[exchange.rows] = told
         return out
 
     def add_at_owners(self, nodes: Ints, values: Array) -> Array:

@@ -1,0 +1,97 @@
+"""Sparse matrices as lists of nodal blocks, whose rows and columns are global numbers of nodes; SciPy multiplies them on each rank."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import Exchange
+
+
+class Blocks(NamedTuple):
+    """Blocks of a sparse matrix; those at one place add up.
+
+    Attributes:
+        row: global node of each block's components ``(k,)``.
+        column: global node of the unknowns that they take ``(k,)``.
+        value: ``(k, block, block)``.
+    """
+
+    row: Ints
+    column: Ints
+    value: Array
+
+    def some(self, which: Any) -> Blocks:
+        """Those alone that a mask or indices name."""
+        return Blocks(self.row[which], self.column[which], self.value[which])
+
+    @property
+    def transposed(self) -> Blocks:
+        """The transpose."""
+        return Blocks(self.column, self.row, self.value.transpose(0, 2, 1))
+
+
+def together(*parts: Blocks) -> Blocks:
+    """The sum of matrices, as a list."""
+    return Blocks(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def product(A: Blocks, B: Blocks) -> Blocks:
+    """``A B`` with each place once, zeros stored; columns of A of which B has no row count as zero."""
+    from scipy.sparse import bsr_matrix
+
+    g = A.value.shape[1]
+    inner, of_inner = np.unique(B.row, return_inverse=True)
+    at = np.minimum(np.searchsorted(inner, A.column), max(len(inner) - 1, 0))
+    kept = inner[at] == A.column if len(inner) else np.zeros(len(A.row), dtype=bool)
+    rows, of_row = np.unique(A.row[kept], return_inverse=True)
+    columns, of_column = np.unique(B.column, return_inverse=True)
+    if not len(rows):
+        return Blocks(rows, rows, np.zeros((0, g, g)))
+    # SciPy drops zeros where blocks are single numbers, in which places would depend on values
+    wide = np.zeros((len(B.row), g, max(g, 2)))
+    wide[:, :, :g] = B.value
+    left = _in_rows(of_row, at[kept], A.value[kept], len(rows))
+    right = _in_rows(of_inner, of_column, wide, len(inner))
+    C = bsr_matrix(left, shape=(g * len(rows), g * len(inner))) @ bsr_matrix(
+        right, shape=(g * len(inner), wide.shape[2] * len(columns))
+    )
+    return Blocks(np.repeat(rows, np.diff(C.indptr)), columns[C.indices], C.data[:, :, :g])
+
+
+def _in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
+    """Blocks in the order of their rows, their columns, and the first of each row and their number."""
+    order = np.argsort(row, kind="stable")
+    return value[order], column[order], np.append(0, np.cumsum(np.bincount(row, minlength=n_rows)))
+
+
+def summed(A: Blocks) -> Blocks:
+    """The same matrix with each place once, sorted by row and column."""
+    order = np.lexsort((A.column, A.row))
+    row, column, value = A.some(order)
+    new = np.ones(len(row), dtype=bool)
+    new[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
+    return Blocks(row[new], column[new], np.add.reduceat(value, np.flatnonzero(new)) if len(row) else value)
+
+
+def to_owners(space: Nodes, A: Blocks) -> Blocks:
+    """The blocks of all ranks in rows that this rank owns (collective)."""
+    if space.comm.size == 1:
+        return A
+    return Blocks(*Exchange.to(space.comm, space.owner_of(A.row)).send(*A))
+
+
+def rows_at(space: Nodes, A: Blocks, nodes: Ints) -> Blocks:
+    """Rows of A, whose rows their owners have, at global ``nodes (m,)`` of any rank, each once (collective)."""
+    asking = Exchange.to(space.comm, space.owner_of(nodes))
+    (asked,) = asking.send(nodes)
+    order = np.argsort(A.row, kind="stable")
+    low, high = (np.searchsorted(A.row[order], asked, side=side) for side in ("left", "right"))
+    counts = high - low
+    places = np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    ranks = np.repeat(asking.origins, counts)
+    lists = np.split(order[places], np.searchsorted(ranks, np.arange(1, space.comm.size)))
+    return Blocks(*Exchange(space.comm, lists).send(*A))
