@@ -193,7 +193,7 @@ def test_tangent_by_differences(cell):
     s = pair.friction.directions(pair.trial)
     residual(smooth, s)
     problem.system._apart = True
-    du = problem.forces.vector(way[: problem.config.n_owned])
+    du = problem.config.vector(way[: problem.config.n_owned])
     plain = problem.forces.update_tangent() * du
     full = plain + curvature_of([pair], du, problem.system._apart, False) * du
     difference = residual(smooth + 1e-5 * way, s) - residual(smooth - 1e-5 * way, s)

@@ -140,13 +140,13 @@ def test_friction_of_mortar_by_differences(cell, target):
         forces = []
         for tau in (-mu * lam[:, None] * pair.friction.directions(pair.trial), np.zeros((n, g))):
             pair.trial = replace(pair.trial, friction=replace(state, tau=tau))
-            forces.append(problem.forces.vector(scene.contact.force.x.array.reshape(-1, g)[: problem.config.n_owned].copy()))
+            forces.append(problem.config.vector(scene.contact.force.x.array.reshape(-1, g)[: problem.config.n_owned].copy()))
         return forces[0] - forces[1]
 
     friction(smooth, np.tile([1.0, *[0.5] * (g - 1)], (n, 1)))
     s = pair.friction.directions(pair.trial)
     friction(smooth, s)
-    du = problem.forces.vector(way[: problem.config.n_owned])
+    du = problem.config.vector(way[: problem.config.n_owned])
     tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[:, None] * pair.friction.directions(pair.trial)
     made = contact_curvature(pair.kinematics.turning(pair.trial, np.arange(n), tau), du) * du
     difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
@@ -195,14 +195,14 @@ def test_friction_of_degree_2_by_differences(cell, where, bound):
         pair.trial = replace(
             pair.trial, lam=lam, friction=replace(state, tau=-mu * lam[:, None] * pair.friction.directions(pair.trial))
         )
-        return problem.forces.vector(friction_at_nodes(scene.contact))
+        return problem.config.vector(friction_at_nodes(scene.contact))
 
     force(start, np.tile([1.0, *[0.3] * (g - 1)], (n, 1)))
     s = pair.friction.directions(pair.trial)
     force(start, s)
     which = np.flatnonzero(touching)
     tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[which, None] * s[which]
-    du = problem.forces.vector(way[: problem.config.n_owned])
+    du = problem.config.vector(way[: problem.config.n_owned])
     made = contact_curvature(pair.kinematics.turning(pair.trial, which, tau), du) * du
     difference = force(start + h * way, s) - force(start - h * way, s)
     difference.scale(0.5 / h)

@@ -99,7 +99,7 @@ def test_rows_do_not_depend_on_who_is_active():
             assert np.array_equal(getattr(eq, name), getattr(first, name))
         rows = system.restriction()
         assert isinstance(rows, Restriction)
-        q = rows.vector(np.cos(3 * pair.config.X[: pair.config.n_owned]))
+        q = pair.config.vector(np.cos(3 * pair.config.X[: pair.config.n_owned]))
         du = rows.expand(q)
         du.axpy(1.0, rows.c)
         gap = pair.predicted(du.array_r.reshape(-1, 3))

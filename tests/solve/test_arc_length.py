@@ -105,7 +105,7 @@ def test_length_of_the_arc():
     direction = ways[-1].array_r / ways[-1].norm()
     for part, closed in ((1 - 3e-9, True), (1 - 3e-8, False)):
         led.begin(0.5, direction, 1.0)
-        led.displace(led.displacement(), arch.problem.forces.vector(part * direction), 1.0)
+        led.displace(led.displacement(), arch.problem.config.vector(part * direction), 1.0)
         assert (abs(led._missing) <= arc_length.ON_THE_PLANE) == closed
 
 

@@ -68,7 +68,7 @@ def test_curvature_without_equations(again):
     if again:
         problem.system.solver.set_operator(none, K, None)
     problem.system.solver.set_operator(none, K, G)
-    used = gathered_vector(none.reduce(none.vector(np.ones(free.shape))))
+    used = gathered_vector(none.reduce(none.space.vector(np.ones(free.shape))))
     expected = used[:, None] * (gathered_matrix(K) + gathered_matrix(G)) * used
     expected += np.diag((1 - used) * np.diag(gathered_matrix(K)))
     found = gathered_matrix(problem.system.solver.A)

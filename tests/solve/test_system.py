@@ -48,7 +48,7 @@ def test_what_a_solve_foretells(length):
         state = system.unite(equilibrium)
         system.differentiate(first=True)
         system.linearise(state)
-        du = problem.forces.vector()
+        du = problem.config.vector()
         way = np.zeros((config.n_owned, 2))
         way[config.X[: config.n_owned, 1] > 0.25 * length, 1] = -0.5 * length * (1 + part)
         du.array[:] = way.ravel()

@@ -139,7 +139,7 @@ def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> 
     number = (np.cumsum(stiff) - 1)[body[mine]]
     # lengths of the model's size make turns as large as shifts
     motions = space.modes(centred=True).transpose(1, 0, 2)
-    modes = np.stack([P.reduce(P.vector(v)).array_r.reshape(n, -1) for v in motions], axis=2)
+    modes = np.stack([P.reduce(space.vector(v)).array_r.reshape(n, -1) for v in motions], axis=2)
     modes = (modes * where[:, :, None])[mine]
     gram = np.zeros((stiff.sum(), modes.shape[2], modes.shape[2]))
     np.add.at(gram, number, np.einsum("ngk,ngl->nkl", modes, modes))

@@ -185,7 +185,7 @@ class UnitedSolver:
             self._adapt(False)
             self._set_unsymmetric(restriction, test, K, curvature)
             return
-        if restriction.M is None and curvature is None:
+        if restriction.alone and curvature is None:
             with timed("cross out prescribed components"):
                 if self._crossed is None or self._crossed[0] != K:
                     self._crossed = K, K.copy()

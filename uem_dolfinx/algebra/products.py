@@ -122,7 +122,8 @@ class UnitedMatrix:
         X = together(left.some(~on), product(left.some(on), trial))
         at = eliminated[X.row - first]
         changes = summed(together(X.some(~at), to_owners(space, product(test.transposed, X.some(at)))))
-        return changes, np.logical_not(eliminated[changes.row - first] | np.isin(changes.column, seen))
+        kept: Bools = np.logical_not(eliminated[changes.row - first] | np.isin(changes.column, seen))
+        return changes, kept
 
     def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
         """Rows of P at eliminated nodes of this rank, and at those of others that are ``coupled`` with nodes here (collective)."""
@@ -138,7 +139,7 @@ class UnitedMatrix:
 
     def _inside(self, nodes: Ints, columns: Bools | None = None) -> Blocks:
         """Blocks of K in rows and columns of owned nodes, in rows ``nodes (k,)``, and in some ``columns (n_owned,)`` alone if told."""
-        g, first = self.space.block, self._first // self.space.block
+        g, first = self.space.block, self.space.first
         places, i, width = blocks_of(nodes, self._K.indptr, g)
         column = self._K.columns[places] // g
         if columns is not None:
@@ -158,7 +159,7 @@ class UnitedMatrix:
 
     def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
         """Blocks of G in owned rows without prescribed components (collective)."""
-        g, first = self.space.block, self._first // self.space.block
+        g, first = self.space.block, self.space.first
         indptr, columns, values = G.getValuesCSR()
         nodes = np.flatnonzero(np.diff(indptr[::g]))
         places, i, width = blocks_of(nodes, indptr, g)
@@ -184,7 +185,7 @@ class UnitedMatrix:
         if fresh:
             self._made_for, self._K, self._A = (K, P.free), Entries.as_in(K), None
             # where Z crosses out, but for the diagonal
-            free = P.vector(P.free.astype(float))
+            free = self.space.vector(P.free)
             self._K.values[:] = 1.0
             self._K.mat.diagonalScale(free, free)
             held = np.flatnonzero(~P.free)
@@ -230,7 +231,7 @@ class UnitedMatrix:
         """Keys of those blocks that K lacks."""
         _, there = self._find(self._K, blocks)
         new = blocks.some(~there)
-        first = self._first // self.space.block
+        first = self.space.first
         line = new.row - first + np.where(self.space.owner_of(new.column) == self.space.comm.rank, 0, self.space.n_owned)
         return np.unique(line * self._size + new.column)
 

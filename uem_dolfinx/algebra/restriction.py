@@ -26,9 +26,9 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.blocks import Blocks, product, rows_at, summed, together
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import ConflictError
-from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.geometry.nodes import Halo, Nodes
 from uem_dolfinx.parallel import agree
 
 #: Equations may follow each other in circles if what has gone through so many of them is rounding.
@@ -67,7 +67,7 @@ class Restriction:
         self.comm = space.comm
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.index_map.size_global),) * 2
-        self._first = g * int(space.index_map.local_range[0])
+        self._first = g * space.first
         self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
@@ -79,18 +79,19 @@ class Restriction:
         closure = np.array(prescribed)
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
-        self.d = self.vector(closure)
-        #: Rows of the eliminated nodes, columns of the nodes they follow.
-        self.M: Any = self._matrix(*self._entries(self._couplings(equations.active))) if self._n_rows else None
+        self.d = space.vector(closure)
+        #: Terms of the equations that hold, which are those of M, and the nodes that they follow.
+        self._held = equations.select(equations.active)
+        self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
+        self._halo = Halo(space, self._follows) if self._n_rows else None
         #: Whether equations follow each other in circles, and the number of terms with M in the series of P and c.
         self.circular = False
         self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
 
-    def vector(self, values: Array) -> PETSc.Vec:
-        """A vector with these values at the owned components."""
-        v = PETSc.Vec().createMPI(self._sizes[0], bsize=self.space.block, comm=self.comm)
-        v.array[:] = values.ravel()
-        return v
+    @property
+    def alone(self) -> bool:
+        """Whether there are no equations on any rank, so that P only crosses out prescribed components."""
+        return not self._n_rows
 
     # -- elimination in each node's frame ------------------------------------------------------------------------------
 
@@ -211,9 +212,9 @@ class Restriction:
         T = self._turned(self.united)
         if self.chain == 0:
             return T
-        M = self._couplings(self.equations.active)
-        asked = np.unique(M.column)
-        terms, power = [T], product(M, Blocks(asked, asked, self.space.ask_owners_for(asked, lambda i: self._turned(i).value)))
+        assert self._halo is not None
+        M, asked = self._couplings(self.equations.active), self._follows
+        terms, power = [T], product(M, Blocks(asked, asked, self._halo.take(lambda i: self._turned(i).value)))
         while True:
             terms.append(power)
             if len(terms) > self.chain:
@@ -238,13 +239,13 @@ class Restriction:
             at = np.minimum(np.searchsorted(self.nodes, nodes), len(self.nodes) - 1)
             here = self.nodes[at] == nodes
             value[here] = self.frames[at[here]]
-        numbers = nodes + int(self.space.index_map.local_range[0])
+        numbers = nodes + self.space.first
         return Blocks(numbers.astype(np.int64), numbers.astype(np.int64), value)
 
     def _couplings(self, which: Bools) -> Blocks:
         """M for some equations."""
         eq = self.equations.select(which)
-        rows = eq.node[eq.row] + int(self.space.index_map.local_range[0])
+        rows = eq.node[eq.row] + self.space.first
         return Blocks(rows.astype(np.int64), eq.followed, self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :])
 
     @cached_property
@@ -263,7 +264,7 @@ class Restriction:
 
     def cross_out(self, A: PETSc.Mat) -> None:
         """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""
-        used = self.vector(self.used.astype(float))
+        used = self.space.vector(self.used.astype(float))
         A.diagonalScale(used, used)
 
     # -- P as a map ----------------------------------------------------------------------------------------------------
@@ -278,24 +279,29 @@ class Restriction:
         q = dq.array_r.reshape(-1, self.space.block)
         du = q * self.free
         du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
-        return self._series(self.vector(du))
+        return self._series(self.space.vector(du))
 
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
-        """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F``."""
-        y, part = F.copy(), F
+        """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective)."""
+        part = F.array_r.reshape(-1, self.space.block)
+        total, eq = part.copy(), self._held
         for _ in range(self.chain):
-            moved = y.duplicate()
-            self.M.multTranspose(part, moved)
-            part = moved
-            y.axpy(1.0, part)
-        return y
+            along = np.einsum("mg,mg->m", self.lift[self.equations.active], part[eq.node])
+            part = self._to_followed(eq.coefficients * along[eq.row][:, None])
+            total += part
+        return self.space.vector(total)
+
+    def _to_followed(self, values: Array) -> Array:
+        """Sums of the terms' values at the nodes that they follow ``(n_owned, block)`` (collective)."""
+        assert self._halo is not None
+        return self._halo.add(sums_of_rows(self._term, values, len(self._follows)))
 
     def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
         """``T' y``; with y from ``pass_on`` this is ``P'F``."""
         full = y.array_r.reshape(-1, self.space.block)
         q = full * self.free
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
-        return self.vector(q)
+        return self.space.vector(q)
 
     def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
         """``P'F``."""
@@ -307,12 +313,16 @@ class Restriction:
         return np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
 
     def _series(self, v: PETSc.Vec) -> PETSc.Vec:
-        """``(1 + M + M^2 + ...) v``."""
-        total, part = v.copy(), v
+        """``(1 + M + M^2 + ...) v`` (collective)."""
+        part = v.array_r.reshape(-1, self.space.block)
+        total, eq, lift = part.copy(), self._held, self.lift[self.equations.active]
         for _ in range(self.chain):
-            part = self.M * part
-            total.axpy(1.0, part)
-        return total
+            assert self._halo is not None
+            there = self._halo.take(part.__getitem__)[self._term]
+            along = np.bincount(eq.row, np.einsum("kg,kg->k", eq.coefficients, there), len(eq))
+            part = sums_of_rows(eq.node.astype(np.int64), lift * along[:, None], self.space.n_owned)
+            total += part
+        return self.space.vector(total)
 
     def fingerprint(self, *, values: bool) -> int:
         """Hash of this rank's part of P: of its sparsity, or of its values too, but for rounding."""

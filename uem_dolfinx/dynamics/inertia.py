@@ -270,8 +270,8 @@ class Dynamics:
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
-        M = self.mass.M.copy() if restriction.M is None else self.mass.M.PtAP(restriction.P)
-        if restriction.M is None:
+        M = self.mass.M.copy() if restriction.alone else self.mass.M.PtAP(restriction.P)
+        if restriction.alone:
             restriction.cross_out(M)
         rhs = restriction.transpose(F)
         diagonal = M.getDiagonal()

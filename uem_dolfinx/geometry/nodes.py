@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Ints, sums_of_rows
@@ -26,6 +27,7 @@ class Nodes:
         index_map: owned nodes and ghosts.
         n_owned: number of nodes that this rank owns.
         n_local: that and its ghosts.
+        first: global number of the first owned node.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
     """
 
@@ -39,6 +41,7 @@ class Nodes:
         self.n_local: int = self.n_owned + self.index_map.num_ghosts
         # every rank takes a node's position from its owner, to the last bit
         every = np.arange(self.n_local)
+        self.first = int(self.index_map.local_range[0])
         self.X: Array = self.from_owners(every, V.tabulate_dof_coordinates()[: self.n_local, : self.gdim], every)
 
     def modes(self, centred: bool = False) -> Array:
@@ -53,6 +56,18 @@ class Nodes:
         """Global block numbers of local nodes."""
         flat = np.ascontiguousarray(nodes, dtype=np.int32).ravel()
         return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
+
+    @cached_property
+    def _like(self) -> PETSc.Vec:
+        """What vectors are made after."""
+        sizes = self.block * self.n_owned, self.block * self.index_map.size_global
+        return PETSc.Vec().createMPI(sizes, bsize=self.block, comm=self.comm)
+
+    def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
+        """A vector with these values at the owned components, or zeros."""
+        v = self._like.duplicate()
+        v.array[:] = 0.0 if values is None else np.ravel(values)
+        return v
 
     @cached_property
     def _work(self) -> fem.Function:
@@ -90,26 +105,45 @@ class Nodes:
     def gather_owned(self, nodes: Ints) -> Ints:
         """Owned local nodes among the global ``nodes (m,)`` of all ranks, each once, sorted (collective)."""
         (owned,) = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes)
-        return np.unique(owned) - self._first_nodes[self.comm.rank]
+        return np.unique(owned) - self.first
 
     def ask_owners(self, nodes: Ints, values: Array) -> Array:
         """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
-        return self.ask_owners_for(nodes, lambda own: values[own])
-
-    def ask_owners_for(self, nodes: Ints, values: Callable[[Ints], Array]) -> Array:
-        """What owners answer for global ``nodes (m,)``: ``values`` of their local numbers ``(k,)``, in rows of any shape (collective)."""
-        exchange = Exchange.to(self.comm, self.owner_of(nodes))
-        (asked,) = exchange.send(nodes)
-        (told,) = exchange.back(values(asked - self._first_nodes[self.comm.rank]))
-        out = np.empty((len(nodes), *told.shape[1:]), told.dtype)
-        out[exchange.rows] = told
-        return out
+        return Halo(self, nodes).take(lambda own: values[own])
 
     def add_at_owners(self, nodes: Ints, values: Array) -> Array:
         """Sums of values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners ``(n_owned, k)`` (collective)."""
         there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
-        return sums_of_rows(there - self._first_nodes[self.comm.rank], arrived, self.n_owned)
+        return sums_of_rows(there - self.first, arrived, self.n_owned)
 
     def describe(self, node: int) -> str:
         """Where a local node is, for error messages."""
         return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"
+
+
+class Halo:
+    """Global nodes that this rank looks at, of any rank, and their owners (collective).
+
+    Args:
+        space: the space.
+        nodes: global numbers ``(m,)``.
+    """
+
+    def __init__(self, space: Nodes, nodes: Ints):
+        self._space, self._size = space, len(nodes)
+        self._exchange = Exchange.to(space.comm, space.owner_of(nodes))
+        (asked,) = self._exchange.send(nodes)
+        #: Local numbers of the owned nodes that ranks look at.
+        self._asked: Ints = asked - space.first
+
+    def take(self, values: Callable[[Ints], Array]) -> Array:
+        """What owners have there ``(m, ...)``: ``values`` of their local nodes ``(k,)``, in rows of any shape (collective)."""
+        (told,) = self._exchange.back(values(self._asked))
+        out = np.empty((self._size, *told.shape[1:]), told.dtype)
+        out[self._exchange.rows] = told
+        return out
+
+    def add(self, values: Array) -> Array:
+        """Sums of ``values (m, k)`` that ranks have there, at their owners ``(n_owned, k)`` (collective)."""
+        (arrived,) = self._exchange.send(values)
+        return sums_of_rows(self._asked, arrived, self._space.n_owned)

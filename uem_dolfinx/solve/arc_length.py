@@ -50,7 +50,7 @@ class ArcLength:
         #: Displacement at the beginning of the step, and load factor at that of the iteration.
         self._start, self._from = self._system.displacement(), 0.0
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
-        self._change, self._slope = 0.0, problem.forces.vector()
+        self._change, self._slope = 0.0, problem.config.vector()
 
     def __getattr__(self, name: str) -> Any:
         """All else is the system's."""

@@ -81,13 +81,6 @@ class BodyForces:
 
     # -- forces --------------------------------------------------------------------------------------------------------
 
-    def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
-        """A vector with the displacement's layout and these values at the owned components, or zeros."""
-        v = PETSc.Vec().createMPI(self._b.getSizes(), bsize=self.config.gdim, comm=self.comm)
-        if values is not None:
-            v.array[:] = np.ravel(values)
-        return v
-
     def assemble(self) -> bool:
         """Residual ``F(u)`` at the present displacement: whether it is finite on all ranks (collective)."""
         try:
@@ -106,7 +99,7 @@ class BodyForces:
     @property
     def residual(self) -> PETSc.Vec:
         """Owned part of the assembled residual, internal minus external forces."""
-        return self.vector(self._b.array_r)
+        return self.config.vector(self._b.array_r)
 
     @property
     def linear(self) -> bool:
@@ -141,7 +134,7 @@ class BodyForces:
             return 0.0
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
-        return float(FORCE_ROUNDING * self.vector(rounded * self.stiffness).norm())
+        return float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
         """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""
@@ -161,19 +154,21 @@ class BodyForces:
         """
         F, n = self._b.array_r, self.config.n_owned
         if self.stiffness is None:
-            return float(self.vector(F).norm())
+            return float(self.config.vector(F).norm())
         body, count = find_bodies(self.config)
         rounded = np.zeros(count)
         np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
         limit = TOLD_APART * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
-        return float(self.vector(np.where(np.abs(F) > limit.ravel(), F, 0.0)).norm())
+        return float(self.config.vector(np.where(np.abs(F) > limit.ravel(), F, 0.0)).norm())
 
     def strain_rounding(self) -> float:
         """Norm of the forces that rounding of ``1 + grad(u)`` can make (collective)."""
         return (
-            0.0 if self.stiffness is None else float(np.finfo(float).eps * self.vector(self.stiffness).norm() * self.config.size)
+            0.0
+            if self.stiffness is None
+            else float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
         )
 
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
@@ -204,7 +199,7 @@ class BodyForces:
 
     def displacement(self) -> PETSc.Vec:
         """Copy of the present displacement."""
-        return self.vector(self._u.array_r)
+        return self.config.vector(self._u.array_r)
 
     def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
         """Set the displacement to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""

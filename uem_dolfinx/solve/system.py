@@ -214,7 +214,7 @@ class BodySystem:
         trial = rows.upright
         if apart is not None:
             trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)
-        added, held = slip_terms(self.pairs, self.forces.vector())
+        added, held = slip_terms(self.pairs, self.config.vector())
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
             trial=trial,
@@ -367,7 +367,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.forces.update_tangent()
         with timed("contact curvature"):
-            how = self.forces.vector(), self._apart, self.exchanges.convex
+            how = self.config.vector(), self._apart, self.exchanges.convex
             self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False

@@ -65,7 +65,7 @@ class LagrangeSystem(BodySystem):
         curvature = self._curvature
         equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
-        self._c = self.forces.vector(self.forces.prescribed)
+        self._c = self.config.vector(self.forces.prescribed)
         if curvature is None and not any(pair.sliding == "finite" for pair in self.pairs):
             made_of = (
                 self.forces.tangent.number,
@@ -86,7 +86,7 @@ class LagrangeSystem(BodySystem):
         self._short = self._G_all * self._c
         self._short.array[:] += equations.gap
         self._short.array[:] *= -self._scale
-        self._load = self.forces.vector(-np.where(free, load.array_r.reshape(free.shape), 0.0))
+        self._load = self.config.vector(-np.where(free, load.array_r.reshape(free.shape), 0.0))
         self._restriction = state.test
         load = self._A * state.trial.c
         load.axpy(1.0, self.forces.residual)
@@ -101,7 +101,7 @@ class LagrangeSystem(BodySystem):
         self._A = self.forces.tangent.K if curvature is None else self.forces.tangent.K.copy()
         if curvature is not None:
             self._A.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        used, own = self.forces.vector(free.astype(float)), self.forces.vector(self.forces.stiffness)
+        used, own = self.config.vector(free.astype(float)), self.config.vector(self.forces.stiffness)
         mean = own.sum() / own.getSize()
         self._scale = float(mean)
         self._G_all = self._constraints(equations)
@@ -131,7 +131,7 @@ class LagrangeSystem(BodySystem):
     def _constraints(self, equations: UnitingEquations) -> PETSc.Mat:
         """G: a row per equation, a column per displacement (collective)."""
         g, m = self.config.gdim, len(equations)
-        sizes = self.forces.vector().getSizes()
+        sizes = self.config.vector().getSizes()
         own = self.config.to_global(equations.node.astype(np.int32))
         rows = np.concatenate([np.repeat(np.arange(m), g), np.repeat(equations.row, g)])
         nodes = np.concatenate([own, equations.followed])
@@ -169,10 +169,10 @@ class LagrangeSystem(BodySystem):
         b.axpy(-1.0, self.saddle * x)
         if reason < 0 or not np.isfinite(x.norm()) or b.norm() > 1e-3 * max(self._load.norm(), self._short.norm()):
             raise LinearSolveError(f"the saddle point is singular, or its solve failed with KSP reason {reason}")
-        self._x = self.forces.vector(x.array_r[:n])
+        self._x = self.config.vector(x.array_r[:n])
         return self._restriction.reduce(self._x), int(self._ksp.getIterationNumber())
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """The increment with the prescribed displacements."""
         free = self.forces.free[: self.config.n_owned].ravel()
-        return self.forces.vector(np.where(free, self._x.array_r, self._c.array_r))
+        return self.config.vector(np.where(free, self._x.array_r, self._c.array_r))

@@ -197,7 +197,7 @@ class PenaltySystem(PushedSystem):
     def _stretch(self) -> tuple[PETSc.Vec, float]:
         """Forces of the springs on the bodies, and the deepest overlap (collective); keeps the springs."""
         self._springs, overlap = [], 0.0
-        total = self.forces.vector()
+        total = self.config.vector()
         for k, (pair, points) in enumerate(zip(self.pairs, self._points)):
             p = points.project()
             force = np.maximum(self._multipliers[k] - self._stiffness_of_springs * points.area * p.gap, 0.0) * ~_past_the_end(p)
@@ -321,7 +321,7 @@ class PenaltySystem(PushedSystem):
         blocks = [self._blocks(s, mu) for s, mu in zip(self._springs, self._mu)]
         A = self.forces.tangent.K.copy()
         if self.comm.allreduce(sum(len(nodes) for nodes, _ in blocks)):
-            A.axpy(1.0, contact_curvature(blocks, self.forces.vector()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            A.axpy(1.0, contact_curvature(blocks, self.config.vector()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return A
 
     def _blocks(self, s: Springs, mu: float) -> tuple[Ints, Array]:
