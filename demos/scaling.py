@@ -6,13 +6,14 @@ python3 demos/scaling.py --json scaling.json --plot scaling.png
 # %% [markdown]
 # # Ranks
 #
-# Three measurements, each a ratio of things done in one run:
+# Four measurements, of which no time hangs on another run:
 #
 # 1. A half sphere on a block, linear elastic, small sliding, one load step, CG with multigrid: seconds from the making of the problem to
 #    its solution, without reading the mesh and compiling forms.
 # 2. Two plates, one cell thick, that touch all over: bytes that a rank receives from others while all contactors are projected,
 #    against its share of the surfaces, its own contactors and facets. Nothing is timed: there may be more ranks than cores.
 # 3. The time of that search on one rank against the number of contactors.
+# 4. Collective calls of MPI in the second step of the first scene, by stage, whoever makes them: where ranks wait for each other.
 #
 # Called on one rank the script starts `mpiexec` of itself for each number of ranks; on several, or with `--where here`, it measures on
 # those that it has. Numbers of a list are parted by commas.
@@ -24,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import common
@@ -31,6 +33,7 @@ import numpy as np
 import ufl
 from common import comm
 from dolfinx import fem
+from benchmarks import collectives
 from benchmarks.traffic import Surfaces, plates, search_traffic
 
 import uem_dolfinx as uem
@@ -44,6 +47,8 @@ args = common.arguments(
     plates="60,120",
     plate_ranks="1,2,4,8",
     searches="40,80,160,320",
+    counted=35_000,
+    count_ranks="2,4",
 )
 
 #: Timers of the stages of a solution.
@@ -60,32 +65,44 @@ STAGES = {
 
 
 # %%
-def solve(dofs: int, runs: int) -> dict[str, object]:
-    """Solve a Hertz scene with about so many unknowns some times: the quickest run, and what a search of it sends (collective)."""
-    a = 0.005
+a = 0.005
+
+
+def scene(dofs: int) -> Callable[[], uem.UnitedProblem]:
+    """A Hertz scene with about so many unknowns: what makes its problem (collective)."""
     parameters = {"h": 0.1 * a * (89_000 / dofs) ** (1 / 3), "zone": 1.4 * a, "growth": 0.8 / a}
     mesh, tags = uem.read_gmsh(common.MESHES / "hertz_sphere.geo", comm, gdim=3, parameters=parameters)
     V = uem.function_space(mesh, 1, (3,))
     bcs = [uem.dirichlet(V, tags[name], i) for i, name in enumerate(("symmetry_x", "symmetry_y", "block_bottom"))]
     bcs.append(uem.dirichlet(V, tags["sphere_top"], 2, -(a**2)))
-    found = []
-    for _ in range(runs):
+
+    def make() -> uem.UnitedProblem:
         u = fem.Function(V, name="displacement")
         F = uem.LinearElastic(1e6, 0.3).residual(u, ufl.TestFunction(V)) * ufl.dx
         contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], sliding="small")
+        return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="scaling_", verbose=args.verbose)
+
+    return make
+
+
+def solve(dofs: int, runs: int) -> dict[str, object]:
+    """Solve a Hertz scene with about so many unknowns some times: the quickest run, and what a search of it sends (collective)."""
+    found, make = [], scene(dofs)
+    for _ in range(runs):
         common.free_memory()
         comm.barrier()
         before, start = clocks(), time.perf_counter()
-        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="scaling_", verbose=args.verbose)
+        problem = make()
         (step,) = uem.load_steps(problem)
         seconds = [time.perf_counter() - start, *(clocks() - before)]
         found.append([float(max(s)) for s in zip(*comm.allgather(seconds))])
     seconds, *stages = min(found)
+    contact = problem.contacts[0]
     pair = contact.pair
     searched = search_traffic(Surfaces(problem.config, pair.target, pair.points))
     return {
         "ranks": comm.size,
-        "dofs": 3 * V.dofmap.index_map.size_global,
+        "dofs": 3 * problem.config.index_map.size_global,
         "seconds": seconds,
         "search_bytes_max": searched["bytes_max"],
         "contact_imbalance": searched["imbalance"],
@@ -99,6 +116,19 @@ def solve(dofs: int, runs: int) -> dict[str, object]:
 def clocks() -> np.ndarray:
     """Seconds that each stage has taken so far on this rank."""
     return np.array([sum(uem.timing(timer)[1] for timer in timers) for timers in STAGES.values()])
+
+
+def count(dofs: int) -> dict[str, object]:
+    """Collective calls in the second step of the scene, by stage (collective)."""
+    problem = scene(dofs)()
+    steps = uem.load_steps(problem, 2)
+    next(steps)
+    with collectives.counted() as calls:
+        step = next(steps)
+    steps.close()
+    solver = sum(calls.pop(stage, 0) for stage in ("linear solve", "factorisation or preconditioner set-up"))
+    row = {"ranks": comm.size, "dofs": 3 * problem.config.index_map.size_global, "newton_iterations": step.newton_iterations}
+    return row | {"all": sum(calls.values()), "solver": solver} | dict(calls.most_common())
 
 
 # %% [markdown]
@@ -139,9 +169,11 @@ def best_time(surfaces: Surfaces) -> float:
     return min(seconds)
 
 
-def here(dofs: int, sizes: str, searches: str) -> dict[str, list]:
+def here(dofs: int, sizes: str, searches: str, counted: int) -> dict[str, list]:
     """All measurements on the ranks of this call (collective)."""
-    found: dict[str, list] = {"ranks": [], "plates": [], "search": []}
+    found: dict[str, list] = {"ranks": [], "plates": [], "search": [], "collectives": []}
+    if counted and collectives.counts():
+        found["collectives"].append(count(counted))
     if dofs:
         # whatever is compiled or imported at first use
         solve(min(dofs, 2000), 1)
@@ -172,7 +204,17 @@ def apart(ranks: int, **options: object) -> dict[str, list]:
     environment |= {"OMPI_MCA_hwloc_base_binding_policy": "none", "PRTE_MCA_hwloc_default_binding_policy": "none"}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "figures.json"
-        options = {"where": "here", "json": file, "runs": args.runs, "dofs": 0, "plates": "", "searches": ""} | options
+        if options.get("counted"):
+            environment |= collectives.environment(mpiexec, Path(folder))
+        options = {
+            "where": "here",
+            "json": file,
+            "runs": args.runs,
+            "dofs": 0,
+            "plates": "",
+            "searches": "",
+            "counted": 0,
+        } | options
         words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         command = [mpiexec, "-n", str(ranks), sys.executable, str(Path(__file__).resolve()), *words]
         done = subprocess.run(command, env=environment | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
@@ -187,7 +229,7 @@ def apart(ranks: int, **options: object) -> dict[str, list]:
 if args.where == "here" or comm.size > 1:
     if comm.rank == 0 and args.where != "here":
         print(f"measured on the {comm.size} ranks of this call alone; call it on one rank to compare numbers of ranks")
-    results = here(args.dofs, args.plates, args.searches)
+    results = here(args.dofs, args.plates, args.searches, args.counted)
 else:
     results = {
         "ranks": [row for k in common.numbers(args.ranks) if args.dofs for row in apart(k, dofs=args.dofs)["ranks"]],
@@ -195,6 +237,9 @@ else:
             row for k in common.numbers(args.plate_ranks) if args.plates for row in apart(k, plates=args.plates)["plates"]
         ],
         "search": apart(1, searches=args.searches)["search"] if args.searches else [],
+        "collectives": [
+            row for k in common.numbers(args.count_ranks) if args.counted for row in apart(k, counted=args.counted)["collectives"]
+        ],
     }
 
 # %% [markdown]

@@ -122,8 +122,7 @@ class UnitedMatrix:
         X = together(left.some(~on), product(left.some(on), trial))
         at = eliminated[X.row - first]
         changes = summed(together(X.some(~at), to_owners(space, product(test.transposed, X.some(at)))))
-        kept: Bools = np.logical_not(eliminated[changes.row - first] | np.isin(changes.column, seen))
-        return changes, kept
+        return changes, ~(eliminated[changes.row - first] | np.isin(changes.column, seen))
 
     def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
         """Rows of P at eliminated nodes of this rank, and at those of others that are ``coupled`` with nodes here (collective)."""
@@ -176,7 +175,7 @@ class UnitedMatrix:
         line = g * blocks.row - self._first + np.where(inside, 0, self._n)
         column = np.repeat(g * blocks.column, g)
         places, there = entries.find((line[:, None] + np.arange(g)).ravel(), column)
-        return places.reshape(-1, g, 1) + np.arange(g), there.reshape(-1, g).all(axis=1)
+        return places.reshape(-1, g, 1) + np.arange(g), np.asarray(there.reshape(-1, g).all(axis=1))
 
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
         """Take K's places if they are new; whether its values are (collective)."""
