@@ -119,8 +119,12 @@ def test_a_cylinder_slides_far(comm, degree):
         ("tetrahedron", "ends"),
     ],
 )
-def test_friction_of_mortar_by_differences(cell, target):
-    """Derivatives of the forces of friction of weighted gaps, over bodies that bend, all contactors slipping."""
+@pytest.mark.parametrize("slips", [True, False])
+def test_friction_of_mortar_by_differences(cell, target, slips):
+    """Derivatives of the forces of friction of weighted gaps, over bodies that bend, all contactors slipping, or all held.
+
+    Of contactors that slip the multipliers of the weighted gaps stay; of those that are held those of the rows along the target.
+    """
     mu, h = 0.4, 1e-6
     scene = driven(
         cell, mu, rigid=target == "plane", n=(3, 4) if cell == "quadrilateral" else (2, 3), how=MORTAR, swap=target == "ends"
@@ -128,17 +132,19 @@ def test_friction_of_mortar_by_differences(cell, target):
     problem, pair = scene.problem, scene.contact.pair
     g, n = problem.config.gdim, len(pair.nodes)
     smooth, way, pressure = fields(problem, pair)
+    held = np.where(pair.kinematics.rows.covered, pressure, 0.0)
 
     def friction(u, direction):
-        """Nodal forces of friction; the multipliers of the weighted gaps stay."""
+        """Nodal forces of friction."""
         state = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
         pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=state)
         problem.u.x.array[:] = u.ravel()
         problem.system.place(returning=False)
         lam = pressure * pair.kinematics.rows.area
         pair.trial = replace(pair.trial, lam=lam)
+        size = mu * (lam if slips else held * pair.kinematics.force_per_multiplier)
         forces = []
-        for tau in (-mu * lam[:, None] * pair.friction.directions(pair.trial), np.zeros((n, g))):
+        for tau in (-size[:, None] * pair.friction.directions(pair.trial), np.zeros((n, g))):
             pair.trial = replace(pair.trial, friction=replace(state, tau=tau))
             forces.append(problem.config.vector(scene.contact.force.x.array.reshape(-1, g)[: problem.config.n_owned].copy()))
         return forces[0] - forces[1]
@@ -147,11 +153,25 @@ def test_friction_of_mortar_by_differences(cell, target):
     s = pair.friction.directions(pair.trial)
     friction(smooth, s)
     du = problem.config.vector(way[: problem.config.n_owned])
-    tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[:, None] * pair.friction.directions(pair.trial)
-    made = contact_curvature(pair.kinematics.turning(pair.trial, np.arange(n), tau), du) * du
+    size = mu * (pair.trial.lam / pair.kinematics.force_per_multiplier if slips else held)
+    tau = -size[:, None] * pair.friction.directions(pair.trial)
+    made = contact_curvature(pair.kinematics.turning(pair.trial, np.arange(n), tau, np.full(n, not slips)), du) * du
     difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
     difference.scale(0.5 / h)
     assert (difference - made).norm() <= 1e-8 * difference.norm()
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", slow("tetrahedron")])
+def test_contactors_that_stick_converge_quadratically(cell):
+    """Over a body that bends under a large shear, with so much friction that most stick: the tangent has all of their rows."""
+    side = [0.0] * (1 if cell == "tetrahedron" else 0)
+    scene = driven(cell, 3.0, law=st_venant, n=(2, 3) if side else (3, 4), how=MORTAR)
+    for place in ((0.0, *side, -0.1), (0.1, *side, -0.1)):
+        scene.to(*place)
+    left = np.array([iteration.residual for iteration in scene.to(0.2, *side, -0.1)])
+    assert scene.states[0] >= 4
+    late = np.flatnonzero(left[:-1] < 1e-3)
+    assert len(late) >= 2 and (left[late + 1] <= np.maximum(10 * left[late] ** 2, 1e-12)).all()
 
 
 @pytest.mark.parametrize(

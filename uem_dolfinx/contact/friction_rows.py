@@ -25,6 +25,7 @@ def with_friction(
     slope: Array,
     normal: Array,
     pointwise: bool,
+    keeps_feet: bool,
 ) -> Constraints:
     """Equations with those along the target, and tilted test rows where contactors slip (collective).
 
@@ -37,6 +38,7 @@ def with_friction(
         slope: by how much the limit of friction grows with the multiplier across the target ``(n,)``.
         normal: of the contactors ``(n, gdim)``.
         pointwise: whether contactors that stick stand on their anchors, so that both are followed by the same weights.
+        keeps_feet: whether these weights stay the same for a step.
     """
     comm, g = frame.ties.config.comm, normal.shape[1]
     across = np.flatnonzero(own.kind == NORMAL)
@@ -60,8 +62,8 @@ def with_friction(
     slipping = rubbing & ~stick
     tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
     slips = comm.allreduce(bool(tilt.any()), op=MPI.LOR)
-    # where none slips on parallel facets rows stay symmetric
-    if own.trial is not test or (slips and not pointwise):
+    # where rows stay the same for a step, those of contactors that stick are symmetric
+    if own.trial is not test or not (pointwise or (keeps_feet and not slips)):
         trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)
     if slips:
         tilted = _tilted(frictionless, across, tilt, place, frame.ties)

@@ -173,13 +173,14 @@ class Kinematics(Protocol):
     def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda grad^2 g``: lists of global nodes ``(k, m)`` and values ``(k, m gdim, m gdim)``."""
 
-    def turning(self, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
-        """Derivatives of the forces of friction of contactors that slip (collective).
+    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
+        """Derivatives of forces of friction (collective).
 
         Args:
             state: of the interface.
-            which: contactors that slip and push, ascending ``(k,)``.
+            which: contactors, ascending; where the discretisation is ``pointwise`` those alone that slip ``(k,)``.
             tau: their friction, as multipliers of rows along the target ``(k, gdim)``.
+            held: those that stick, whose multipliers are kept rather than their coefficients of friction ``(k,)``; None if none do.
 
         Returns:
             Lists of global nodes, negative where there is none, and blocks, as of ``curvature``.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.duals import add_up, basis_of, products
 from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
@@ -22,22 +22,20 @@ from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
 
 @dataclass(frozen=True)
-class Slips:
-    """Contactors that slip, covered by the target.
+class Frictional:
+    """Contactors with friction, covered by the target.
 
     Attributes:
         which: places among the contactors, ascending ``(k,)``.
-        push: multipliers of their plain rows, positive ``(k,)``.
-        pressure: multipliers of their weighted gaps ``(k,)``.
         normal: directions of their equations ``(k, gdim)``.
         tau: friction, handed on by the weights that they follow other nodes with ``(k, gdim)``.
+        slips: those that slip, whose friction grows with the force across the target ``(k,)``.
     """
 
     which: Ints
-    push: Array
-    pressure: Array
     normal: Array
     tau: Array
+    slips: Bools
 
 
 def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
@@ -131,26 +129,27 @@ def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: I
 
 
 def turning(
-    elimination: Elimination, rows: WeightedRows, dofs: Indices, slips: Slips, weights: Terms
+    elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
 ) -> list[tuple[Ints, Array]]:
-    """Derivatives of the forces of friction of contactors that slip, their coefficients of friction being kept (collective).
+    """Derivatives of forces of friction: with the coefficients of those that slip and the multipliers of others kept (collective).
 
     Args:
         elimination: of the contactors.
         rows: equations of all contactors, where they were made.
         dofs: local nodes of the contactor facets ``(m, nc)``.
-        slips: the contactors that slip.
+        frictional: the contactors with friction.
         weights: by what all contactors follow other nodes.
 
     Returns:
         Lists of global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
     """
-    at, config, (which, normal, tau) = rows.points, elimination.config, (slips.which, slips.normal, slips.tau)
+    at, config, (which, normal, tau) = rows.points, elimination.config, (frictional.which, frictional.normal, frictional.tau)
     n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
     assert rows.whole is not None and rows.slope is not None and rows.push is not None and rows.parts is not None
     whole = rows.whole[which, None]
     mine = np.zeros((n, 1 + g))
-    mine[which] = np.column_stack([slips.pressure, tau / whole])
+    # directions and their changes are the same for any force across the target: one that makes the plain row's multiplier 1
+    mine[which] = np.column_stack([rows.share[which] / rows.area[which], tau / whole])
     there = config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(m, nc, 1 + g)
     # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
     unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
@@ -194,8 +193,8 @@ def turning(
     nodes, values = _table(add_up_terms((who, terms, values)), which, n)
     k, c = nodes.shape
     gradient, longer, of_whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
-    along = longer / (slips.push * rows.push[which])[:, None, None]
-    across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / (slips.push * rows.slope[which])[:, None, None]
+    along = longer * (frictional.slips / rows.push[which])[:, None, None]
+    across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / rows.slope[which, None, None]
     change = np.einsum("kg,kch->kgch", tau, along - of_whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
     blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
     return [*handing_on(at, there[:, :, 1:]), (nodes, blocks)]

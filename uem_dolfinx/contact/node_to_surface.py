@@ -314,7 +314,7 @@ class NodalKinematics:
             blocks = np.concatenate([blocks, -c.hessians(state.force[c.which])])
         return [(np.column_stack([self.of.config.to_global(own), followed]), blocks)]
 
-    def turning(self, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
         """Derivatives of the rows along forces of friction, of contactors that no corner holds."""
         plain = ~state.in_corner[which]
         i, p = which[plain], self.projection

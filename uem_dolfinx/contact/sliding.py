@@ -308,6 +308,7 @@ class Sliding:
             slope=self._cone(state)[1] * kinematics.cone,
             normal=kinematics.normal,
             pointwise=self.discretisation.pointwise,
+            keeps_feet=self.keeps_feet,
         )
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
@@ -366,12 +367,18 @@ class Sliding:
         return nodes, blocks, forces
 
     def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
-        """Derivatives of the forces of friction of contactors that slip, with the rows along the target (collective)."""
-        which = np.flatnonzero(self.slipping(state) & (state.lam > 0))
+        """Derivatives of the forces of friction with the rows along the target (collective).
+
+        Contactors that stand on their anchors follow the same points in all directions: no turn of these counts.
+        """
+        slips = self.slipping(state) & (state.lam > 0)
+        held = self.active(state) & _of(state).stick & (not self.discretisation.pointwise)
+        which = np.flatnonzero(slips | held)
         if not self.config.comm.allreduce(len(which)):
             return []
-        tau = -(self._limit(state, state.lam) / kinematics.force_per_multiplier)[which, None] * self.directions(state)[which]
-        return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau)]
+        force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)
+        tau = (force / kinematics.force_per_multiplier[:, None])[which]
+        return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau, held[which])]
 
     # -- from step to step -----------------------------------------------------------------------------------------------
 

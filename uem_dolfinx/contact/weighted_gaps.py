@@ -14,7 +14,7 @@ from uem_dolfinx.contact.duals import Basis, basis_of
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
 from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, WeightedRows
-from uem_dolfinx.contact.mortar_turning import Slips, turning
+from uem_dolfinx.contact.mortar_turning import Frictional, turning
 from uem_dolfinx.contact.node_to_surface import near_target, past_end
 from uem_dolfinx.contact.on_target import OnTarget
 from uem_dolfinx.contact.state import PairState
@@ -227,14 +227,14 @@ class MortarKinematics:
         at_nodes = of.config.from_owners(of.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
         return curvature(rows.points, at_nodes)
 
-    def turning(self, state: PairState, which: Ints, tau: Array) -> list[tuple[Ints, Array]]:
+    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
         """Of those that the target covers: traction turns, grows with its surface and is handed to what is opposite (collective)."""
         of, rows = self.of, self.rows
         assert rows.weights is not None
         kept = rows.covered[which]
-        i, tau = which[kept], tau[kept]
-        slips = Slips(i, (state.lam / rows.share)[i], state.lam[i] / rows.area[i], self.normal[i], tau)
-        return turning(of.elimination, rows, of.surface.dofs[rows.facets], slips, rows.weights)
+        slips = np.ones(len(which), dtype=bool) if held is None else ~held
+        frictional = Frictional(which[kept], self.normal[which[kept]], tau[kept], slips[kept])
+        return turning(of.elimination, rows, of.surface.dofs[rows.facets], frictional, rows.weights)
 
     def areas(self, areas: Array, current: bool) -> Array:
         """Integrals of the dual functions over what is covered (collective)."""
