@@ -169,6 +169,28 @@ def test_rigid_surfaces_go_on_covering():
     assert not pair.kinematics.rows.covered.any()
 
 
+def test_facets_go_on_facing_each_other_within_a_step():
+    """One that turns away is covered until 78 degrees in the step in which it was covered before, and until 53 degrees in others."""
+    s = scene(COMM, "quadrilateral", [
+        box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [1, 1]), box("quadrilateral", [-3.0, -1.0], [3.0, 0.0], [1, 1])
+    ])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    contact = uem.Contact(s.tag("base", 0, at(1, 0.0)), s.tag("low", 1, at(1, 0.0)), coupling="mortar")
+    uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(V, s.tag("bottom", 1, at(1, -1.0))), contacts=[contact])
+    X = V.tabulate_dof_coordinates()[:, :2]
+    upper = ((np.abs(X[:, 0] - 0.5) < 1.0) & (X[:, 1] > -0.5))[:, None]
+    turns = [(50, False, True), (60, False, True), (77, False, True), (80, False, False), (77, False, True), (77, True, False)]
+    for degrees, anew, covers in [*turns, (54, False, False), (52, False, True), (54, False, True)]:
+        if anew:
+            contact.pair.discretisation.begin_step()
+        c, sn = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+        u.x.array[:] = np.where(upper, X @ np.array([[c, sn], [-sn, c]]) - X, 0.0).ravel()[: len(u.x.array)]
+        contact.pair.project()
+        contact.pair.follow()
+        assert (contact.pair.kinematics.rows.covered == covers).all()
+
+
 def test_dual_functions_are_kept():
     """The end of a punch that moves over a facet: what it covers more than 5 % of has a dual function, and keeps it down to 1 %."""
     s = scene(COMM, "quadrilateral", [

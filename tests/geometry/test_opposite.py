@@ -35,6 +35,20 @@ def test_facets_that_face_each_other(angle, faces):
     assert not len(find_opposite(target, planes, x[None] + [0.0, 3.0], np.array([0.2])).facet)
 
 
+@pytest.mark.parametrize(("angle", "faces"), [(54.0, True), (78.0, True), (79.0, False), (120.0, False)])
+def test_facets_that_have_faced_each_other(angle, faces):
+    """They do so until their normals are 78 degrees from antiparallel; others than those named do not."""
+    s = scene(MPI.COMM_SELF, "quadrilateral", [box("quadrilateral", [0.0, -1.0], [1.0, 0.0], [1, 1])])
+    config = Configuration(fem.Function(compat.function_space(s.mesh, 1, (2,))))
+    target = MeshTarget(TargetFacets(config, s.tag("top", 0, at(1, 0.0))))
+    a = np.deg2rad(angle)
+    x = np.array([0.5, 0.1]) + np.outer([-0.5, 0.5], [np.cos(a), np.sin(a)])
+    planes, key = Planes.of(target.shape, x[None], np.array([1.0])), int(target.keys[0])
+    for pairs, seen in (([[7, key]], faces), ([[8, key]], False), ([[7, key + 1]], False)):
+        found = find_opposite(target, planes, x[None], np.array([0.2]), (np.array([7]), np.array(pairs)))
+        assert (len(found.facet) > 0) == seen
+
+
 @pytest.mark.parametrize(
     "gap", [0.0, pytest.param(0.05, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow), 50.0]
 )

@@ -196,7 +196,7 @@ class Kinematics(Protocol):
 
 
 class Discretisation(Protocol):
-    """Ties contactors to a target. From step to step it keeps the feet or segments of a contact with small sliding."""
+    """Ties contactors to a target. It keeps the feet or segments of a contact with small sliding, and what holds for one step."""
 
     @property
     def target(self) -> Target:
@@ -228,6 +228,9 @@ class Discretisation(Protocol):
 
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+
+    def begin_step(self) -> None:
+        """A step begins, for the first time or anew; contactors are placed again."""
 
     def place(self, points: Array, state: PairState) -> Kinematics:
         """The only search: where contactors at ``points (n, gdim)`` stand (collective)."""

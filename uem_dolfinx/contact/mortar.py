@@ -152,7 +152,7 @@ class Mortar(Contactors):
             pieces = self._over_segments(planes, x[facets], facets, reach)
         else:
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
-        segments, pairs, to_gap, N, nodes, y, bend = pieces
+        segments, pairs, to_gap, N, nodes, y, bend, facing = pieces
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
         covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
         dofs = surface.dofs[facets]
@@ -164,13 +164,15 @@ class Mortar(Contactors):
             segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
             surface.shape, other, x[facets], y, surface.sign[facets], bend,
         )  # fmt: skip
-        return self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
+        rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
+        return replace(rows, facing=facing)
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Segments against a mesh (collective)."""
         assert isinstance(self.target, MeshTarget)
         shape = self.target.shape
-        found = find_opposite(self.target, planes, x, reach)
+        keys = self.surface.keys[facets]
+        found = find_opposite(self.target, planes, x, reach, (keys, self.faced))
         e = found.facet
         s = overlap(planes.take(e), (self.surface.shape, x[e]), (shape, found.x), self.surface.sign[facets[e]])
         # what lies behind the facets in reach is no contact
@@ -179,7 +181,9 @@ class Mortar(Contactors):
         kept = ((weight > 0) & (np.abs(mean) <= reach[e]))[s.pair]
         s = Segments(s.pair[kept], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
         to_gap = slopes(shape, found.x, planes.normal[e], s.pair, s.eta)
-        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes, found.x, None)
+        upon = np.unique(s.pair)
+        facing = np.column_stack([keys[e[upon]], found.key[upon]])
+        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes, found.x, None, facing)
 
     def _over_facets(self, planes: Planes, x: Array, least: Array) -> Pieces:
         """Whole facets against a rigid surface, which covers all that face it with cosines above ``least (m,)``."""
@@ -195,7 +199,8 @@ class Mortar(Contactors):
         i = np.flatnonzero((lean.reshape(m, q) > least[:, None]).all(axis=1)[row])
         none = np.zeros((len(i), 0))
         s = Segments(row[i], xi[i], none, weight[i], p.gap[i])
-        return Pieces(s, np.arange(m), p.normal[i], none, np.zeros((m, 0), np.int64), np.zeros((m, 0, g)), p.hessians(i))
+        nodes, y = np.zeros((m, 0), np.int64), np.zeros((m, 0, g))
+        return Pieces(s, np.arange(m), p.normal[i], none, nodes, y, p.hessians(i), np.zeros((0, 2), np.int64))
 
     def _precedence(self, ratio: Array, dofs: Indices) -> Array:
         """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
@@ -267,6 +272,11 @@ class Mortar(Contactors):
         return WeightedRows(
             equations, length, plain, at, facets, is_covered, ratio, size, stretch, share, weights, upright, slope, push, parts, whole,
         )  # fmt: skip
+
+    def begin_step(self) -> None:
+        """Facets that no longer face each other are forgotten."""
+        super().begin_step()
+        self._united = None
 
     def commit(self) -> None:
         """Small sliding finds its segments anew in every step."""

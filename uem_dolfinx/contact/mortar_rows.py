@@ -33,7 +33,10 @@ Terms: TypeAlias = tuple[Ints, Ints, Array]
 
 
 class Pieces(NamedTuple):
-    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``."""
+    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``.
+
+    ``facing`` is as in ``WeightedRows``.
+    """
 
     segments: Segments
     facet: Ints
@@ -42,6 +45,7 @@ class Pieces(NamedTuple):
     opposite: Ints
     y: Array
     bend: Array | None
+    facing: Ints
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ class WeightedRows:
         parts: of the facets' nodes, what the facet has of their own derivatives ``(m, nc, gdim)``.
         whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
             without friction.
+        facing: contactor and target facets that lie upon each other, by what tells them in any partition ``(p, 2)``.
     """
 
     equations: UnitingEquations
@@ -86,6 +91,7 @@ class WeightedRows:
     push: Array | None = None
     parts: Array | None = None
     whole: Array | None = None
+    facing: Ints | None = None
 
 
 class Elimination:

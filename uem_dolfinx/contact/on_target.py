@@ -60,6 +60,9 @@ class OnTarget:
             self._projected = last = points, x, anchor, found
         return last[3]
 
+    def begin_step(self) -> None:
+        """Nothing is kept within a step."""
+
     def commit(self) -> None:
         """Small sliding finds its feet anew in every step."""
         if self.sliding == "small":

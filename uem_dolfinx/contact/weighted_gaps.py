@@ -35,6 +35,9 @@ class Contactors(OnTarget):
 
     Args:
         surface: the contactor's facets.
+
+    Attributes:
+        faced: contactor and target facets that have faced each other in this step, by what tells them in any partition ``(p, 2)``.
     """
 
     at_feet = False
@@ -45,6 +48,11 @@ class Contactors(OnTarget):
         self.basis: Basis = basis_of(surface.shape)
         self.elimination = Elimination(config, nodes, self.free)
         self.remembered = Remembered(config, nodes, surface)
+        self.begin_step()
+
+    def begin_step(self) -> None:
+        """Forget which facets have faced each other."""
+        self.faced: Ints = np.zeros((0, 2), np.int64)
 
     def along(self, equations: UnitingEquations, values: Array) -> Array:
         """What the left sides of the equations make of the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
@@ -134,12 +142,15 @@ class MortarKinematics:
     def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
         """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
 
-        What a rigid target covers is kept in mind, and of what a mesh covers the nodes with a dual function of their own.
+        What a rigid target covers is kept in mind, and of what a mesh covers the nodes with a dual function of their own, and for the
+        step the facets that face each other.
         """
         of, rows = self.of, self.rows
         if of.sliding == "finite":
             covered = np.zeros(of.surface.dofs.shape, dtype=bool)
             if isinstance(of.target, MeshTarget):
+                assert rows.facing is not None
+                of.faced = np.unique(np.concatenate([of.faced, rows.facing]), axis=0)
                 covered[rows.facets] = rows.points.duals.kept
             else:
                 covered[rows.facets[rows.points.facet[rows.points.segments.pair]]] = True

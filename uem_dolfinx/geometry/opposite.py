@@ -12,12 +12,17 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.overlaps import Planes
 from uem_dolfinx.geometry.search import MeshTarget, balls_that_meet
+from uem_dolfinx.geometry.shapes import FacetShape
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange
 
 #: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
 #: [convention; cosine; test_opposite.py::test_facets_that_face_each_other]
 FACING = 0.6
+#: Those that have faced each other in a step do so until its end unless the cosine is smaller than this: sides of a corner that turn with
+#: the forces would else be opposite to each other and not by turns.
+#: [convention; cosine; test_opposite.py::test_facets_that_have_faced_each_other]
+STILL_FACING = 0.2
 
 
 @dataclass(frozen=True)
@@ -28,15 +33,17 @@ class Opposite:
         facet: number of the contactor facet among those asked for ``(k,)``, ascending.
         x: nodes of the target facet ``(k, nt, gdim)``.
         nodes: their global block numbers ``(k, nt)``.
+        key: what tells the target facet in any partition ``(k,)``.
     """
 
     facet: Ints
     x: Array
     nodes: Ints
+    key: Ints
 
 
 @timed("search")
-def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array) -> Opposite:
+def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array, faced: tuple[Ints, Ints] | None = None) -> Opposite:
     """Target facets that face contactor facets and may lie upon them, no farther than ``reach (m,)`` along the normal (collective).
 
     Args:
@@ -44,6 +51,8 @@ def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array) ->
         planes: of the contactor facets ``(m,)``.
         x: their nodes ``(m, nc, gdim)``.
         reach: lengths ``(m,)``.
+        faced: what tells the contactor facets in any partition ``(m,)``, and by these keys the contactor and target facets that have
+            faced each other before ``(p, 2)``; None if none have.
     """
     comm = target.comm
     middle = x.mean(axis=1)
@@ -52,17 +61,29 @@ def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array) ->
     asked = [middle, radius, reach, planes.normal]
     if comm.size == 1:
         i, f = _candidates(target, here, *asked)
-        order = np.lexsort((target.keys[f], i))
-        i, f = i[order], f[order]
-        return Opposite(i, here[f], target.facets.nodes[f])
+        return _facing(target.shape, planes, faced, i, here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     near = _boxes_near(target, here, middle, radius + reach)
     exchange = Exchange(comm, [np.flatnonzero(n) for n in near])
     mine = np.arange(len(x))
     *arrived, row, rank = exchange.send(*asked, mine, np.full(len(x), comm.rank))
     i, f = _candidates(target, here, *arrived)
-    found, y, nodes, key = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f])
-    order = np.lexsort((key, found))
-    return Opposite(found[order], y[order], nodes[order])
+    found = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
+    return _facing(target.shape, planes, faced, *found)
+
+
+def _facing(
+    shape: FacetShape, planes: Planes, faced: tuple[Ints, Ints] | None, facet: Ints, y: Array, nodes: Ints, key: Ints, sign: Array
+) -> Opposite:
+    """Those candidates that face each other now, or have ``faced`` each other before, in order."""
+    kept = -np.einsum("kg,kg->k", planes.normal[facet], Planes.of(shape, y, sign).normal) > FACING
+    if faced is not None:
+        keys, before = faced
+        _, number = np.unique(np.concatenate([before, np.column_stack([keys[facet], key])]), axis=0, return_inverse=True)
+        number = number.ravel()
+        kept |= np.isin(number[len(before) :], number[: len(before)])
+    i = np.flatnonzero(kept)
+    i = i[np.lexsort((key[i], facet[i]))]
+    return Opposite(facet[i], y[i], nodes[i], key[i])
 
 
 def _boxes_near(target: MeshTarget, here: Array, middle: Array, within: Array) -> Array:
@@ -88,7 +109,7 @@ def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reac
     height = np.einsum("kg,kg->k", away, normal[i])
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
     both = radius[i] + size[f]
-    kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -FACING) & (beside < both) & (np.abs(height) < reach[i] + both)
+    kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -STILL_FACING) & (beside < both) & (np.abs(height) < reach[i] + both)
     return i[kept], f[kept]
 
 

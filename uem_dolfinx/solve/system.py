@@ -122,6 +122,8 @@ class BodySystem:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
         self._doubtful, self._led, place = None, False, partial(self.place, returning=False)
         self.exchanges.begin_step()
+        for pair in self.pairs:
+            pair.discretisation.begin_step()
         self.floating.begin_step(place)
         if self.forces.dynamics is None and self.floating.motions is None:
             touch_ahead(self.forces, self.pairs, self.floating.rigid, place)
