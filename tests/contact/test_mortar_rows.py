@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-from mortar_scenes import Blocks
+from mortar_scenes import Blocks, disturbed
 
 from uem_dolfinx.contact.duals import basis_of
 from uem_dolfinx.geometry.shapes import facet_shape
@@ -58,3 +60,23 @@ def test_rows_against_slow_quadrature(degree):
         found = np.zeros((config.n_local, 2))
         np.add.at(found, rows.followed[terms], rows.coefficients[terms])
         assert np.abs(found - follows[node] / scale).max() < 2e-4
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_rows_do_not_depend_on_who_is_active(cell):
+    """Gaps and multipliers of a linearised problem are conjugate: any active set finds the same equations across the target."""
+    b = Blocks(
+        cell, (3, 4), degree=2 if cell == "quadrilateral" else 1, gap=-0.01, narrow=0.55, contactor="lower", max_penetration=1.0
+    )
+    problem = b.pressed()
+    disturbed(b, 2, 0.01)
+    problem.system.place(returning=False)
+    pair, rng = b.contact.pair, np.random.default_rng(5)
+    every = np.arange(len(pair.nodes))
+    first = pair.kinematics.approach(every)
+    for _ in range(3):
+        pair.take(replace(pair.trial, active=rng.random(len(every)) < 0.5))
+        made = pair.kinematics.equations(pair.trial, every).trial
+        assert (made.active == pair.trial.active).all()
+        for name in ("node", "direction", "gap", "row", "followed", "coefficients"):
+            assert np.array_equal(getattr(made, name), getattr(first, name))
