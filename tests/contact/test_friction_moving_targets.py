@@ -41,6 +41,25 @@ def test_a_turntable_under_a_block_that_is_held(coupling, centre):
     assert highest(scene.problem.comm, np.abs(force - exact)[far]) <= 4e-2 * highest(scene.problem.comm, np.abs(exact))
 
 
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (1.2, -0.2)])
+@pytest.mark.parametrize(("mu", "press"), [(0.1, 0.01), (0.3, 0.001)])
+def test_a_slender_block_on_a_turntable(mu, press, centre):
+    """Friction would bend it further than the table has turned: what slipped outwards as it was pressed is held after a few exchanges.
+
+    Were its slip turned as long as that friction is beyond its limit, it would turn back and forth.
+    """
+    about = [*centre, 0.0]
+    plane = uem.RigidPlane([0.0] * 3, [0.0, 0.0, 1.0])
+    scene = on_plane(plane.move([0.0] * 3, [0.0] * 3, about), "node_to_surface", mu=mu, depth=0.2, height=0.8)
+    scene.to(0.0, 0.0, -press)
+    assert scene.states[0] == 0
+    plane.move([0.0] * 3, [0.0, 0.0, 0.002], about)
+    history = scene.to(0.0, 0.0, -press)
+    assert len(history) - 1 <= 6
+    assert sum(iteration.exchanges for iteration in history) <= 15
+    assert scene.states[0] > 0
+
+
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_block_on_a_belt(coupling):
     """It is taken along with mu g until it is as fast as the belt: a few iterations a step, none of them cut."""

@@ -244,10 +244,12 @@ class Sliding:
             taken, tau = self._next_in_line(wrong, state, kinematics.points, tau)
             pivot = replace(pivot, taken=taken)
         slide = wrong.slide | pivot.taken if ahead else wrong.slide
-        # in the plane one whose slip turns slips the other way first: where a surface turns back they would else follow one after the
-        # other; nodes in space turn as long as the force q is beyond the cone; bodies that slide without end are held
-        q = pivot.stiffness[:, None] * slip - tau / share
-        beyond = np.linalg.norm(q, axis=1) > self.bound(lam) / share[:, 0] if space else ~pivot.turned
+        # one whose slip turns slips the other way first: where a surface turns back they would else follow one after the other; if it
+        # turns again it is held: where the bodies give way more than the surface has moved it would turn for ever. Nodes in space that
+        # begin to slip turn as long as the force q is beyond the cone; bodies that slide without end are held
+        q, beyond = pivot.stiffness[:, None] * slip - tau / share, ~pivot.turned
+        if space:
+            beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(lam) / share[:, 0])
         turns = wrong.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
         # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
         back = (wrong.enter & (committed.active | pivot.released | forced) | wrong.slide & forced) & (size > 0)
@@ -260,8 +262,8 @@ class Sliding:
         q, of_q, led = pivot.q.copy(), pivot.tau.copy(), slide | back | turns
         q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
-        released, turned = pivot.released | wrong.release, pivot.turned | turns
-        self.pivot = replace(pivot, released=released, turned=turned, q=q, tau=of_q)
+        released, turned, begun = pivot.released | wrong.release, pivot.turned | turns, pivot.begun | slide
+        self.pivot = replace(pivot, released=released, turned=turned, begun=begun, q=q, tau=of_q)
         return state, ahead and bool(self.config.comm.allreduce(pivot.taken.any(), op=MPI.LOR))
 
     def _next_in_line(self, wrong: friction.FrictionWrong, state: PairState, points: Array, tau: Array) -> tuple[Bools, Array]:

@@ -73,6 +73,7 @@ class Pivot:
     Attributes:
         released: contactors that have been let go of.
         turned: those whose slip has been turned back.
+        begun: those that have begun to slip.
         taken: those that slip ahead of others.
         stiffness: c.
         q: forces that the directions of slip have ``(n, gdim)``.
@@ -82,6 +83,7 @@ class Pivot:
 
     released: Bools
     turned: Bools
+    begun: Bools
     taken: Bools
     stiffness: Array
     q: Array
@@ -92,7 +94,7 @@ class Pivot:
     def begin(cls, front: Front, stiffness: Array, q: Array, tau: Array) -> Pivot:
         """Nothing is done yet."""
         none = np.zeros(len(stiffness), dtype=bool)
-        return cls(none, none, none, stiffness, q, tau, front)
+        return cls(none, none, none, none, stiffness, q, tau, front)
 
 
 @dataclass(frozen=True)
