@@ -152,6 +152,23 @@ def test_refused_only_where_impossible(cell, everywhere):
     assert outcomes == {False, True} and clipped
 
 
+@pytest.mark.parametrize(("make", "between"), [(uem.consistent_mass, 7), (uem.lumped_mass, 6)])
+@pytest.mark.parametrize("cell", CELLS)
+def test_layers_that_the_error_asks_for(cell, make, between):
+    """As many as it tells are enough, behind one surface of contactors and between two."""
+    g = dimension(cell)
+    for layers, ends in ((5, (0.0,)), (between, (0.0, 1.0))):
+        s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * (g - 1) + [layers])])
+        before = make(space(s), 1.0)
+        bare = np.concatenate([facing(before, g - 1, end) for end in ends])
+        after = before.without(bare)
+        assert np.abs(after.rigid() - before.rigid()).max() < 1e-12
+        assert highest(COMM, after.of_nodes[bare]) == 0.0
+    fewer = make(space(scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)])), 1.0)
+    with pytest.raises(uem.MassError, match=r"five layers of cells of degree 1, or between two contactor surfaces to seven \(six"):
+        fewer.without(np.concatenate([facing(fewer, g - 1, end) for end in (0.0, 1.0)]))
+
+
 def test_bodies_do_not_exchange_mass():
     """The body without contactors is left alone to the last bit; a massless body as well."""
     cell = "triangle"

@@ -250,9 +250,9 @@ class Mass:
         return MassError(
             f"the body with its middle at ({where}) cannot keep its mass, centre and inertia without the mass of "
             f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
-            f"{part}refine the mesh behind its contact surface, to five layers of cells of degree 1 or six between two surfaces that may "
-            "touch, declare fewer facets as contactors, or keep their mass by Dynamics(..., contactors='massy'), which lets impact set "
-            "them in vibration"
+            f"{part}refine the mesh behind its contact surface, to five layers of cells of degree 1, or between two contactor surfaces to "
+            "seven (six with a lumped mass), declare fewer facets as contactors, or keep their mass by Dynamics(..., contactors='massy'), "
+            "which lets impact set them in vibration"
         )
 
     def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:
