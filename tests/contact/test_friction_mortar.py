@@ -38,7 +38,7 @@ def friction_at_nodes(contact):
         ("quadrilateral", 1, (3, 4)),
         ("quadrilateral", 2, (3, 2)),
         ("triangle", 2, (2, 3)),
-        ("tetrahedron", 2, (3, 2)),
+        slow("tetrahedron", 2, (3, 2)),
         slow("hexahedron", 2, (3, 2)),
     ],
 )
@@ -55,7 +55,7 @@ def test_a_flat_block_slides_at_mu_times_its_load(cell, degree, n):
     assert balance.force <= 1e-12 and balance.moment <= 1e-12
 
 
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", slow("hexahedron")])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", slow("tetrahedron"), slow("hexahedron")])
 def test_friction_holds_a_block_of_degree_2(cell):
     """Pushed with less than mu times its weight it stays where it is; weight, push and friction balance."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
@@ -83,7 +83,7 @@ def test_a_target_that_ends_over_facets_that_stick(cell, degree):
     assert np.linalg.norm(f[:2]) == pytest.approx(-0.3 * f[2], rel=0.015)
 
 
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [1, slow(2)])
 def test_a_cylinder_slides_far(comm, degree):
     """Pressed and driven past its own contact it finds the same on any number of ranks, and loses what its friction takes."""
     found = []

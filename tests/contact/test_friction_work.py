@@ -76,7 +76,7 @@ def pushed(contact, before):
 
 @pytest.mark.parametrize(
     ("cell", "across"),
-    [("triangle", 0.0), pytest.param("tetrahedron", 0.0, marks=pytest.mark.slow), ("tetrahedron", 0.05)],
+    [("triangle", 0.0), *(pytest.param("tetrahedron", across, marks=pytest.mark.slow) for across in (0.0, 0.05))],
 )
 def test_friction_and_normal_forces_do_all_the_work(cell, across):
     """In every step what friction takes and the work of the normal forces is the work of all; friction's is mu times force times way."""

@@ -165,7 +165,9 @@ def test_layers_that_the_error_asks_for(cell, make, between):
         assert np.abs(after.rigid() - before.rigid()).max() < 1e-12
         assert highest(COMM, after.of_nodes[bare]) == 0.0
     fewer = make(space(scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)])), 1.0)
-    with pytest.raises(uem.MassError, match=r"five layers of cells of degree 1, or between two contactor surfaces to seven \(six"):
+    with pytest.raises(
+        uem.MassError, match=r"five layers of cells of degree 1, or between two contactor surfaces to seven \(six"
+    ):
         fewer.without(np.concatenate([facing(fewer, g - 1, end) for end in (0.0, 1.0)]))
 
 

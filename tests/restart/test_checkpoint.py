@@ -217,7 +217,8 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
 @pytest.mark.parametrize(
     ("cell", "normals"),
     [
-        ("triangle", "averaged"), ("quadrilateral", "facet"),
+        ("quadrilateral", "facet"),
+        pytest.param("triangle", "averaged", marks=pytest.mark.slow),
         pytest.param("tetrahedron", "facet", marks=pytest.mark.slow),
         pytest.param("triangle", "facet", marks=pytest.mark.slow),
         pytest.param("quadrilateral", "averaged", marks=pytest.mark.slow),
