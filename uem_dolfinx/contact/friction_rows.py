@@ -25,7 +25,7 @@ def with_friction(
     slope: Array,
     normal: Array,
     pointwise: bool,
-    keeps_feet: bool,
+    keeps_ties: bool,
 ) -> Constraints:
     """Equations with those along the target, and tilted test rows where contactors slip (collective).
 
@@ -38,7 +38,7 @@ def with_friction(
         slope: by how much the limit of friction grows with the multiplier across the target ``(n,)``.
         normal: of the contactors ``(n, gdim)``.
         pointwise: whether contactors that stick stand on their anchors, so that both are followed by the same weights.
-        keeps_feet: whether these weights stay the same for a step.
+        keeps_ties: whether contactors that stick follow by the weights of now what they have followed since the last step.
     """
     comm, g = frame.ties.config.comm, normal.shape[1]
     across = np.flatnonzero(own.kind == NORMAL)
@@ -62,8 +62,8 @@ def with_friction(
     slipping = rubbing & ~stick
     tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
     slips = comm.allreduce(bool(tilt.any()), op=MPI.LOR)
-    # where rows stay the same for a step, those of contactors that stick are symmetric
-    if own.trial is not test or not (pointwise or (keeps_feet and not slips)):
+    # rows of contactors that stick are symmetric where they follow by the weights of now
+    if own.trial is not test or not (pointwise or (keeps_ties and not slips)):
         trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)
     if slips:
         tilted = _tilted(frictionless, across, tilt, place, frame.ties)

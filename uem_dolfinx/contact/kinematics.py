@@ -178,7 +178,7 @@ class Kinematics(Protocol):
 
         Args:
             state: of the interface.
-            which: contactors, ascending; where the discretisation is ``pointwise`` those alone that slip ``(k,)``.
+            which: contactors, ascending; where forces act ``at_feet`` those alone that slip ``(k,)``.
             tau: their friction, as multipliers of rows along the target ``(k, gdim)``.
             held: those that stick, whose multipliers are kept rather than their coefficients of friction ``(k,)``; None if none do.
 

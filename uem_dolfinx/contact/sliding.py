@@ -310,7 +310,7 @@ class Sliding:
             slope=self._cone(state)[1] * kinematics.cone,
             normal=kinematics.normal,
             pointwise=self.discretisation.pointwise,
-            keeps_feet=self.keeps_feet,
+            keeps_ties=self.keeps_feet or self.discretisation.at_feet,
         )
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
@@ -371,10 +371,10 @@ class Sliding:
     def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
         """Derivatives of the forces of friction with the rows along the target (collective).
 
-        Contactors that stand on their anchors follow the same points in all directions: no turn of these counts.
+        Contactors that stick at feet follow the same points in all directions: no turn of these counts.
         """
         slips = self.slipping(state) & (state.lam > 0)
-        held = self.active(state) & _of(state).stick & (not self.discretisation.pointwise)
+        held = self.active(state) & _of(state).stick & (not self.discretisation.at_feet)
         which = np.flatnonzero(slips | held)
         if not self.config.comm.allreduce(len(which)):
             return []
