@@ -33,6 +33,8 @@ __all__ = [
 try:
     from mpi4py import MPI as _MPI  # noqa: F401  first: in the PyPI wheel it loads the MPI library that DOLFINx and petsc4py need
 
+    # Ctrl-C to one rank ends all while the rest is imported
+    import uem_dolfinx.parallel as _parallel  # noqa: F401  # isort: skip
     import dolfinx as _dolfinx  # noqa: F401
 except ImportError as _error:
     from uem_dolfinx.errors import MissingBackendError

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import pickle
+import signal
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import TracebackType
 from typing import Any, TypeVar
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
@@ -18,6 +21,10 @@ from uem_dolfinx.arrays import AnyArray, Ints
 from uem_dolfinx.errors import UEMError, UserFunctionError
 
 T = TypeVar("T")
+
+#: Exit status of a run that Ctrl-C to one rank has ended between what is collective, as shells have it.
+#: [format; exit status; test_signals.py::test_one_rank_is_interrupted_before_the_steps]
+INTERRUPTED = 128 + signal.SIGINT
 
 
 def agree(comm: MPI.Comm, error: BaseException | None) -> None:
@@ -52,6 +59,19 @@ def mark_as_agreed(error: BaseException) -> BaseException:
 def is_agreed(error: BaseException | None) -> bool:
     """Whether all ranks raise this error."""
     return getattr(error, "of_all_ranks", False)
+
+
+def _end_all_ranks(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Tell of an error that ends the script; where it is Ctrl-C on one rank, end the others, which would wait for it for ever."""
+    _tell(kind, error, trace)
+    if isinstance(error, KeyboardInterrupt) and not is_agreed(error) and not MPI.Is_finalized():
+        sys.stderr.flush()
+        MPI.COMM_WORLD.Abort(INTERRUPTED)
+
+
+_tell = sys.excepthook
+if MPI.COMM_WORLD.size > 1:
+    sys.excepthook = _end_all_ranks
 
 
 def _sendable(error: BaseException | None) -> Any:

@@ -22,7 +22,7 @@ from ramp_scenes import COMM, nothing
 from resting_scenes import Bar
 
 import uem_dolfinx as uem
-from uem_dolfinx.restart.interruption import INTERRUPTED
+from uem_dolfinx.parallel import INTERRUPTED
 from uem_dolfinx.solve.system import BodySystem
 
 ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: SystemExit}
@@ -141,11 +141,27 @@ MPI.COMM_WORLD.barrier()
 """
 
 
+IMPORTING = """
+from mpi4py import MPI
+import signal, sys
+
+class Finder:
+    def find_spec(name, *more):
+        if name == "dolfinx" and MPI.COMM_WORLD.rank == 1:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder)
+import uem_dolfinx as uem
+MPI.COMM_WORLD.barrier()
+"""
+
+
 @serial
-def test_one_rank_is_interrupted_before_the_steps():
-    """In the script's own lines, where nothing is collective: the run ends, and the others do not wait for ever."""
+@pytest.mark.parametrize("script", [ALONE, IMPORTING], ids=["own lines", "import"])
+def test_one_rank_is_interrupted_before_the_steps(script):
+    """In the script's own lines, or while it imports, where nothing is collective: the run ends, and nobody waits for ever."""
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
-    command = [str(mpiexec), "-n", "2", sys.executable, "-c", ALONE]
+    command = [str(mpiexec), "-n", "2", sys.executable, "-c", script]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == INTERRUPTED and "KeyboardInterrupt" in done.stderr
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Callable
 from functools import wraps
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, NoReturn, ParamSpec, Self, TypeVar
 
 from mpi4py import MPI
 
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import is_agreed, mark_as_agreed
+from uem_dolfinx.parallel import mark_as_agreed
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,9 +21,6 @@ T = TypeVar("T")
 #: Exit status of a run that has ended on SIGTERM, as shells have it.
 #: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
 TERMINATED = 128 + signal.SIGTERM
-#: Exit status of a run that Ctrl-C to one rank has ended between what is collective, as shells have it.
-#: [format; exit status; test_signals.py::test_one_rank_is_interrupted_before_the_steps]
-INTERRUPTED = 128 + signal.SIGINT
 #: What is noted, unless it is ignored.
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -135,16 +131,3 @@ def end_together(comm_of: Callable[..., MPI.Comm | None]) -> Callable[[Callable[
         return decorated
 
     return decorate
-
-
-def _end_all_ranks(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Tell of an error that ends the script; where it is Ctrl-C on one rank, end the others, which would wait for it for ever."""
-    _tell(kind, error, trace)
-    if isinstance(error, KeyboardInterrupt) and not is_agreed(error) and not MPI.Is_finalized():
-        sys.stderr.flush()
-        MPI.COMM_WORLD.Abort(INTERRUPTED)
-
-
-_tell = sys.excepthook
-if MPI.COMM_WORLD.size > 1:
-    sys.excepthook = _end_all_ranks
