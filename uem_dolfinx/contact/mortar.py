@@ -21,7 +21,6 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Covered, dual_functions
 from uem_dolfinx.contact.mortar_rows import Pieces, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
-from uem_dolfinx.contact.node_to_surface import NEAR
 from uem_dolfinx.contact.segment_motions import slopes
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.valleys import MOST_CHANGES, with_averaged_normals
@@ -144,7 +143,7 @@ class Mortar(Contactors):
         size = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) * 2
         near = np.ones(len(x), dtype=bool)
         if self.target.n_nodes and self.sliding == "finite":
-            near = away.min(axis=1) < (1 + NEAR) * size
+            near = away.min(axis=1) < 2 * size
         facets = np.flatnonzero(near)
         planes = Planes.of(surface.shape, x, surface.sign).take(facets)
         reach = away[facets].max(axis=1, initial=0.0) / FACING + 0.5 * size[facets]

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
 #: [heuristic; length of the facet; test_large_sliding.py::test_an_end_holds_what_was_drawn_there]
 END_HOLDS = 0.1
-#: Contactors nearer than this many facets keep a row in the sparsity of P.
-#: [heuristic; length of the facet; -]
-NEAR = 1.0
 
 
 class NodeToSurface(OnTarget):
@@ -337,8 +334,8 @@ def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
 
 
 def near_target(p: Projection, state: PairState, off: Bools) -> Bools:
-    """Contactors that are active or about a facet from the target, but for those that are ``off (n,)`` it: ``(n,)``."""
-    return state.active | ((p.gap < NEAR * p.facet_size) & ~off)
+    """Contactors that are active or nearer to the target than one of its facets is long, unless they are ``off (n,)`` it: ``(n,)``."""
+    return state.active | ((p.gap < p.facet_size) & ~off)
 
 
 def _closing(normal: Array, gap: Array, free: Bools) -> Array:
