@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.corners import Corners, find_corners
 from uem_dolfinx.contact.state import PairState
@@ -26,9 +27,6 @@ SHARP = 0.5
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
 #: [heuristic; changes in a step; -]
 MOST_CHANGES = 8
-#: A corner holds a contactor if its free components keep this part of each of the corner's directions.
-#: [heuristic; length of a unit vector; -]
-FREE_ENOUGH = 1e-3
 
 
 def create_valleys(config: Configuration, target: Target, free: Bools) -> Valleys | None:
@@ -171,7 +169,7 @@ class Valleys:
         """Corners whose contactor has a free direction for every facet ``(k,)``."""
         asked = np.arange(self.config.gdim) < c.count[:, None]
         A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
-        return (np.linalg.svd(A, compute_uv=False) > FREE_ENOUGH).sum(axis=1) == c.count
+        return (np.linalg.svd(A, compute_uv=False) > MOSTLY_PRESCRIBED).sum(axis=1) == c.count
 
 
 def with_averaged_normals(nearest: Projection, which: Bools, points: Array) -> FacetProjection:
