@@ -59,7 +59,7 @@ def vertex_of_three_facets(rise):
     normals = np.column_stack([-rise * out, np.ones(3)]) / np.hypot(1.0, rise)
     some, nowhere = np.ones(1, bool), np.zeros((1, 3, 0))
     return Corners(
-        np.zeros(1, int), np.full(1, 3), some, ~some, np.full(1, rise), normals[None], away[None], np.eye(3)[None], np.zeros((1, 3), int),
+        np.zeros(1, int), np.full(1, 3), some, np.full(1, rise), normals[None], away[None], np.eye(3)[None], np.zeros((1, 3), int),
         np.ones((1, 3)) / 3, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3, 3)), nowhere, np.zeros((1, 3, 0, 0)),
     )  # fmt: skip
 

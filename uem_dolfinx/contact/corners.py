@@ -21,9 +21,6 @@ from uem_dolfinx.geometry.shapes import beneath, closest_point, tangents
 #: Facets whose slopes differ by less are one plane.
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]
 ON_PLANE = 1e-9
-#: Facets that share a vertex only hold a contactor if they rise by more; in flatter ones its place tells of other facets soon.
-#: [heuristic; slope; -]
-STEEP = 0.05
 #: Facets hold what is in their corner by friction up to this part of what would hold it against any pull.
 #: [heuristic; coefficient of friction; -]
 WEDGED = 0.99
@@ -37,7 +34,6 @@ class Corners:
         which: their places among the pair's contactors ``(k,)``.
         count: number of facets, 2 to gdim ``(k,)``.
         meets: whether the facets share a place to be held at ``(k,)``.
-        loose: whether that is a vertex of two facets in space, whose planes meet in a line through it ``(k,)``.
         rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
         normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
         away: unit directions along the facets away from the shared place, zero beyond ``count`` ``(k, gdim, gdim)``.
@@ -54,7 +50,6 @@ class Corners:
     which: Ints
     count: Ints
     meets: Bools
-    loose: Bools
     rising: Array
     normals: Array
     away: Array
@@ -70,7 +65,7 @@ class Corners:
     @property
     def concave(self) -> Bools:
         """Corners that can hold a contactor ``(k,)``."""
-        return self.meets & (self.rising > np.where(self.loose, STEEP, ON_PLANE))
+        return self.meets & (self.rising > ON_PLANE)
 
     @property
     def flat(self) -> Bools:
@@ -218,7 +213,7 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
     earlier = np.arange(gdim)[None, :] < count[:, None] - 1
     rising = np.where(earlier, np.einsum("kg,kjg->kj", arm, normals), np.inf).min(axis=1)
     return Corners(
-        which, count, place.found, place.loose, rising, normals, _away(arms, normals, count), _axes(normals, count), first.nodes,
+        which, count, place.found, rising, normals, _away(arms, normals, count), _axes(normals, count), first.nodes,
         place.weights, place.foot, place.beyond, first.x, place.dN, place.ddN,
     )  # fmt: skip
 
@@ -226,7 +221,6 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
 @dataclass(frozen=True)
 class _Place:
     found: Bools
-    loose: Bools
     weights: Array
     foot: Array
     beyond: Array
@@ -245,7 +239,7 @@ def _shared_place(
     k, nn = common.shape
     shape = target.shape
     d = shape.dim - 1
-    found, loose, weights = np.zeros(k, bool), np.zeros(k, bool), np.zeros((k, nn))
+    found, weights = np.zeros(k, bool), np.zeros((k, nn))
     dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
     x, beyond, past = first.x, np.zeros(points.shape), (first.beyond != 0).any(axis=1)
     for side, nodes, _, _ in shape.edges():
@@ -265,10 +259,9 @@ def _shared_place(
         found[i] = True
         if d:
             i = i[count[i] == 2]
-            loose[i] = True
             weights[i], dN[i, :, 0] = _on_line(target, x[i], points[i], node, normals[i])
     foot = np.einsum("ka,kag->kg", weights, x)
-    return _Place(found, loose, weights, foot, beyond, dN, ddN)
+    return _Place(found, weights, foot, beyond, dN, ddN)
 
 
 def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Array) -> tuple[Array, Array]:
