@@ -10,8 +10,10 @@ from helpers import blocks
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import options
+from uem_dolfinx.algebra.deflation import near_null_space
+from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.algebra.linear_solver import UnitedSolver, is_symmetric
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import has_hypre, has_mumps
 from uem_dolfinx.geometry.configuration import Configuration
 
@@ -77,22 +79,20 @@ def test_what_counts_as_symmetric(comm, part, symmetric, scale):
     assert is_symmetric(K) == symmetric
 
 
-def near_null_space(config):
-    solver = UnitedSolver(config, "thresholds_", ITERATIVE)
-    solver.A = mass(config)
-    return len(solver._near_null_space(united(config, [])).getVecs())
+def modes_of(config):
+    return len(near_null_space(config, mass(config), united(config, [])).getVecs())
 
 
 @pytest.mark.parametrize("bodies, modes", [(2, 6), (12, 3)])
 def test_few_bodies_have_modes_of_their_own(bodies, modes):
     """Two bodies have three modes each, a dozen have them together."""
-    assert near_null_space(triangles(bodies)) == modes
+    assert modes_of(triangles(bodies)) == modes
 
 
 @pytest.mark.parametrize("away, modes", [(2.2e5, 3), (2.2e6, 2)])
 def test_modes_that_are_nearly_alike(away, modes):
     """Far from the origin a rotation about it is nearly a translation: the rest is as the body's radius 2/3 to its distance."""
-    assert near_null_space(triangles(1, away)) == modes
+    assert modes_of(triangles(1, away)) == modes
 
 
 def test_places_of_earlier_products(comm):

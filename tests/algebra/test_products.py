@@ -5,11 +5,9 @@ The test to read first is ``test_united_matrix_follows_its_equations``.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from equation_scenes import CASES, Case
+from equation_scenes import CASES, Case, turned
 from helpers import gathered_matrix
 from petsc4py import PETSc
 
@@ -18,17 +16,6 @@ from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 
 EXACT = 1e-14
-
-
-def turned(case: Case, angle: float, active=None, followed=None) -> Restriction:
-    """P of the equations of a case in directions turned in the plane of x and y, some of them active, some with others to follow."""
-    e, turn = case.equations, np.eye(case.g)
-    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    changed = replace(e, direction=e.direction @ turn.T, coefficients=e.coefficients @ turn.T)
-    changed = replace(
-        changed, active=e.active if active is None else active, followed=e.followed if followed is None else followed
-    )
-    return Restriction(case.config, changed, case.free, case.prescribed)
 
 
 def unsymmetric(case: Case) -> PETSc.Mat:

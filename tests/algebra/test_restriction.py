@@ -20,6 +20,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -108,9 +109,9 @@ def test_united_matrix_is_the_dense_product(name):
 def test_product_keeps_its_pattern(name):
     case = CASES[name]()
     K = case.stiffness()
-    solver = UnitedSolver(case.config, "restriction_", DIRECT)
-    solver.set_operator(case.restriction(), K, None)
-    before, info = solver.A.handle, solver.A.getInfo()
+    united, r = UnitedMatrix(case.config, True), case.restriction()
+    A = united.update(r, r, K, None)
+    before, info = A.handle, A.getInfo()
 
     # turned directions, other weights, and another set of active equations: new numbers in the same places
     turn = np.eye(case.g)
@@ -121,33 +122,33 @@ def test_product_keeps_its_pattern(name):
     active[::2] = False
     case.equations = replace(e, direction=e.direction @ turn.T, coefficients=other, active=active)
     r = case.restriction()
-    solver.set_operator(r, K, None)
-    after = solver.A.getInfo()
-    assert solver.A.handle == before
+    A = united.update(r, r, K, None)
+    after = A.getInfo()
+    assert A.handle == before
     assert after["nz_used"] == info["nz_used"] and after["nz_allocated"] == info["nz_allocated"]
     assert after["mallocs"] == 0
     P, k = gathered_matrix(r.P), gathered_matrix(K)
     idle = np.abs(P).max(axis=0) == 0
     expected = P.T @ k @ P + np.diag(np.where(idle, np.diag(k), 0.0))
-    assert np.abs(gathered_matrix(solver.A) - expected).max() < 1e-13 * np.abs(k).max()
+    assert np.abs(gathered_matrix(A) - expected).max() < 1e-13 * np.abs(k).max()
 
 
 def test_new_pattern_is_noticed():
     """Other target nodes, then none at all, then the first ones again."""
     case = CASES["triangles"]()
     K = case.stiffness()
-    solver = UnitedSolver(case.config, "restriction_", DIRECT)
+    united = UnitedMatrix(case.config, True)
     e = case.equations
     none = e.select(np.zeros(len(e), bool))
     other = replace(e, followed=np.full_like(e.followed, case.where[0]))
     for equations in (e, other, none, e):
         case.equations = equations
         r = case.restriction()
-        solver.set_operator(r, K, None)
+        A = united.update(r, r, K, None)
         P, k = gathered_matrix(r.P), gathered_matrix(K)
         idle = np.abs(P).max(axis=0) == 0
         expected = P.T @ k @ P + np.diag(np.where(idle, np.diag(k), 0.0))
-        assert np.abs(gathered_matrix(solver.A) - expected).max() < 1e-13 * np.abs(k).max()
+        assert np.abs(gathered_matrix(A) - expected).max() < 1e-13 * np.abs(k).max()
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -94,6 +96,17 @@ class Case:
         K = forms.create_matrix(form)
         forms.assemble_matrix(K, form)
         return K
+
+
+def turned(case, angle, active=None, followed=None, like=None):
+    """P of equations of a case in directions turned in the plane of x and y, some active, some with others to follow; like another P."""
+    e, turn = case.equations, np.eye(case.g)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    changed = replace(e, direction=e.direction @ turn.T, coefficients=e.coefficients @ turn.T)
+    changed = replace(
+        changed, active=e.active if active is None else active, followed=e.followed if followed is None else followed
+    )
+    return Restriction(case.config, changed, case.free, case.prescribed, like=like)
 
 
 def nodes_at(cell, *places):

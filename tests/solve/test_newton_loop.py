@@ -62,6 +62,9 @@ class OneUnknown:
     def solve(self, rhs, accuracy, near):
         return vector(1.0), 1
 
+    def complete(self, dq):
+        return dq
+
     def move(self, state, dq):
         return dq
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from petsc4py import PETSc
 
+from uem_dolfinx.algebra.entries import blocks_of
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import Exchange
@@ -95,3 +97,14 @@ def rows_at(space: Nodes, A: Blocks, nodes: Ints) -> Blocks:
     ranks = np.repeat(asking.origins, counts)
     lists = np.split(order[places], np.searchsorted(ranks, np.arange(1, space.comm.size)))
     return Blocks(*Exchange(space.comm, lists).send(*A))
+
+
+def blocks_of_matrix(space: Nodes, A: PETSc.Mat) -> Blocks:
+    """The blocks in owned rows of a matrix whose nodes have the same columns in all components."""
+    g = space.block
+    indptr, columns, values = A.getValuesCSR()
+    nodes = np.flatnonzero(np.diff(indptr)[::g])
+    places, i, width = blocks_of(nodes, indptr, g)
+    k = np.arange(g)
+    value = values[places[:, None, None] + width[:, None, None] * k[:, None] + k]
+    return Blocks(nodes[i] + space.first, columns[places].astype(np.int64) // g, value)

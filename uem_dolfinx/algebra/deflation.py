@@ -29,6 +29,11 @@ from uem_dolfinx.geometry.nodes import Nodes
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
 #: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
 MUCH_STIFFER = 10.0
+#: Types of PC that cannot see contactors much stiffer than their targets.
+MULTIGRID = ("hypre", "gamg", "ml")
+#: Up to so many bodies each have rigid-body modes of their own in the near-null space.
+#: [convention; bodies; test_linear_solver.py::test_few_bodies_have_modes_of_their_own]
+MODES_OF_THEIR_OWN = 4
 #: A mode of which less than this part is new adds nothing to those before it.
 #: [convention; part of its norm; test_linear_solver.py::test_modes_that_are_nearly_alike]
 INDEPENDENT = 1e-6
@@ -150,3 +155,28 @@ def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> 
     modes = np.einsum("ngk,nkl->ngl", modes, mixed / np.sqrt(np.where(independent, size, 1.0))[:, None, :])
     i, c, k = np.nonzero((modes != 0) & independent[number][:, None, :])
     return column[number[i], k], mine[i] * space.block + c, modes[i, c, k]
+
+
+def near_null_space(space: Nodes, A: PETSc.Mat, restriction: Restriction) -> PETSc.NullSpace:
+    """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
+
+    Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
+    across a contact would lock its sliding.
+    """
+    body, n_bodies = find_bodies(space)
+    body = body[: space.n_owned]
+    own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
+    joint = list(space.modes().transpose(1, 0, 2))
+    vectors: list[PETSc.Vec] = []
+    for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
+        full = A.createVecLeft()
+        full.array[:] = mode.ravel()
+        q = restriction.reduce(full)
+        before = q.norm()
+        # twice is enough
+        for other in [*vectors, *vectors]:
+            q.axpy(-q.dot(other), other)
+        if q.norm() > INDEPENDENT * before:
+            q.normalize()
+            vectors.append(q)
+    return PETSc.NullSpace().create(vectors=vectors, comm=space.comm)

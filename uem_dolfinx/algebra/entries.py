@@ -9,6 +9,10 @@ from petsc4py import PETSc
 
 from uem_dolfinx.arrays import Bools, Ints
 
+#: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
+#: [convention; entries; test_linear_solver.py::test_what_counts_as_symmetric]
+SYMMETRIC = 1e-11
+
 
 class Entries:
     """Entries of the owned rows of a square matrix, shared with PETSc.
@@ -93,3 +97,25 @@ def blocks_of(lines: Ints, starts: Ints, g: int) -> tuple[Ints, Ints, Ints]:
     places, i = entries_of((g * lines).astype(starts.dtype), starts)
     width = starts[g * lines + 1] - starts[g * lines]
     return places[::g], i[::g], width[i[::g]]
+
+
+def stiffen(A: PETSc.Mat, K: PETSc.Mat, idle: Bools) -> None:
+    """Give A the diagonal of K at ``idle`` owned components ``(n_owned block,)`` (collective)."""
+    diagonal = A.getDiagonal()
+    diagonal.array[idle] = K.getDiagonal().array_r[idle]
+    A.setDiagonal(diagonal)
+
+
+def is_symmetric(A: PETSc.Mat) -> bool:
+    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective)."""
+    scale, size = A.getDiagonal(), A.createVecLeft()
+    scale.sqrtabs()
+    if scale.min()[1] == 0.0:
+        return False
+    scale.reciprocal()
+    size.array[:] = scale.array_r * np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], size.local_size)
+    difference, across = A * size, size.duplicate()
+    A.multTranspose(size, across)
+    difference.axpy(-1.0, across)
+    difference.pointwiseMult(difference, scale)
+    return bool(difference.norm(PETSc.NormType.INFINITY) <= SYMMETRIC)

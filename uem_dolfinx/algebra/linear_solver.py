@@ -5,7 +5,6 @@ Any KSP and PC can be chosen through ``petsc_options``.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,21 +14,19 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.algebra import mumps
-from uem_dolfinx.algebra.deflation import INDEPENDENT, Deflation, deflated, pressed_hard, without
+from uem_dolfinx.algebra.condensed import Condensed
+from uem_dolfinx.algebra.deflation import MULTIGRID, Deflation, deflated, near_null_space, pressed_hard, without
+from uem_dolfinx.algebra.entries import is_symmetric, stiffen
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
-from uem_dolfinx.algebra.options import OFTEN_USED, check_options, default_options
+from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, default_options, last_words, tell_unused
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
-from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
 
-#: Up to so many bodies each have rigid-body modes of their own in the near-null space.
-#: [convention; bodies; test_linear_solver.py::test_few_bodies_have_modes_of_their_own]
-MODES_OF_THEIR_OWN = 4
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
 #: [convention; ratio of norms; test_linear_solver.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
@@ -39,18 +36,6 @@ KEPT_CHANGES = 0.1
 #: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
 #: [convention; ratio of iterations; test_linear_solver.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
-#: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
-#: [convention; entries; test_linear_solver.py::test_what_counts_as_symmetric]
-SYMMETRIC = 1e-11
-#: Types of PC that cannot see contactors much stiffer than their targets.
-MULTIGRID = ("hypre", "gamg", "ml")
-#: Errors of PETSc that say that it has no such type, or no such factorisation.
-NO_SUCH_TYPE = (86, 92)
-
-
-def _last_words(error: PETSc.Error) -> str:
-    """What PETSc says about an error, without where in its sources."""
-    return str(error).splitlines()[-1].partition("] ")[2] or str(error)
 
 
 class UnitedSolver:
@@ -73,7 +58,7 @@ class UnitedSolver:
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
-        self.A: Any = None
+        self._A: Any = None
         self.ksp: Any = None
         self._use(self._first)
         #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
@@ -81,6 +66,11 @@ class UnitedSolver:
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
         #: The last factorisation, and the united matrix that it serves to solve with, if it does.
         self._kept = KeptFactor(space)
+        #: K without the contact, and whether the present united matrix is made of it.
+        self._condensed, self._on_condensed = Condensed(space), False
+        #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
+        self.lasting = False
+        self._of: tuple[PETSc.Mat, int] | None = None
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: P and K of the present united matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
@@ -101,7 +91,7 @@ class UnitedSolver:
                 ksp.setFromOptions()
             except PETSc.Error as error:
                 raise InputError(
-                    f"PETSc refuses petsc_options = {given.shown(self.options)}: {_last_words(error)}; correct them"
+                    f"PETSc refuses petsc_options = {given.shown(self.options)}: {last_words(error)}; correct them"
                 ) from error
         return ksp
 
@@ -120,8 +110,10 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self.A = self._crossed = self._served = self._factor_of = None
+        self._A = self._crossed = self._served = self._factor_of = None
         self._kept.drop()
+        self._condensed.drop()
+        self._of = None
         self._use(self._first)
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
@@ -129,6 +121,8 @@ class UnitedSolver:
         """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
         self._begins = True
         self._kept.drop()
+        self._condensed.begin_step()
+        self._of = None
         self._united.begin_step()
         self._unsymmetric.begin_step()
 
@@ -169,15 +163,16 @@ class UnitedSolver:
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
-        self._served = (restriction, K, curvature) if not self._apart and self._kept.serves(restriction, K) else None
-        if self._served is not None:
+        if self._apart and self._instead and self.iterative:
+            # it tells the sign of the determinant as well
+            self._use(self._instead)
+        self._served = None
+        self._on_condensed = self._condense(restriction, test, K, curvature)
+        if self._on_condensed or self._served is not None:
             return
         self._factor_of = None
         self._kept.drop()
         if self._apart:
-            if self._instead and self.iterative:
-                # it tells the sign of the determinant as well
-                self._use(self._instead)
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
                 self.set_operator(restriction, K, curvature)
@@ -189,38 +184,78 @@ class UnitedSolver:
             with timed("cross out prescribed components"):
                 if self._crossed is None or self._crossed[0] != K:
                     self._crossed = K, K.copy()
-                self.A = K.copy(self._crossed[1], PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                restriction.cross_out(self.A)
-                _stiffen_idle(self.A, K, restriction)
+                self._A = K.copy(self._crossed[1], PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                restriction.cross_out(self._A)
+                stiffen(self._A, K, ~restriction.used.ravel())
         else:
-            self.A = self._united.update(restriction, restriction, K, curvature)
-        symmetric = is_symmetric(self.A)
+            self._A = self._united.update(restriction, restriction, K, curvature)
+        symmetric = is_symmetric(self._A)
         if not symmetric and self._instead and self.iterative:
             self._use(self._instead)
         self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
-        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
-            self.A.setBlockSize(self.space.block)
-            self.A.setNearNullSpace(self._near_null_space(restriction))
-        self.pc.setOperators(self.A)
+            self._A.setBlockSize(self.space.block)
+            self._A.setNearNullSpace(near_null_space(self.space, self._A, restriction))
+        self.pc.setOperators(self._A)
         self._deflate(restriction, K)
-        self.ksp.setOperators(self.A)
+        self.ksp.setOperators(self._A)
         if symmetric and not self.iterative and self.pc.getType() in mumps.FACTORISATIONS:
             self._factor_of = restriction, K
+
+    @property
+    def A(self) -> Any:
+        """The united matrix, of the whole (collective)."""
+        if not self._on_condensed:
+            return self._A
+        P, Q, K, G = self._condensed.made_of
+        return (self._united if P is Q else self._unsymmetric).update(P, Q, K, G)
+
+    def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> bool:
+        """Unite on the components of the contact; whether that is done (collective).
+
+        That pays where K lasts or, since no factorisation is kept then, where Q is not P; else from the second matrix of a K on that none
+        serves which is kept. Where one does it is noted.
+        """
+        again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
+        possible = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
+        serves = possible and self._condensed.serves(P, Q, K, G)
+        if not (serves or self.lasting or self._apart) and self._kept.serves(P, K):
+            self._served = P, K, G
+            return False
+        pays = possible and (self.lasting or self._apart or again)
+        if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
+            return False
+        self._condensed.unite(P, Q, G)
+        return True
+
+    def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
+        """Factorise K without the components of the contact; whether that can be done, and pays (collective)."""
+        pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K)
+        pc.setOptionsPrefix(self._prefix)
+        pc.setType((self.pc.getType() if self._symmetric else self._types[1]) if symmetric else "lu")
+        with timed("factorisation or preconditioner set-up"), self._in_database(**options):
+            if self._condensed.factorise(P, Q, K, G, pc, symmetric):
+                return True
+        more = mumps.more_room(pc)
+        if more:
+            logger.debug("MUMPS lacked room, and gets more: %s", more)
+            return self._factorise_inside(P, Q, K, G, **options | more)
+        return False
 
     def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
         """Put multigrid into a deflation where contactors are much stiffer than what they press on (collective)."""
         if self.pc.getType() not in MULTIGRID:
             return
         with timed("deflation"):
-            pressed = pressed_hard(self.space, self.A, K, restriction)
+            pressed = pressed_hard(self.space, self._A, K, restriction)
             if not self.space.comm.allreduce(int(pressed.any())):
                 self.ksp.setPC(self.pc)
                 return
-            self.pc.setOperators(without(self.space, self.A, restriction, pressed))
+            self.pc.setOperators(without(self.space, self._A, restriction, pressed))
             deflation = Deflation(self.pc)
-            deflation.update(self.A, deflated(self.space, self.A, restriction, pressed))
+            deflation.update(self._A, deflated(self.space, self._A, restriction, pressed))
             self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.space.comm))
 
     def _adapt(self, symmetric: bool) -> None:
@@ -250,9 +285,9 @@ class UnitedSolver:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
         A = self._unsymmetric.update(P, Q, K, curvature)
         if self.iterative:
-            self.ksp.setOperators(A, self.A)
+            self.ksp.setOperators(A, self._A)
             return
-        self._new, self.A = True, A
+        self._new, self._A = True, A
         self.pc.setReusePreconditioner(False)
         self.ksp.setOperators(A)
 
@@ -269,30 +304,6 @@ class UnitedSolver:
         self._new = not keep
         self.pc.setReusePreconditioner(bool(keep))
 
-    def _near_null_space(self, restriction: Restriction) -> PETSc.NullSpace:
-        """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
-
-        Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
-        across a contact would lock its sliding.
-        """
-        body, n_bodies = find_bodies(self.space)
-        body = body[: self.space.n_owned]
-        own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
-        joint = list(self.space.modes().transpose(1, 0, 2))
-        vectors: list[PETSc.Vec] = []
-        for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
-            full = self.A.createVecLeft()
-            full.array[:] = mode.ravel()
-            q = restriction.reduce(full)
-            before = q.norm()
-            # twice is enough
-            for other in [*vectors, *vectors]:
-                q.axpy(-q.dot(other), other)
-            if q.norm() > INDEPENDENT * before:
-                q.normalize()
-                vectors.append(q)
-        return PETSc.NullSpace().create(vectors=vectors, comm=self.space.comm)
-
     @property
     def _tells_sign(self) -> bool:
         """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
@@ -301,12 +312,16 @@ class UnitedSolver:
     @property
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
+        if self._on_condensed:
+            return self._apart and self._condensed.negative
         return self._tells_sign and mumps.is_negative(self.pc)
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
         self._kept.drop()
         self.set_operator(restriction, K, curvature)
+        if self._on_condensed:
+            return self._condensed.negative
         self._set_up(**mumps.TELLS_SIGN)
         return mumps.is_negative(self.pc)
 
@@ -338,17 +353,29 @@ class UnitedSolver:
         """Solve for dq, and the number of linear iterations (collective).
 
         An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side; it begins
-        with the unknowns ``near``, if they are given.
+        with the unknowns ``near``, if they are given. They are of the last solve, under the same forces of the bodies: one on the
+        contact alone needs to be completed then.
 
         Raises:
             LinearSolveError: with PETSc's reason.
         """
+        if self._on_condensed:
+            dq = self._condensed.solve(rhs, near is not None)
+            self._tell_unused()
+            if np.isfinite(dq.norm()):
+                return dq, 1
+            raise LinearSolveError(
+                "the united problem is singular: hold free bodies by Dirichlet conditions, or bring them into contact"
+            )
+        self._condensed.whole = True
         if self._served is not None:
             found = self._kept.solve(*self._served, rhs, accuracy) if accuracy > 0 else None
             if found is not None:
                 return found
             self._kept.drop()
+            self._of = None
             self.set_operator(*self._served)
+            return self.solve(rhs, accuracy, near)
         dq = rhs.duplicate()
         # a factorisation has no use for a guess
         near = near if self.iterative else None
@@ -367,10 +394,10 @@ class UnitedSolver:
             kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
             if error.ierr in NO_SUCH_TYPE:
                 raise InputError(
-                    f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {_last_words(error)}; choose others"
+                    f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {last_words(error)}; choose others"
                 ) from error
             raise LinearSolveError(
-                f"PETSc error {error.ierr} in the united solve with {kinds} ({_last_words(error)}): "
+                f"PETSc error {error.ierr} in the united solve with {kinds} ({last_words(error)}): "
                 "a body may be free to move as a rigid body; hold it by a Dirichlet condition or bring it into contact"
             ) from error
         self._tell_unused()
@@ -393,6 +420,23 @@ class UnitedSolver:
             self._kept.keep(self.pc, *self._factor_of)
         return dq, iterations
 
+    @property
+    def begins(self) -> bool:
+        """Whether a step begins in which the united matrix, although it may be the same, is to be made as if the step were the first."""
+        return self._begins and self._on_condensed
+
+    def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
+        """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
+        return K * du if self.iterative else self._condensed.forces(K, du, self.exact)
+
+    def begin_at(self, c: PETSc.Vec) -> None:
+        """Take what the increment is without the unknowns that are solved for next."""
+        self._condensed.closure = c
+
+    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """The unknowns of the last solve, all of them (collective)."""
+        return self._condensed.complete(dq) if self._on_condensed else dq
+
     def _keep_pace(self, iterations: int) -> None:
         """Note how many iterations a digit has taken."""
         norms = self.ksp.getConvergenceHistory()
@@ -402,33 +446,5 @@ class UnitedSolver:
 
     def _tell_unused(self) -> None:
         """Warn, once, of options that PETSc has had no use for."""
-        for key in sorted(self._unused or ()):
-            near = difflib.get_close_matches(key, OFTEN_USED, n=1)
-            logger.warning(
-                "petsc_options[%r] = %s was not used by PETSc with %s and %s: %s",
-                key, given.shown(self.options[key]), self.ksp.getType(), self.pc.getType(),
-                f"did you mean {near[0]!r}?" if near else "check its spelling, or leave it out",
-            )  # fmt: skip
+        tell_unused(self._unused or (), self.options, f"{self.ksp.getType()} and {self.pc.getType()}")
         self._unused = None
-
-
-def _stiffen_idle(A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> None:
-    """Give A the diagonal of K where columns of P are idle (collective)."""
-    diagonal, idle = A.getDiagonal(), ~P.used.ravel()
-    diagonal.array[idle] = K.getDiagonal().array_r[idle]
-    A.setDiagonal(diagonal)
-
-
-def is_symmetric(A: PETSc.Mat) -> bool:
-    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective)."""
-    scale, size = A.getDiagonal(), A.createVecLeft()
-    scale.sqrtabs()
-    if scale.min()[1] == 0.0:
-        return False
-    scale.reciprocal()
-    size.array[:] = scale.array_r * np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], size.local_size)
-    difference, across = A * size, size.duplicate()
-    A.multTranspose(size, across)
-    difference.axpy(-1.0, across)
-    difference.pointwiseMult(difference, scale)
-    return bool(difference.norm(PETSc.NormType.INFINITY) <= SYMMETRIC)

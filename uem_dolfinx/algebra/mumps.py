@@ -1,14 +1,20 @@
 """What is asked of MUMPS beside solving: whether it needs more room, and the sign of the determinant.
 
 Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the room it has beyond what the analysis foresees,
-ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa.
+ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa; with a Schur complement both are of what it is the complement of, and
+with ICNTL(26) = 0 so are solves. petsc4py has no Schur complements: PETSc's own library is called.
 """
 
 from __future__ import annotations
 
+import ctypes
+from functools import cache
 from typing import Any
 
+import numpy as np
 from petsc4py import PETSc
+
+from uem_dolfinx.arrays import Array, Ints
 
 #: Types of PC that solve exactly.
 FACTORISATIONS = ("cholesky", "lu")
@@ -43,6 +49,62 @@ def more_room(pc: PETSc.PC) -> dict[str, Any]:
 def is_negative(pc: PETSc.PC) -> bool:
     """Whether the determinant of what was factorised with ``TELLS_SIGN`` is negative."""
     return bool(pc.getFactorMatrix().getMumpsRinfog(12) < 0.0)
+
+
+@cache
+def _petsc() -> Any:
+    """PETSc's library if it has what Schur complements take, or None."""
+    library = ctypes.CDLL(PETSc.__file__)
+    names = "MatFactorSetSchurIS", "MatFactorCreateSchurComplement", "MatDenseGetArrayRead", "MatDestroy"
+    if PETSc.ScalarType is not np.float64 or not all(hasattr(library, name) for name in names):
+        return None
+    for name, arguments in zip(names, (2, 3, 2, 1)):
+        getattr(library, name).argtypes = [ctypes.c_void_p] * arguments
+    return library
+
+
+def condenses(pc: PETSc.PC) -> bool:
+    """Whether a preconditioner factorises with MUMPS, which can leave some unknowns then and make their Schur complement."""
+    return solves(pc) and _petsc() is not None
+
+
+def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
+    """Factorise all unknowns but some, with which the PC then solves; what it makes of these is zero (collective).
+
+    Args:
+        pc: of a type that factorises, with a matrix, not yet set up.
+        left: global numbers of those to be left, rank by rank.
+
+    Returns:
+        On rank 0 the Schur complement of all that were left, and nothing ``(0, 0)`` on others; None if MUMPS fails.
+    """
+    library, comm = _petsc(), pc.comm.tompi4py()
+    every = np.concatenate(comm.allgather(left)).astype(PETSc.IntType)
+    numbers = PETSc.IS().createGeneral(every if comm.rank == 0 else every[:0], comm=comm)
+    pc.setFactorSolverType("mumps")
+    pc.setFactorSetUpSolverType()
+    factors = pc.getFactorMatrix()
+    factors.setOptionsPrefix(pc.getOptionsPrefix())
+    factors.setMumpsIcntl(33, 1)
+    _check(library.MatFactorSetSchurIS(factors.handle, numbers.handle))
+    pc.setUp()
+    if factors.getMumpsInfog(1) < 0:
+        return None
+    factors.setMumpsIcntl(26, 0)
+    complement, values = ctypes.c_void_p(), ctypes.c_void_p()
+    _check(library.MatFactorCreateSchurComplement(factors.handle, ctypes.byref(complement), None))
+    _check(library.MatDenseGetArrayRead(complement, ctypes.byref(values)))
+    n = len(every) if comm.rank == 0 else 0
+    # stored by columns
+    S = np.ctypeslib.as_array(ctypes.cast(values, ctypes.POINTER(ctypes.c_double)), (n, n)).T.copy() if n else np.zeros((0, 0))
+    _check(library.MatDestroy(ctypes.byref(complement)))
+    return S
+
+
+def _check(error: int) -> None:
+    """Raise what a function of PETSc returned."""
+    if error:
+        raise PETSc.Error(error)
 
 
 def how_it_ended(pc: PETSc.PC) -> str:

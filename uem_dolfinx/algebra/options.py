@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import given
 from uem_dolfinx.errors import InputError, MissingBackendError
+from uem_dolfinx.log import logger
 
 #: Direct factorisation pays up to about this many unknowns, by dimension (one core, OpenBLAS).
 #: [convention; unknowns; test_options.py::test_direct_solvers_up_to]
@@ -22,6 +23,8 @@ HYPRE_FROM = {2: 300_000, 3: 4_000}
 #: CG that takes more iterations leaves a matrix to a factorisation that pays.
 #: [convention; iterations; test_linear_solver.py::test_cg_gives_way]
 FEW_ITERATIONS = 200
+#: Errors of PETSc that say that it has no such type, or no such factorisation.
+NO_SUCH_TYPE = (86, 92)
 #: Options that misspelt ones are likely to mean.
 OFTEN_USED = (
     "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_norm_type", "ksp_gmres_restart", "ksp_monitor", "ksp_view", "pc_type",
@@ -114,3 +117,18 @@ def _knows(of: Any, name: Any) -> bool:
     except (PETSc.Error, TypeError):
         return False
     return True
+
+
+def tell_unused(names: Iterable[str], options: Mapping[str, Any], types: str) -> None:
+    """Warn of options that PETSc with these types of KSP and PC has had no use for."""
+    for key in sorted(names):
+        near = difflib.get_close_matches(key, OFTEN_USED, n=1)
+        logger.warning(
+            "petsc_options[%r] = %s was not used by PETSc with %s: %s",
+            key, given.shown(options[key]), types, f"did you mean {near[0]!r}?" if near else "check its spelling, or leave it out",
+        )  # fmt: skip
+
+
+def last_words(error: PETSc.Error) -> str:
+    """What PETSc says about an error, without where in its sources."""
+    return str(error).splitlines()[-1].partition("] ")[2] or str(error)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.blocks import Blocks, product, summed, to_owners, together
+from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, product, summed, to_owners, together
 from uem_dolfinx.algebra.entries import Entries, blocks_of, entries_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -158,15 +158,10 @@ class UnitedMatrix:
 
     def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
         """Blocks of G in owned rows without prescribed components (collective)."""
-        g, first = self.space.block, self.space.first
-        indptr, columns, values = G.getValuesCSR()
-        nodes = np.flatnonzero(np.diff(indptr[::g]))
-        places, i, width = blocks_of(nodes, indptr, g)
-        row, column = nodes[i] + first, columns[places].astype(np.int64) // g
-        k = np.arange(g)
-        value = values[places[:, None, None] + width[:, None, None] * k[:, None] + k] * free[row - first][:, :, None]
+        row, column, value = blocks_of_matrix(self.space, G)
         asked, at = np.unique(column, return_inverse=True)
-        return Blocks(row, column, value * self.space.ask_owners(asked, free.astype(float))[at][:, None, :])
+        there = self.space.ask_owners(asked, free.astype(float))[at]
+        return Blocks(row, column, value * free[row - self.space.first][:, :, None] * there[:, None, :])
 
     def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:
         """Places of blocks in owned rows ``(k, g, g)``, and whether they are there ``(k,)``."""

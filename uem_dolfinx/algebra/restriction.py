@@ -223,6 +223,10 @@ class Restriction:
                 power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
             power = product(M, rows_at(self.space, power, asked))
 
+    def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
+        """Rows of P at owned nodes ``(k,)``, which have all eliminated ones (collective)."""
+        return together(self._turned(np.setdiff1d(nodes, self.united)), self.rows())
+
     def reserved(self) -> Blocks:
         """Places of ``rows``, and those that all equations would take if they held and followed no others."""
         return together(self._turned(self.nodes), self._couplings(np.ones_like(self.equations.active)))
@@ -251,8 +255,7 @@ class Restriction:
     @cached_property
     def P(self) -> PETSc.Mat:
         """The restriction matrix; idle columns are stored as zeros, so that ``P'KP`` holds their diagonal (collective)."""
-        others = np.setdiff1d(np.arange(self.space.n_owned), self.united)
-        return self._matrix(*self._entries(together(self._turned(others), self.rows())))
+        return self._matrix(*self._entries(self.rows_of(np.arange(self.space.n_owned))))
 
     def _entries(self, blocks: Blocks) -> tuple[Ints, Ints, Array]:
         """Sorted local rows, global columns and values of blocks in owned rows, zeros stored; equal places added."""

@@ -178,8 +178,12 @@ class UnitedSystem(Protocol):
     def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations.
 
-        They are looked for from ``near`` on, if it is given. A system that leads the load adds to ``rhs`` what its change contributes.
+        They are looked for from ``near`` on, those of the state before, if it is given; the others alone need change then that contact
+        asks for. A system that leads the load adds to ``rhs`` what its change contributes.
         """
+
+    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """All unknowns of the last solve, if it was of some."""
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
@@ -362,6 +366,9 @@ def _solve_linearised(
             if better is not None:
                 break
         if better is None:
+            whole = system.complete(dq)
+            if whole is not dq:
+                dq, du = whole, system.move(state, whole)
             return _Step(state, rhs, dq, du, driving, iterations, exchanges)
         state, exchanges = better, exchanges + 1
 

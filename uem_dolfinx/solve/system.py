@@ -72,7 +72,9 @@ class BodySystem:
         self.forces, self.pairs, self.solver = forces, list(pairs), solver
         self.config, self.comm = forces.config, forces.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
+        solver.lasting = forces.tangent.linear or newton == "modified"
         self._factored: object = None
+        self.complete = solver.complete
         self._curvature: PETSc.Mat | None = None
         self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
@@ -242,7 +244,7 @@ class BodySystem:
             return None
         assert isinstance(state, BodyState)
         with timed("uniting equations"):
-            F = self._foreseen_forces(state, du)
+            F = self._foreseen_forces(state, du, self.solver.forces(self.forces.tangent.K, du))
             increment = du.array_r.reshape(-1, self.config.gdim)
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             left = 0.0 if self.solver.exact else accuracy
@@ -277,9 +279,8 @@ class BodySystem:
             residual = rows.test.transpose(self._residual())
         return self._state(rows, residual, state.rounding, state.changed, False)
 
-    def _foreseen_forces(self, state: BodyState, du: PETSc.Vec) -> PETSc.Vec:
-        """``F + K du`` with what contact and friction add (collective)."""
-        F = self.forces.tangent.K * du
+    def _foreseen_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
+        """What contact, friction and present forces add to ``F = K du`` (collective)."""
         for more in (self._curvature, state.added):
             if more is not None:
                 F.axpy(1.0, more * du)
@@ -384,10 +385,11 @@ class BodySystem:
         parts = self.forces.tangent.number, exact, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
         made_of = self.comm.allgather(parts)
         moving = (curvature is not None or Q is not P) and self.newton == "full"
-        if moving or made_of != self._factored:
+        if moving or made_of != self._factored or self.solver.begins:
             self.solver.set_operator(P, K, curvature, Q)
         self._factored = made_of
-        return -Q.transpose(self._foreseen_forces(state, P.c))
+        self.solver.begin_at(c := P.c)
+        return -Q.transpose(self._foreseen_forces(state, c, K * c))
 
     @property
     def inexact(self) -> bool:

@@ -123,6 +123,10 @@ class PushedSystem(ABC):
         """Unknowns dq, and the number of linear iterations."""
         return self.solver.solve(rhs, accuracy, near)
 
+    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """Every solve is of all unknowns."""
+        return dq
+
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``."""
         du = state.trial.expand(dq)

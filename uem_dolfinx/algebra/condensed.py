@@ -1,0 +1,296 @@
+"""The united problem condensed onto the components that contact touches: one factorisation for every ``Q'(K + G)P`` of one K.
+
+P and Q are the identity but at eliminated nodes and those that they follow, and the curvature G is zero but there. With C, the
+components of these nodes, and I, all others,
+
+    S = K_CC - K_CI K_II^-1 K_IC                                        MUMPS makes it with the factorisation of K_II
+    Q'(S + G)P dq_C = Q'(r_C - K_CI K_II^-1 r_I)                        dense, by LAPACK on rank 0
+    dq_I = K_II^-1 (r_I - K_IC P dq_C)
+
+for the right-hand side ``(Q'r_C, r_I)``. C grows with what is touched, as long as K stays. From a solution du that is known, others under
+the same forces on I are dense problems alone, as long as only C is asked:
+
+    K (du + e) = K du + S e_C on C, and as K du on I                    e_I = -K_II^-1 K_IC e_C in the end
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra import mumps
+from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix
+from uem_dolfinx.algebra.entries import SYMMETRIC, stiffen
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.log import timed
+
+#: A dense matrix of more components takes as long as factorisations of the whole, and too much room on one rank.
+#: [convention; components; test_condensed.py::test_most_components]
+MOST_COMPONENTS = 3_000
+
+
+class Condensed:
+    """The factorisation of one K without the components of the contact, and the united problem that was made of it last.
+
+    Args:
+        space: the space that K acts on.
+    """
+
+    def __init__(self, space: Nodes):
+        self.space = space
+        self.drop()
+
+    def drop(self) -> None:
+        """Forget K."""
+        #: K, the state of its values, and the components without Dirichlet condition.
+        self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
+        #: Whether a step begins, which may not depend on what others have touched.
+        self._begins = False
+        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, what solves with K_II, and S there.
+        self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
+        self._at: Ints = np.zeros(0, np.int64)
+        self._counts: Ints | None = None
+        self._pc: Any = None
+        self._S: Any = None
+        #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
+        self.made_of: Any = None
+        self._dense: _Dense | None = None
+        #: Whether the united matrix has a negative determinant.
+        self.negative = False
+        #: What the increment is without dq, one of the last solves with K du, and whether the last solve was of I, too.
+        self.closure: PETSc.Vec | None = None
+        self._known: tuple[PETSc.Vec, PETSc.Vec] | None = None
+        self.whole = True
+
+    def begin_step(self) -> None:
+        """Let C depend on what this step touches alone: a run that goes on from a checkpoint takes the same."""
+        self._begins = True
+
+    def serves(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> bool:
+        """Whether this K is factorised, and C has all that P, Q and G touch (collective)."""
+        lacks = True
+        if self._is_of(K):
+            touched = self._touched(P, Q, G, holding=not self._begins)
+            lacks = bool((touched & ~self._nodes).any() or (self._begins and (self._nodes & ~touched).any()))
+        return not self.space.comm.allreduce(int(lacks))
+
+    def _is_of(self, K: PETSc.Mat) -> bool:
+        return self._made_for is not None and self._made_for[0] == K and self._made_for[1] == K.stateGet()
+
+    def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, holding: bool) -> Bools:
+        """Nodes that C needs: those of equations, only of ``holding`` ones or of all, those in G, and those held otherwise than before."""
+        g, n, first = self.space.block, self.space.n_owned, self.space.first
+        touched = np.zeros(n, dtype=bool)
+        for R in (P,) if P is Q else (P, Q):
+            touched[R.united if holding else R.nodes] = True
+            followed = R.followed(R.equations.active if holding else np.ones_like(R.equations.active))
+            own = (followed >= first) & (followed < first + n)
+            touched[followed[own] - first] = True
+            touched[self.space.gather_owned(followed[~own])] = True
+        if G is not None:
+            # a node with a row of it is coupled with itself
+            touched |= np.diff(G.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
+        if self._made_for is not None:
+            touched |= (P.free != self._made_for[2]).any(axis=1)
+        return touched
+
+    def factorise(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, pc: PETSc.PC, symmetric: bool) -> bool:
+        """Factorise K without all that P, Q and G touch or may touch; whether there are few enough of it, and MUMPS does (collective).
+
+        Args:
+            P: of a united matrix.
+            Q: of the same.
+            K: the tangent.
+            G: the curvature.
+            pc: for MUMPS, without a matrix.
+            symmetric: whether K is.
+        """
+        space, nodes = self.space, self._touched(P, Q, G, holding=False)
+        if self._is_of(K) and not self._begins:
+            nodes |= self._nodes
+        self.drop()
+        if space.comm.allreduce(space.block * int(nodes.sum())) > MOST_COMPONENTS:
+            return False
+        self._nodes = nodes
+        self._at = (space.block * np.flatnonzero(nodes)[:, None] + np.arange(space.block)).ravel()
+        counts = space.comm.gather(len(self._at))
+        self._counts = None if counts is None else np.array(counts)
+        A, kept = K.copy(), space.vector(P.free | nodes[:, None])
+        A.diagonalScale(kept, kept)
+        stiffen(A, K, kept.array_r == 0.0)
+        A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        pc.setOperators(A)
+        S = mumps.schur_complement(pc, self._at + space.block * space.first)
+        if S is None:
+            self.drop()
+            return False
+        self._pc, self._S, self._made_for = pc, S, (K, K.stateGet(), P.free)
+        return True
+
+    def unite(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None) -> None:
+        """Make the dense united matrix; ``serves`` must hold (collective)."""
+        assert self._made_for is not None
+        with timed("condensed matrix"):
+            nodes = np.flatnonzero(self._nodes)
+            numbers = self._gathered(nodes + self.space.first)
+            trial = self._on_root(P.rows_of(nodes), numbers)
+            test = trial if P is Q else self._on_root(Q.rows_of(nodes), numbers)
+            curvature = None if G is None else self._on_root(blocks_of_matrix(self.space, G), numbers)
+            used = self._gathered(P.used.ravel()[self._at].astype(float)) > 0
+            self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
+            if self.space.comm.rank == 0:
+                self._dense = _Dense(self._S, curvature, trial[:, used], None if P is Q else test[:, used], used)
+            self.negative = mumps.is_negative(self._pc) != self.space.comm.bcast(self._dense and self._dense.negative)
+
+    def solve(self, rhs: PETSc.Vec, again: bool = False) -> PETSc.Vec:
+        """Unknowns dq of the united problem; not finite where it is singular (collective).
+
+        Args:
+            rhs: the right-hand side.
+            again: whether the forces on I are those of the increment whose forces were asked for last; then I is left as it is there.
+        """
+        (P, Q, K, _), at = self.made_of, self._at
+        self._begins = False
+        self.whole = not (again and self._known is not None)
+        with timed("linear solve"):
+            if self._known is not None and not self.whole:
+                assert self.closure is not None
+                du, forces = self._known
+                left = forces - K * self.closure
+                left.array[at] += self._stiffness(self.closure.array_r[at] - du.array_r[at])
+                dq = du.copy()
+            else:
+                dq = self._solve_inside(P, rhs)
+                left = K * dq
+            left = Q.transpose(left)
+            dq.array[at] = self._on_contact(rhs.array_r[at] - left.array_r[at])
+            dq.array[~P.used.ravel()] = 0.0
+            if self.whole:
+                outer = self.space.vector(np.zeros_like(dq.array_r))
+                outer.array[at] = dq.array_r[at]
+                inside = self._solve_inside(P, rhs - K * P.expand(outer))
+                dq.array[:] = outer.array_r + inside.array_r
+        return dq
+
+    def forces(self, K: PETSc.Mat, du: PETSc.Vec, exact: bool) -> PETSc.Vec:
+        """``K du`` of an increment that the last solve has found, but for prescribed components away from the contact (collective).
+
+        Args:
+            K: the tangent.
+            du: the increment.
+            exact: whether no more than rounding is left of the forces on I.
+        """
+        if not self.whole and self._known is not None:
+            (before, known), at = self._known, self._at
+            forces = known.copy()
+            forces.array[at] += self._stiffness(du.array_r[at] - before.array_r[at])
+            return forces
+        forces = K * du
+        self._known = (du.copy(), forces.copy()) if exact else None
+        return forces
+
+    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
+        """Unknowns of the last solve, those of I as well (collective)."""
+        if self.whole:
+            return dq
+        assert self._known is not None and self.closure is not None
+        (P, _, K, _), at = self.made_of, self._at
+        with timed("linear solve"):
+            du = P.expand(dq)
+            du.axpy(1.0, self.closure)
+            du.axpy(-1.0, self._known[0])
+            change = self.space.vector(np.zeros_like(du.array_r))
+            change.array[at] = du.array_r[at]
+            whole = dq - self._solve_inside(P, K * change)
+        self.whole = True
+        return whole
+
+    def _solve_inside(self, P: Restriction, rhs: PETSc.Vec) -> PETSc.Vec:
+        """``K_II^-1 r_I``, zero where unknowns are not used, and on C (collective)."""
+        found = rhs.duplicate()
+        self._pc.apply(rhs, found)
+        found.array[~P.used.ravel()] = 0.0
+        found.array[self._at] = 0.0
+        return found
+
+    def _on_contact(self, rhs: Array) -> Array:
+        """Solution of the dense problem, of this rank's components of C (collective)."""
+        every = self._gathered(rhs)
+        return self._scattered(None if self._dense is None else self._dense.solve(every))
+
+    def _stiffness(self, du: Array) -> Array:
+        """``S du_C`` of this rank's components of C (collective)."""
+        every = self._gathered(du)
+        return self._scattered(self._S @ every if self.space.comm.rank == 0 else None)
+
+    def _on_root(self, blocks: Blocks, numbers: Ints) -> Any:
+        """A matrix of C as SciPy's, on rank 0; None elsewhere (collective).
+
+        Args:
+            blocks: those in owned rows.
+            numbers: on rank 0, of all nodes of C.
+        """
+        from scipy.sparse import bsr_matrix
+
+        parts = self.space.comm.gather(blocks)
+        if parts is None:
+            return None
+        row, column, value = (np.concatenate(arrays) for arrays in zip(*parts))
+        order = np.argsort(row, kind="stable")
+        indptr = np.append(0, np.cumsum(np.bincount(np.searchsorted(numbers, row), minlength=len(numbers))))
+        size = self.space.block * len(numbers)
+        return bsr_matrix((value[order], np.searchsorted(numbers, column[order]), indptr), shape=(size, size)).tocsr()
+
+    def _gathered(self, values: Any) -> Any:
+        """Values at C of all ranks, on rank 0 (collective)."""
+        parts = self.space.comm.gather(values)
+        return np.concatenate(parts) if parts is not None else np.zeros(0)
+
+    def _scattered(self, values: Array | None) -> Array:
+        """What rank 0 has for this rank's components of C (collective)."""
+        parts = None if values is None or self._counts is None else np.split(values, np.cumsum(self._counts)[:-1])
+        return np.asarray(self.space.comm.scatter(parts))
+
+
+class _Dense:
+    """``Q'(S + G)P`` of the used components, factorised.
+
+    Args:
+        S: Schur complement ``(k, k)``.
+        G: curvature, sparse, or None.
+        P: its used columns, sparse ``(k, m)``.
+        Q: those of Q, or None where it is P.
+        used: of all components ``(k,)``.
+    """
+
+    def __init__(self, S: Array, G: Any, P: Any, Q: Any, used: Bools):
+        from scipy.linalg import lapack
+
+        self._used, self._lapack = used, lapack
+        M = np.asarray((P if Q is None else Q).T @ np.ascontiguousarray((P.T @ S.T).T))
+        if G is not None:
+            M += ((P if Q is None else Q).T @ G @ P).toarray()
+        self._positive = False
+        root = np.sqrt(np.abs(np.diag(M)))
+        if Q is None and (np.abs(M - M.T) <= SYMMETRIC * root[:, None] * root).all():
+            factor, failed = lapack.dpotrf(M, lower=1)
+            self._positive = failed == 0
+        if self._positive:
+            self._factor, self.negative = factor, False
+            return
+        self._factor, self._pivots, _ = lapack.dgetrf(M)
+        swapped = (self._pivots != np.arange(len(self._pivots))).sum() % 2 == 1
+        self.negative = bool(swapped != ((np.diag(self._factor) < 0.0).sum() % 2 == 1))
+
+    def solve(self, rhs: Array) -> Array:
+        """Unknowns ``(k,)``, zero where they are not used."""
+        q, b = np.zeros(len(rhs)), rhs[self._used]
+        if len(b) and self._positive:
+            q[self._used], _ = self._lapack.dpotrs(self._factor, b, lower=1)
+        elif len(b):
+            q[self._used], _ = self._lapack.dgetrs(self._factor, self._pivots, b)
+        return q
