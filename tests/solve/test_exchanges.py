@@ -152,7 +152,9 @@ def test_limits_are_held_until_they_settle():
     exchanges.choose(seen(1.0, True), (), False, 1.0)
     assert held == [None] and not exchanges.again
     pair.trial, pair.friction.pivot = replace(start, changes=start.changes + 1), "after"
-    chosen = exchanges.choose(seen(1e9, True), (), False, 1e4)
+    chosen = exchanges.choose(seen(1e9, True), (), True, 1e4)
+    # without curvature, so that the problem is convex
+    assert exchanges.held and exchanges.straight and exchanges.convex
     assert exchanges.again and pair.friction.pivot == "before" and not chosen[0].which.any()
     assert np.array_equal(pair.taken[0].changes, start.changes) and np.array_equal(held[-1], np.ones(n))
     for lam, last in ((2.0, False), (2.1, True)):

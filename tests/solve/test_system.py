@@ -4,6 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from friction_scenes import driven
 from helpers import blocks, clamp, linear, run
 
 import uem_dolfinx as uem
@@ -53,3 +54,29 @@ def test_what_a_solve_foretells(length):
         way[config.X[: config.n_owned, 1] > 0.25 * length, 1] = -0.5 * length * (1 + part)
         du.array[:] = way.ravel()
         assert (system.exchange(state, du, 0.0, 0.0) is not None) == closes
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_the_united_matrix_follows_q(coupling):
+    """Where limits of friction are held Q is P, which is what it was with tilted rows: the matrix is made anew, and back again."""
+    d = driven(mu=0.3, how={"coupling": coupling}, options={"consistent_tangent": False})
+    for place in ((0.0, -0.01), (0.1, -0.01)):
+        d.to(*place)
+    system, pair = d.problem.system, d.contact.pair
+    assert d.states[1] > 0
+    system.place(returning=False)
+    system.assemble_residual()
+    system.unite(lambda *norms: False)
+    system.differentiate(first=True)
+    for lam in (None, pair.trial.lam, None):
+        pair.friction.hold_limits(lam)
+        rows = system._rows()
+        state = system._state(rows, rows.test.transpose(system._residual()), 0.0, False, False)
+        assert (state.test is state.trial) == (lam is not None)
+        system.linearise(state)
+        loads = d.problem.forces.residual.duplicate()
+        loads.set(1.0)
+        rhs = state.test.transpose(loads)
+        dq, _ = system.solve(rhs, 0.0)
+        left = state.test.transpose(d.problem.forces.tangent.K * state.trial.expand(dq)) - rhs
+        assert left.norm() <= 1e-9 * rhs.norm()

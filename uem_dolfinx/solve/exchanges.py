@@ -5,8 +5,9 @@ change sides for ever.
 
 Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
 are: the united matrix is singular, and what it foresees is far beyond the bodies. From the state before, limits of friction are then held
-at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric. The forces that follow make the next limits,
-until these settle, and Coulomb's law goes on from there. So they are once in every linearised problem where contactors would go one by one.
+at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric; without the curvature of contact the problem
+is convex. The forces that follow make the next limits, until these settle, and Coulomb's law goes on from there. So they are once in every
+linearised problem where contactors would go one by one.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ class Exchanges:
         convex: whether the curvature of contact has to do without what could make the tangent indefinite: Newton's method does not
             leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
         frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
+        held: whether limits of friction are held.
         again: whether the linearised problem is to be solved with other limits of friction, whoever changes sides.
     """
 
@@ -103,8 +105,8 @@ class Exchanges:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
         self._number, self._rule = 0, Rule.ALL
-        #: Whether limits of friction are held, whether they have been, and the last states without a mechanism.
-        self._held = self._were_held = False
+        #: Whether limits have been held, and the last states without a mechanism.
+        self.held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
         for pair in self._pairs:
             if pair.friction is not None:
@@ -138,15 +140,18 @@ class Exchanges:
             wrong = [w.of_contact() for w in wrong]
         self.again, number = False, count(self._pairs, wrong)
         if not number:
-            if self._held:
+            if self.held:
                 self._let_limits_follow(wrong)
             return wrong
-        free = self._rough and not self._held
+        free = self._rough and not self.held
         far = free and way > FAR * self._pairs[0].config.size and self._known is not None
         if free and not far:
             self._known = self._here(wrong)
         chosen, rule = wrong, self._rule if far else self._pivoting.choose(number, self._state())
         if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
+            if curved:
+                # without curvature the problem with held limits is a convex one
+                self.straight = self.convex = True
             self._hold_limits()
             return [w.among(np.zeros_like(w.enter)) for w in wrong]
         if rule >= Rule.FIRST and curved and not self.straight:
@@ -192,7 +197,7 @@ class Exchanges:
                 state, pair.friction.pivot = known
                 pair.take(state)
                 pair.friction.hold_limits(state.lam)
-        self._pivoting, self._held, self._were_held, self.again = Pivoting(), True, True, True
+        self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
 
     def _let_limits_follow(self, wrong: Sequence[Wrong]) -> None:
@@ -207,7 +212,7 @@ class Exchanges:
             for pair in self._pairs:
                 if pair.friction is not None:
                     pair.friction.hold_limits(None)
-            self._held = False
+            self.held = False
         self._pivoting, self.again = Pivoting(), True
         self._solve_again()
 
