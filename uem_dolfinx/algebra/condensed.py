@@ -134,11 +134,14 @@ class Condensed:
     def unite(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None) -> None:
         """Make the dense united matrix; ``serves`` must hold (collective)."""
         assert self._made_for is not None
+        nodes = np.flatnonzero(self._nodes)
+        with timed("restriction matrix P"):
+            rows = P.rows_of(nodes)
+            test_rows = rows if P is Q else Q.rows_of(nodes)
         with timed("condensed matrix"):
-            nodes = np.flatnonzero(self._nodes)
             numbers = self._gathered(nodes + self.space.first)
-            trial = self._on_root(P.rows_of(nodes), numbers)
-            test = trial if P is Q else self._on_root(Q.rows_of(nodes), numbers)
+            trial = self._on_root(rows, numbers)
+            test = trial if P is Q else self._on_root(test_rows, numbers)
             curvature = None if G is None else self._on_root(blocks_of_matrix(self.space, G), numbers)
             used = self._gathered(P.used.ravel()[self._at].astype(float)) > 0
             self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
@@ -274,13 +277,16 @@ class _Dense:
         M = np.asarray((P if Q is None else Q).T @ np.ascontiguousarray((P.T @ S.T).T))
         if G is not None:
             M += ((P if Q is None else Q).T @ G @ P).toarray()
-        self._positive = False
+        self._positive = self.negative = False
+        if not len(M):
+            # every component is eliminated or prescribed
+            return
         root = np.sqrt(np.abs(np.diag(M)))
         if Q is None and (np.abs(M - M.T) <= SYMMETRIC * root[:, None] * root).all():
             factor, failed = lapack.dpotrf(M, lower=1)
             self._positive = failed == 0
         if self._positive:
-            self._factor, self.negative = factor, False
+            self._factor = factor
             return
         self._factor, self._pivots, _ = lapack.dgetrf(M)
         swapped = (self._pivots != np.arange(len(self._pivots))).sum() % 2 == 1

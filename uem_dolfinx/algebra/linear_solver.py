@@ -121,10 +121,9 @@ class UnitedSolver:
         """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
         self._begins = True
         self._kept.drop()
-        self._condensed.begin_step()
         self._of = None
-        self._united.begin_step()
-        self._unsymmetric.begin_step()
+        for part in (self._condensed, self._united, self._unsymmetric):
+            part.begin_step()
 
     @contextmanager
     def _in_database(self, **instead: Any) -> Iterator[None]:
@@ -151,12 +150,13 @@ class UnitedSolver:
         return self.pc.getType() in ("gamg", "ml", "bddc")
 
     def set_operator(
-        self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, test: Restriction | None = None
+        self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, same: bool = False
     ) -> None:
-        """Build ``Q'(K + curvature)P`` and give it to the KSP (collective).
+        """Build ``Q'(K + G)P`` and give it to the KSP (collective).
 
         ``restriction`` is P, of the current uniting equations, ``test`` is Q: if None, or the same object, P, and the matrix is
-        symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``curvature`` second derivatives of gaps times forces.
+        symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``G`` second derivatives of gaps times forces.
+        ``same`` tells that all of them have the values that they had the last time, although a step has begun since.
         """
         test = test or restriction
         self._apart = test is not restriction
@@ -167,7 +167,7 @@ class UnitedSolver:
             # it tells the sign of the determinant as well
             self._use(self._instead)
         self._served = None
-        self._on_condensed = self._condense(restriction, test, K, curvature)
+        self._on_condensed = self._condense(restriction, test, K, G, same)
         if self._on_condensed or self._served is not None:
             return
         self._factor_of = None
@@ -175,12 +175,12 @@ class UnitedSolver:
         if self._apart:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
-                self.set_operator(restriction, K, curvature)
+                self.set_operator(restriction, K, G)
                 self._apart = True
             self._adapt(False)
-            self._set_unsymmetric(restriction, test, K, curvature)
+            self._set_unsymmetric(restriction, test, K, G)
             return
-        if restriction.alone and curvature is None:
+        if restriction.alone and G is None:
             with timed("cross out prescribed components"):
                 if self._crossed is None or self._crossed[0] != K:
                     self._crossed = K, K.copy()
@@ -188,7 +188,7 @@ class UnitedSolver:
                 restriction.cross_out(self._A)
                 stiffen(self._A, K, ~restriction.used.ravel())
         else:
-            self._A = self._united.update(restriction, restriction, K, curvature)
+            self._A = self._united.update(restriction, restriction, K, G)
         symmetric = is_symmetric(self._A)
         if not symmetric and self._instead and self.iterative:
             self._use(self._instead)
@@ -212,7 +212,7 @@ class UnitedSolver:
         P, Q, K, G = self._condensed.made_of
         return (self._united if P is Q else self._unsymmetric).update(P, Q, K, G)
 
-    def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> bool:
+    def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
         """Unite on the components of the contact; whether that is done (collective).
 
         That pays where K lasts or, since no factorisation is kept then, where Q is not P; else from the second matrix of a K on that none
@@ -227,7 +227,8 @@ class UnitedSolver:
         pays = possible and (self.lasting or self._apart or again)
         if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
             return False
-        self._condensed.unite(P, Q, G)
+        if not (serves and same):
+            self._condensed.unite(P, Q, G)
         return True
 
     def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
@@ -284,12 +285,10 @@ class UnitedSolver:
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
         A = self._unsymmetric.update(P, Q, K, curvature)
-        if self.iterative:
-            self.ksp.setOperators(A, self._A)
-            return
-        self._new, self._A = True, A
-        self.pc.setReusePreconditioner(False)
-        self.ksp.setOperators(A)
+        if not self.iterative:
+            self._new, self._A = True, A
+            self.pc.setReusePreconditioner(False)
+        self.ksp.setOperators(A, self._A)
 
     def _keep_preconditioner(self, equations: UnitingEquations) -> None:
         """Decide whether the preconditioner serves the present matrix as well (collective)."""

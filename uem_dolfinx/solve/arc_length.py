@@ -20,7 +20,8 @@ from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.newton import Iteration, IterationState, Settled
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.system import BodyState, BodySystem
+from uem_dolfinx.solve.rows import BodyState
+from uem_dolfinx.solve.system import BodySystem
 
 #: Difference of load factors over which the residual's derivative is taken; exact where the load is proportional to the factor.
 #: [convention; load factor; test_arc_length.py::test_loads_that_are_not_proportional]

@@ -20,6 +20,7 @@ from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import agree
+from uem_dolfinx.solve.newton import IterationState
 
 
 class Meetings:
@@ -94,6 +95,15 @@ class Rows:
     independent: IndependentEquations | None
     test: Restriction
     upright: Restriction
+
+
+@dataclass(frozen=True)
+class BodyState(IterationState):
+    """``IterationState`` with the rows that it was made of, and what the direction of slip adds to tangent and residual."""
+
+    rows: Rows
+    added: PETSc.Mat | None
+    held: PETSc.Vec | None
 
 
 def make_rows(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from mpi4py import MPI
@@ -29,7 +28,7 @@ from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import IterationState, Settled
-from uem_dolfinx.solve.rows import Meetings, Rows, make_rows, unbalanced
+from uem_dolfinx.solve.rows import BodyState, Meetings, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
 #: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
@@ -38,15 +37,6 @@ FORESEEN = 1e-8
 #: Part of the model's size that an active contactor's gap may be left with.
 #: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
 CLOSED = 1e-13
-
-
-@dataclass(frozen=True)
-class BodyState(IterationState):
-    """``IterationState`` with the rows that it was made of, and what the direction of slip adds to tangent and residual."""
-
-    rows: Rows
-    added: PETSc.Mat | None
-    held: PETSc.Vec | None
 
 
 class BodySystem:
@@ -386,8 +376,9 @@ class BodySystem:
         parts = self.forces.tangent.number, exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
         made_of = self.comm.allgather(parts)
         moving = (curvature is not None or Q is not P) and self.newton == "full"
-        if moving or made_of != self._factored or self.solver.begins:
-            self.solver.set_operator(P, K, curvature, Q)
+        same = made_of == self._factored and not moving
+        if not same or self.solver.begins:
+            self.solver.set_operator(P, K, curvature, Q, same)
         self._factored = made_of
         self.solver.begin_at(c := P.c)
         return -Q.transpose(self._foreseen_forces(state, c, K * c))
