@@ -27,6 +27,7 @@ from ufl.mathfunctions import MathFunction
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
+from uem_dolfinx.parallel import reduced
 
 #: Integrands that are no polynomials get a quadrature rule of this times the degree of the displacement.
 #: [convention; degrees; test_elastic.py::test_degrees_that_are_asked_for]
@@ -275,7 +276,7 @@ def assemble_array(V: Any, L: Any) -> npt.NDArray[np.float64]:
 
 def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     """Sum of a compiled functional over all ranks of a communicator, known to all of them (collective)."""
-    return float(comm.allreduce(sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
+    return float(reduced(comm, sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
 
 
 def free_petsc_garbage(comm: MPI.Comm) -> None:

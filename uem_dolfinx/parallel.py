@@ -41,7 +41,7 @@ def agree(comm: MPI.Comm, error: BaseException | None) -> None:
         BaseException: the same error on all ranks, if any rank had one, SystemExit and KeyboardInterrupt among them; a RuntimeError
             with its words if it cannot be sent as it is.
     """
-    if comm.size > 1 and comm.allreduce(error is not None, op=MPI.LOR):
+    if comm.size > 1 and reduced(comm, error is not None, op=MPI.LOR):
         errors = comm.allgather(_sendable(error))
         first = next(rank for rank, e in enumerate(errors) if e is not None)
         if first != comm.rank or errors[first].__class__ is not error.__class__:
@@ -194,3 +194,15 @@ def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
     total = np.empty(len(keys), dtype=np.int64)
     (total[meeting.rows],) = meeting.back(counts[inverse.ravel()])
     return total
+
+
+def reduced(comm: MPI.Comm, value: Any, op: MPI.Op = MPI.SUM) -> Any:
+    """Sum, or another reduction, of a number or an array ``(...)`` over all ranks, in one call and as what it came (collective)."""
+    if comm.size == 1:
+        return value
+    own = np.asarray(value)
+    if own.dtype == bool and op == MPI.SUM:
+        own = own.astype(np.int64)
+    out = np.empty_like(own, order="C")
+    comm.Allreduce(np.ascontiguousarray(own), out, op)
+    return out if out.ndim else out.item()

@@ -27,6 +27,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
 
 #: A dense matrix of more components takes as long as factorisations of the whole, and too much room on one rank.
 #: [convention; components; test_condensed.py::test_most_components]
@@ -76,7 +77,7 @@ class Condensed:
         if self._is_of(K):
             touched = self._touched(P, Q, G, holding=not self._begins)
             lacks = bool((touched & ~self._nodes).any() or (self._begins and (self._nodes & ~touched).any()))
-        return not self.space.comm.allreduce(int(lacks))
+        return not reduced(self.space.comm, int(lacks))
 
     def _is_of(self, K: PETSc.Mat) -> bool:
         return self._made_for is not None and self._made_for[0] == K and self._made_for[1] == K.stateGet()
@@ -113,7 +114,7 @@ class Condensed:
         if self._is_of(K) and not self._begins:
             nodes |= self._nodes
         self.drop()
-        if space.comm.allreduce(space.block * int(nodes.sum())) > MOST_COMPONENTS:
+        if reduced(space.comm, space.block * int(nodes.sum())) > MOST_COMPONENTS:
             return False
         self._nodes = nodes
         self._at = (space.block * np.flatnonzero(nodes)[:, None] + np.arange(space.block)).ravel()

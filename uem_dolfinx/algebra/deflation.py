@@ -25,6 +25,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import reduced
 
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
 #: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
@@ -117,7 +118,7 @@ def deflated(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETS
     alone = np.flatnonzero(P.used & near)
     counts = np.cumsum([0, *comm.allgather(len(alone))])
     mode, row, value = _rigid_modes(space, P, pressed, ~near & P.used)
-    n_modes = comm.allreduce(int(mode.max(initial=-1)) + 1, op=MPI.MAX)
+    n_modes = reduced(comm, int(mode.max(initial=-1)) + 1, op=MPI.MAX)
     rows, values = np.append(alone, row), np.append(np.ones(len(alone)), value)
     columns = np.append(counts[comm.rank] + np.arange(len(alone)), counts[-1] + mode)
     order = np.lexsort((columns, rows))

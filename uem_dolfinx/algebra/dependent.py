@@ -22,7 +22,7 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
-from uem_dolfinx.parallel import Exchange
+from uem_dolfinx.parallel import Exchange, reduced
 
 #: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
 #: do so only to the first order of their strain.
@@ -213,7 +213,7 @@ def _with_neighbours(space: Nodes, equations: UnitingEquations, conflicting: Boo
         here[space.gather_owned(touched)] = True
         more = equations.active & ~conflicting & here[equations.node]
         conflicting |= more
-        if not space.comm.allreduce(int(more.any())):
+        if not reduced(space.comm, int(more.any())):
             return conflicting
 
 

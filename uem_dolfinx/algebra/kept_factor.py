@@ -16,6 +16,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
 
 #: A factorisation that has not done after so many solves is made anew, which takes about as long.
 #: [convention; solves; test_kept_factor.py::test_a_factor_that_does_not_serve]
@@ -61,7 +62,7 @@ class KeptFactor:
             there = diagonal.array_r
             if (np.abs(K.getDiagonal().array_r - there) <= ALIKE * np.abs(there)).all():
                 changed = float(np.count_nonzero(used != P.used))
-        return bool(self.space.comm.allreduce(changed) <= FEW_CHANGES)
+        return bool(reduced(self.space.comm, changed) <= FEW_CHANGES)
 
     def solve(
         self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, rhs: PETSc.Vec, accuracy: float

@@ -25,7 +25,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
 #: [convention; ratio of norms; test_linear_solver.py::test_accuracy_of_an_iterative_solve]
@@ -251,7 +251,7 @@ class UnitedSolver:
             return
         with timed("deflation"):
             pressed = pressed_hard(self.space, self._A, K, restriction)
-            if not self.space.comm.allreduce(int(pressed.any())):
+            if not reduced(self.space.comm, int(pressed.any())):
                 self.ksp.setPC(self.pc)
                 return
             self.pc.setOperators(without(self.space, self._A, restriction, pressed))
@@ -296,7 +296,7 @@ class UnitedSolver:
         if self.iterative and before is not None:
             same = np.array_equal(equations.node, before.node)
             changed = (equations.active != before.active).sum() if same else len(before) + 1
-            changed, present = self.space.comm.allreduce(np.array([changed, before.active.sum()]))
+            changed, present = reduced(self.space.comm, np.array([changed, before.active.sum()]))
             keep = changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
             self._made_with, self._first_pace = equations, 0.0

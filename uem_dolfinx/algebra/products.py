@@ -23,7 +23,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import Exchange
+from uem_dolfinx.parallel import Exchange, reduced
 
 #: Places of earlier products are kept while there are no more than this times as many of them as of the present one's.
 #: [convention; number of entries that K lacks; test_linear_solver.py::test_places_of_earlier_products]
@@ -77,7 +77,7 @@ class UnitedMatrix:
         changes, adding = self._changes(trial, test, G)
         begins = self._A is None or self._begins
         places, there = self._find(self._K if begins else self._A, changes)
-        if begins or self.space.comm.allreduce(int(not there.all())):
+        if begins or reduced(self.space.comm, int(not there.all())):
             self._make_room(begins, changes, P, Q, G)
             places, _ = self._find(self._A, changes)
         values = self._A.values
@@ -175,7 +175,7 @@ class UnitedMatrix:
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
         """Take K's places if they are new; whether its values are (collective)."""
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
-        fresh, changed = self.space.comm.allreduce(np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
+        fresh, changed = reduced(self.space.comm, np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
             self._made_for, self._K, self._A = (K, P.free), Entries.as_in(K), None
             # where Z crosses out, but for the diagonal
@@ -212,12 +212,12 @@ class UnitedMatrix:
         self._begins = False
         if begins:
             same = self._A is not None and np.array_equal(wanted, self._filled)
-            if comm.allreduce(int(same)) == comm.size:
+            if reduced(comm, int(same)) == comm.size:
                 return
             self._filled = wanted
         else:
             both = np.union1d(wanted, self._filled)
-            few = comm.allreduce(len(both)) <= KEPT_PLACES * comm.allreduce(len(wanted))
+            few = reduced(comm, len(both)) <= KEPT_PLACES * reduced(comm, len(wanted))
             self._filled = both if few else wanted
         self._create()
 

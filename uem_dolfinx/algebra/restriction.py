@@ -29,7 +29,7 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, Uniting
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Halo, Nodes
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 #: Equations may follow each other in circles if what has gone through so many of them is rounding.
 #: [convention; number of equations; test_restriction.py::test_circles_that_fade]
@@ -68,7 +68,7 @@ class Restriction:
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.index_map.size_global),) * 2
         self._first = g * space.first
-        self.n_equations, self._n_rows = (int(k) for k in self.comm.allreduce(np.array([equations.active.sum(), len(equations)])))
+        self.n_equations, self._n_rows = (int(k) for k in reduced(self.comm, np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
@@ -160,7 +160,7 @@ class Restriction:
         eliminated = np.zeros((self.space.n_owned, 1))
         eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
         on = self.space.ask_owners(eq.followed, eliminated)[:, 0] > 0
-        if not self.comm.allreduce(int(on.any())):
+        if not reduced(self.comm, int(on.any())):
             return int(sizes[1] > 0)
         terms = np.broadcast_to(eq.row[on, None], (on.sum(), g)), eq.followed[on, None] * g + k, eq.coefficients[on]
         own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift

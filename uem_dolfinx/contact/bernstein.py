@@ -27,6 +27,7 @@ from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.parallel import reduced
 
 #: Nodes share a quadratic gap if their normals agree up to this cosine,
 #: [heuristic; cosine; -]
@@ -185,7 +186,7 @@ class Bernstein(NodeToSurface):
         super().__init__(config, nodes, target, **how)
         self.family = Family(config, nodes, *_family(config, nodes))
         # one in the middle of a facet follows those in the middles of edges
-        self.chained = bool(config.comm.allreduce(int(self.family.of_facet.sum())))
+        self.chained = bool(reduced(config.comm, int(self.family.of_facet.sum())))
 
     def with_friction(self, mu: Array) -> None:
         """Keep all terms: with friction the gap of a parent matters whether it has closed or not."""

@@ -24,7 +24,7 @@ from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 #: [heuristic; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
@@ -61,8 +61,8 @@ def check_initial(pair: Interface) -> None:
         )
     agree(pair.config.comm, error)
     inside = gap < -TOUCHING * pair.config.size
-    depth = pair.config.comm.allreduce(float(-gap.min(initial=0.0)), op=MPI.MAX)
-    count = pair.config.comm.allreduce(int(inside.sum()))
+    depth = reduced(pair.config.comm, float(-gap.min(initial=0.0)), op=MPI.MAX)
+    count = reduced(pair.config.comm, int(inside.sum()))
     if count:
         pair.initial_overlap = depth
         logger.warning(
@@ -111,7 +111,7 @@ def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -
     curved = V.tabulate_dof_coordinates()[:, :g]
     on = np.concatenate([fem.locate_dofs_topological(V, tag.dim, tag.entities) for tag in tags]).astype(np.int64)
     off = np.linalg.norm(curved[on] - straight.x.array.reshape(-1, g)[on], axis=1).max(initial=0.0)
-    off = config.comm.allreduce(float(off), op=MPI.MAX)
+    off = reduced(config.comm, float(off), op=MPI.MAX)
     if off > TOUCHING * config.size:
         logger.warning(
             "%s: a displacement of degree 1 makes straight facets of the curved ones of this mesh, up to %.3g off them: take one of "
@@ -187,8 +187,8 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
     p = pair.projection
     near = np.linalg.norm(p.beyond, axis=1) < 0.5 * p.facet_size
     slipped = pair.off & ~before & near & (p.gap < 0.0)
-    lost, held, count = pair.config.comm.allreduce(
-        np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
+    lost, held, count = reduced(
+        pair.config.comm, np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
     )
     if lost <= SLIPPED * (lost + held):
         return False

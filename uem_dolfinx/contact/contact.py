@@ -30,7 +30,7 @@ from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import Areas, check_distinct, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.target_corners import CornerInside
@@ -244,7 +244,7 @@ class Contact:
     def look_at_ends(self) -> None:
         """Warn, once, if contactors have slid off the target's end since the start (collective)."""
         gone = self.pair.off & ~self._off_at_start
-        if not self._slipped and self.pair.target.n_nodes and self.config.comm.allreduce(gone.any(), op=MPI.LOR):
+        if not self._slipped and self.pair.target.n_nodes and reduced(self.config.comm, gone.any(), op=MPI.LOR):
             self._slipped = warn_of_slipped(self.pair, self._off_at_start, self._areas)
 
     def corner_inside(self, stiffness: Array | None) -> CornerInside | None:
@@ -324,7 +324,7 @@ class Contact:
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
-        return float(self.config.comm.allreduce(float(self.pressures.max(initial=0.0)), op=MPI.MAX))
+        return float(reduced(self.config.comm, float(self.pressures.max(initial=0.0)), op=MPI.MAX))
 
     @property
     def pressure(self) -> fem.Function:
@@ -375,7 +375,7 @@ class Contact:
     def dissipation(self) -> float:
         """Energy that friction has taken from the bodies in all committed steps: slips times means of a step's friction (collective)."""
         friction = self.pair.committed.friction
-        return float(self.config.comm.allreduce(0.0 if friction is None else float(friction.work.sum())))
+        return float(reduced(self.config.comm, 0.0 if friction is None else float(friction.work.sum())))
 
     @property
     def force(self) -> fem.Function:

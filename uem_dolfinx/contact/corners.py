@@ -17,6 +17,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import FacetProjection, gap_hessians
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import beneath, closest_point, tangents
+from uem_dolfinx.parallel import reduced
 
 #: Facets whose slopes differ by less are one plane.
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]
@@ -190,7 +191,7 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
         which: their places among the pair's contactors ``(k,)``.
         facets: at least two for each, the rest -1 ``(k, gdim)``.
     """
-    if not comm.allreduce(len(which)):
+    if not reduced(comm, len(which)):
         return None
     k, gdim = facets.shape
     first = target.project_on(points, facets[:, 0])

@@ -13,6 +13,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.frame import Frame
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints
 from uem_dolfinx.contact.ties import Ties
+from uem_dolfinx.parallel import reduced
 
 
 def with_friction(
@@ -61,7 +62,7 @@ def with_friction(
     frictionless = tilted = trial = with_those_along(test, frame.ties)
     slipping = rubbing & ~stick
     tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
-    slips = comm.allreduce(bool(tilt.any()), op=MPI.LOR)
+    slips = reduced(comm, bool(tilt.any()), op=MPI.LOR)
     # rows of contactors that stick are symmetric where they follow by the weights of now
     if own.trial is not test or not (pointwise or (keeps_ties and not slips)):
         trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)

@@ -23,7 +23,7 @@ from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.sliding import Sliding
@@ -159,7 +159,7 @@ class Interface:
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
         disturbance = np.abs(stiffness[self.nodes] * correction).max(axis=1)
-        largest = self.config.comm.allreduce(float(self.trial.lam.max(initial=0.0)), op=MPI.MAX)
+        largest = reduced(self.config.comm, float(self.trial.lam.max(initial=0.0)), op=MPI.MAX)
         correction[disturbance > GENTLE * largest] = 0.0
         self.config.displacement[self.nodes] += correction
         self._replace(self.kinematics.returned(self.points, self.trial))
@@ -167,7 +167,7 @@ class Interface:
     @property
     def n_active(self) -> int:
         """Number of active contactors over all ranks (collective)."""
-        return int(self.config.comm.allreduce(int(self.trial.active.sum())))
+        return int(reduced(self.config.comm, int(self.trial.active.sum())))
 
     @property
     def pattern(self) -> Ints:
@@ -180,7 +180,7 @@ class Interface:
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
         if self.friction is not None:
             here = max(here, self.friction.largest_distance(self.trial, self.redundant))
-        return float(self.config.comm.allreduce(here, op=MPI.MAX))
+        return float(reduced(self.config.comm, here, op=MPI.MAX))
 
     # -- activation and release ------------------------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class Interface:
         """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
         came = self.trial.active & ~self.committed.active & self.committed.passed
         self.barred = self.barred | came
-        return int(self.config.comm.allreduce(int(came.sum())))
+        return int(reduced(self.config.comm, int(came.sum())))
 
     def _at_end(self, state: PairState) -> Bools:
         """Contactors that an end of the target holds in the next step ``(n,)``: where surfaces follow each other, the end touches."""
@@ -228,7 +228,7 @@ class Interface:
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
         self._set_active(state)
-        return bool(self.config.comm.allreduce(gone or moved, op=MPI.LOR))
+        return bool(reduced(self.config.comm, gone or moved, op=MPI.LOR))
 
     def predicted(self, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment; see ``Kinematics.predicted`` (collective)."""
@@ -326,7 +326,7 @@ class Interface:
         active = self.trial.active.copy()
         active[now] = True
         self._set_active(replace(self.trial, active=active))
-        return bool(self.config.comm.allreduce(len(now)))
+        return bool(reduced(self.config.comm, len(now)))
 
     def release_apart(self) -> None:
         """Release contactors without friction that rigid motions have taken off their target (collective)."""
@@ -341,7 +341,7 @@ class Interface:
 
         Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
         """
-        lacks, known = self.config.comm.allreduce(np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
+        lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
         if lacks:
             self.reserved = self.kinematics.near(self.trial) if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))

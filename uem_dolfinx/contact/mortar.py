@@ -34,6 +34,7 @@ from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
 
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
 #: [convention; radians; test_mortar.py::test_parallel_facets]
@@ -76,7 +77,7 @@ class Mortar(Contactors):
             nearest, locked = self.on_target(points), state.changes >= MOST_CHANGES
             known = np.column_stack([locked, state.cover])
             same = self._united is not None and self._united[0] is nearest and np.array_equal(self._united[1], known)
-            if self._united is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+            if self._united is None or not reduced(self.config.comm, same, op=MPI.LAND):
                 placed = nearest
                 if self.target.faceted and isinstance(nearest, FacetProjection):
                     placed = with_averaged_normals(nearest, locked, points)
@@ -245,7 +246,7 @@ class Mortar(Contactors):
         length, parts = np.ones(n), np.einsum("mii,mg->mig", coefficients, normal)
         plain_parts = parts
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
-        if self.sliding == "finite" and config.comm.allreduce(bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
+        if self.sliding == "finite" and reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
             beside, more = self.elimination.beside(at, scale, plain)
             parts = parts + more
             equations, length = self.elimination.derivatives(plain, beside)

@@ -17,7 +17,7 @@ from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.overlaps import Segments
-from uem_dolfinx.parallel import Exchange
+from uem_dolfinx.parallel import Exchange, reduced
 
 #: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
 #: little is covered there, far from the target, and the end of what covers it moves faster than the contactor.
@@ -134,7 +134,7 @@ class Elimination:
             kept = ~lone[beside[0]]
             row, term, value = beside = row[kept], term[kept], value[kept]
             left = self._left_of_circles(plain, beside)
-            most = self.config.comm.allreduce(float(left.max(initial=0.0)), op=MPI.MAX)
+            most = reduced(self.config.comm, float(left.max(initial=0.0)), op=MPI.MAX)
             if most <= FADED:
                 return beside, np.einsum("mjjg->mjg", on_facet)
             lone = left > 0.5 * most
@@ -155,7 +155,7 @@ class Elimination:
         at[self.nodes] = 1.0
         for _ in range(MOST_ROUND):
             at[self.nodes, 0] = np.bincount(row, follows * self.config.ask_owners(term, at)[:, 0], minlength=len(self.nodes))
-            if self.config.comm.allreduce(float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
+            if reduced(self.config.comm, float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
                 break
         return at[self.nodes, 0]
 

@@ -23,6 +23,7 @@ from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.corners import Corners
@@ -160,7 +161,7 @@ class NodalKinematics:
         cone, target, p = np.ones(len(self.points)), self.of.target, self.projection
         if self.of.frictional and target.faceted and isinstance(target, MeshTarget) and isinstance(p, FacetProjection):
             averaged = (p.averaged == p.normal).all(axis=1)
-            if self.of.config.comm.allreduce(bool(averaged.any()), op=MPI.LOR):
+            if reduced(self.of.config.comm, bool(averaged.any()), op=MPI.LOR):
                 cone = np.where(averaged, target.spread(p), 1.0)
         if self.corners is not None:
             cone[self.corners.which] = np.linalg.norm(self.corners.summing, axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.parallel import reduced
 
 
 class OnTarget:
@@ -35,7 +36,7 @@ class OnTarget:
     ):
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
         self.free, self.free_of_owned, self.frictional = free[nodes], free, False
-        self.prescribed = bool(config.comm.allreduce(int(not self.free.all())))
+        self.prescribed = bool(reduced(config.comm, int(not self.free.all())))
         self.anchor: Projection | None = None
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
@@ -55,7 +56,7 @@ class OnTarget:
             return self.target.project(points) if anchor is None else self.target.follow(points, anchor)
         x, last = self.config.x[self.target.dofs], self._projected
         same = last is not None and last[2] is anchor and np.array_equal(points, last[0]) and np.array_equal(x, last[1])
-        if last is None or not self.config.comm.allreduce(same, op=MPI.LAND):
+        if last is None or not reduced(self.config.comm, same, op=MPI.LAND):
             found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
             self._projected = last = points, x, anchor, found
         return last[3]

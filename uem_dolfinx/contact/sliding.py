@@ -25,6 +25,7 @@ from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import FrictionState, LastStep, PairState, Pivot
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.parallel import reduced
 
 #: What is left of a limit that is proportional to the force along the normal, below this part of it, is rounding.
 #: [bound; limit of friction; -]
@@ -114,7 +115,7 @@ class Sliding:
 
     def meet(self, kinematics: Kinematics, normals: Array) -> None:
         """Take the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which they do not slip (collective)."""
-        if self.config.comm.allreduce(not np.array_equal(normals, self._beside), op=MPI.LOR):
+        if reduced(self.config.comm, not np.array_equal(normals, self._beside), op=MPI.LOR):
             self._beside = normals
             self.replace(kinematics)
 
@@ -264,7 +265,7 @@ class Sliding:
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
         released, turned, begun = pivot.released | wrong.release, pivot.turned | turns, pivot.begun | slide
         self.pivot = replace(pivot, released=released, turned=turned, begun=begun, q=q, tau=of_q)
-        return state, ahead and bool(self.config.comm.allreduce(pivot.taken.any(), op=MPI.LOR))
+        return state, ahead and bool(reduced(self.config.comm, pivot.taken.any(), op=MPI.LOR))
 
     def _next_in_line(self, wrong: friction.FrictionWrong, state: PairState, points: Array, tau: Array) -> tuple[Bools, Array]:
         """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
@@ -342,7 +343,7 @@ class Sliding:
     def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array] | None:
         """Friction of contactors that does not grow with the force along the normal: nodes and forces; None without any (collective)."""
         rest, _ = self._cone(state)
-        if not self.config.comm.allreduce(bool(rest.any()), op=MPI.LOR):
+        if not reduced(self.config.comm, bool(rest.any()), op=MPI.LOR):
             return None
         size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
         return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
@@ -376,7 +377,7 @@ class Sliding:
         slips = self.slipping(state) & (state.lam > 0)
         held = self.active(state) & _of(state).stick & (not self.discretisation.at_feet)
         which = np.flatnonzero(slips | held)
-        if not self.config.comm.allreduce(len(which)):
+        if not reduced(self.config.comm, len(which)):
             return []
         force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)
         tau = (force / kinematics.force_per_multiplier[:, None])[which]

@@ -8,6 +8,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.geometry.search import box_distances, nearest_of
+from uem_dolfinx.parallel import reduced
 
 #: Others go along this times as far ahead as the last time.
 #: [convention; how far they last went along; test_slip_front.py::test_slip_that_eats_its_way_goes_ahead]
@@ -41,7 +42,7 @@ class Front:
         Returns:
             Those that go along ``(n,)``, and the force on the nearest that begins to slip ``(n, gdim)``, zero for the others.
         """
-        begin, back = self._comm.allreduce(np.array([len(here), too_far]))
+        begin, back = reduced(self._comm, np.array([len(here), too_far]))
         if not begin:
             return np.zeros(len(points), dtype=bool), np.zeros(points.shape)
         self._reach = self._reach * (NEARER if back else FARTHER) or self._come(here)
@@ -54,6 +55,6 @@ class Front:
         if self._last is None:
             return 0.0
         _, far = box_distances(self._comm, here, self._last)
-        bound = self._comm.allreduce(float(far.min(initial=np.inf)), op=MPI.MIN)
+        bound = reduced(self._comm, float(far.min(initial=np.inf)), op=MPI.MIN)
         distance, _ = nearest_of(self._comm, self._last, here, bound, here)
-        return float(self._comm.allreduce(float(distance.min(initial=np.inf)), op=MPI.MIN))
+        return float(reduced(self._comm, float(distance.min(initial=np.inf)), op=MPI.MIN))

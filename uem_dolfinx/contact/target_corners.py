@@ -21,6 +21,7 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.search import MeshTarget, nearest_of
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
 
 #: A node of a target is at a convex corner if a facet falls away from the mean of the normals there by more than this.
 #: [convention; sine; test_target_corners.py::test_what_is_a_corner]
@@ -69,7 +70,7 @@ class TargetCorners:
         self._largest = 0.0
         #: Owned nodes of the target at corners and ends ``(k,)``, and whether any rank has one.
         self.nodes = corner_nodes(config, pair.target.facets) if isinstance(pair.target, MeshTarget) else np.zeros(0, np.int32)
-        self.some = isinstance(pair.target, MeshTarget) and bool(config.comm.allreduce(len(self.nodes)))
+        self.some = isinstance(pair.target, MeshTarget) and bool(reduced(config.comm, len(self.nodes)))
         if not self.some:
             return
         try:
@@ -81,8 +82,8 @@ class TargetCorners:
         x = self.surface.facets.x
         sides = np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
         #: Sizes of the largest and of the smallest facet, lengths.
-        self.reach: float = config.comm.allreduce(float(np.ptp(x, axis=1).max(initial=0.0)), op=MPI.MAX)
-        self.smallest: float = config.comm.allreduce(float(sides.min(initial=np.inf)), op=MPI.MIN)
+        self.reach: float = reduced(config.comm, float(np.ptp(x, axis=1).max(initial=0.0)), op=MPI.MAX)
+        self.smallest: float = reduced(config.comm, float(sides.min(initial=np.inf)), op=MPI.MIN)
 
     @timed("corners of the target")
     def find(self, stiffness: Array) -> CornerInside | None:
@@ -95,7 +96,7 @@ class TargetCorners:
         if not self.some or pair.mutual:
             return None
         near = self._near()
-        some, force = comm.allreduce(np.array([len(near), pair.trial.lam.sum()]))
+        some, force = reduced(comm, np.array([len(near), pair.trial.lam.sum()]))
         # bodies that part press hardly any more
         self._largest = force = max(force, self._largest)
         if not some:
@@ -104,7 +105,7 @@ class TargetCorners:
         points, least = pair.points, ON_FACET * self.smallest
         distance, _ = nearest_of(comm, config.x[near], points, least, np.zeros((len(points), 1)))
         near = near[distance > least]
-        if not comm.allreduce(len(near)):
+        if not reduced(comm, len(near)):
             return None
         points = config.x[near]
         p = self.surface.project(points)
@@ -119,7 +120,7 @@ class TargetCorners:
             np.einsum("ng,ng->n", stiffness[near], p.normal**2),
         )
         both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
-        lacking = comm.allreduce(float(both @ depth))
+        lacking = reduced(comm, float(both @ depth))
         if not lacking > LACKING * force:
             return None
         found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in np.flatnonzero(inside)]

@@ -17,6 +17,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import reduced
 
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
 #: [heuristic; changes in a step; -]
@@ -84,7 +85,7 @@ class Valleys:
         """
         nearest = cast("FacetProjection", nearest)
         i = np.flatnonzero(left & ~state.in_corner)
-        if self.config.comm.allreduce(len(i)):
+        if reduced(self.config.comm, len(i)):
             own = self.target.project_on(points[i], state.facet[i])
             own = replace(own, normal=self.target.outward(own))
             own = replace(own, gap=np.einsum("ng,ng->n", own.normal, points[i] - own.foot))

@@ -25,7 +25,7 @@ from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import InputTypeError, LinearSolveError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agree, agreed, ask_together
+from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
@@ -167,7 +167,7 @@ class Dynamics:
             MassError: if a body cannot do without the mass of its contactors.
         """
         contactors = contactor_nodes(contacts)
-        massy = int(self.config.comm.allreduce(int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
+        massy = int(reduced(self.config.comm, int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
         if self.contactors == "massless":
             self.mass = without_surfaces(self.mass, contacts)
         elif massy:
@@ -347,7 +347,7 @@ class Dynamics:
     def momentum(self) -> Array:
         """Momentum ``(gdim,)`` (collective)."""
         p = self.mass.M * self._like(self.velocity.x.array[: self._n])
-        return np.asarray(self.config.comm.allreduce(p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
+        return np.asarray(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2`` (collective)."""

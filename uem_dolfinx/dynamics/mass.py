@@ -26,7 +26,7 @@ from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration, configuration_of
 from uem_dolfinx.geometry.search import EQUALLY_NEAR
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import agree, agreed, ask_together
+from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 #: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]
@@ -81,13 +81,13 @@ class Mass:
     @property
     def total(self) -> Array:
         """Mass that moves along each coordinate ``(gdim,)`` (collective)."""
-        return np.asarray(self.config.comm.allreduce(self._row_sums.sum(axis=0)))
+        return np.asarray(reduced(self.config.comm, self._row_sums.sum(axis=0)))
 
     @property
     def centre(self) -> Array:
         """Centre of all mass as the bodies are drawn, components taken together ``(gdim,)``; NaN without mass (collective)."""
         m = self._row_sums.sum(axis=1)
-        sums = self.config.comm.allreduce(np.append(m @ self._X, m.sum()))
+        sums = reduced(self.config.comm, np.append(m @ self._X, m.sum()))
         return np.asarray(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
 
     def rigid(self) -> Array:
@@ -139,12 +139,12 @@ class Mass:
         needed[named] = True
         bare = needed.copy()
         bare[more] = True
-        if not config.comm.allreduce(int(self.of_nodes[bare].any())):
+        if not reduced(config.comm, int(self.of_nodes[bare].any())):
             return self
         with timed("redistribute mass"):
             body, _ = self._bodies
             s, unable = self._scaling(~bare)
-            if unable.any() and config.comm.allreduce(len(more)):
+            if unable.any() and reduced(config.comm, len(more)):
                 bare &= needed | ~unable[body]
                 s, unable = self._scaling(~bare)
             if unable.any():
@@ -244,7 +244,7 @@ class Mass:
         """
         heavy = self.of_nodes.any(axis=1) & here
         sums = [here.sum(), (heavy & needed).sum(), (heavy & ~needed).sum(), *self._X[here].sum(axis=0)]
-        n, contactors, others, *x = self.config.comm.allreduce(np.array(sums, dtype=float))
+        n, contactors, others, *x = reduced(self.config.comm, np.array(sums, dtype=float))
         where = ", ".join(f"{c:.4g}" for c in np.array(x) / n)
         part = "" if distance is None else self._possible_part(heavy & needed, here, distance)
         return MassError(
@@ -261,7 +261,7 @@ class Mass:
         Arguments as those of ``_unable``.
         """
         comm, body = self.config.comm, self._bodies[0]
-        number = comm.allreduce(int(body[here].max(initial=-1)), op=MPI.MAX)
+        number = reduced(comm, int(body[here].max(initial=-1)), op=MPI.MAX)
         # equally near ones go together
         unit = EQUALLY_NEAR * self.config.size
         level = np.rint(distance / unit)
@@ -273,7 +273,7 @@ class Mass:
             low, high = (middle, high) if able else (low, middle)
         if low < 0:
             return ""
-        count = comm.allreduce(int((needed & (level <= levels[low])).sum()))
+        count = reduced(comm, int((needed & (level <= levels[low])).sum()))
         return (
             f"the {count} of them that are no farther than {levels[low] * unit:.4g} from what they may touch could be massless: make that "
             "part of its surface the contactor, or "
@@ -299,7 +299,7 @@ class Mass:
     def _products(self, left: Array, right: Array) -> Array:
         """Sums of ``left (n_owned, g, k)`` times ``right (n_owned, g, l)`` over bodies: ``(n_bodies, g, k, l)`` (collective)."""
         sums = [left[here].transpose(1, 2, 0) @ right[here].transpose(1, 0, 2) for here in self._nodes_of_bodies]
-        return np.asarray(self.config.comm.allreduce(np.array(sums)))
+        return np.asarray(reduced(self.config.comm, np.array(sums)))
 
     def _times(self, field: Array) -> Array:
         """M times a field at the owned nodes ``(n_owned, gdim)`` (collective)."""

@@ -20,6 +20,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes, surface_nodes, tributary_areas
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
 
 
 def contactor_nodes(contacts: Sequence[Contact]) -> Indices:
@@ -54,7 +55,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
     for contact in contacts:
         kept = _followed(config, contact)[: config.n_owned] & massy
         bare = not massy[contact.pair.nodes].any()
-        if not config.comm.allreduce(int(kept.any())) or not config.comm.allreduce(int(bare), op=MPI.MIN):
+        if not reduced(config.comm, int(kept.any())) or not reduced(config.comm, int(bare), op=MPI.MIN):
             continue
         K = stiffness() if K is None else K
         sides = [_stiffness_per_area(config, tag, K) for tag in (contact.contactor, contact.target)]
@@ -90,5 +91,5 @@ def _stiffness_per_area(config: Configuration, part: object, K: Array) -> float:
     if not isinstance(part, Tag):
         return 0.0
     nodes = surface_nodes(config, part)
-    total, area = config.comm.allreduce(np.array([K[nodes].sum(), tributary_areas(config, part)[nodes].sum()]))
+    total, area = reduced(config.comm, np.array([K[nodes].sum(), tributary_areas(config, part)[nodes].sum()]))
     return float(total / area) if area > 0.0 and np.isfinite(total) else 0.0

@@ -12,6 +12,7 @@ from dolfinx import fem
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import reduced
 
 
 def rigid_velocities(arm: Array) -> Array:
@@ -68,4 +69,4 @@ def body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
     """Sums of nodal values ``(n, ...)`` over the bodies ``(n,)`` of the nodes, over all ranks ``(count, ...)`` (collective)."""
     out = np.zeros((count, *values.shape[1:]))
     np.add.at(out, body, values)
-    return np.asarray(comm.allreduce(out))
+    return np.asarray(reduced(comm, out))

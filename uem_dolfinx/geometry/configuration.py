@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.bodies import rigid_velocities
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import reduced
 
 
 class Configuration(Nodes):
@@ -73,7 +74,7 @@ class Configuration(Nodes):
         """
         x = self.x[: self.n_owned]
         if centred:
-            x = (x - self.comm.allreduce(x.sum(axis=0)) / self.index_map.size_global) / self.size
+            x = (x - reduced(self.comm, x.sum(axis=0)) / self.index_map.size_global) / self.size
         return rigid_velocities(x)
 
     @cached_property

@@ -16,7 +16,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import SpaceError, TagError
 from uem_dolfinx.given import shown
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 Key: TypeAlias = "str | int | tuple[int, str | int]"
 
@@ -155,7 +155,7 @@ def as_tag(part: Part, mesh: Any, dims: Sequence[int], role: str) -> Tag:
     if not isinstance(part, Tag):
         entities = compat.shared_by_ranks(mesh.topology.index_map(tag.dim), np.concatenate([t.entities for t in tags]))
         tag = Tag(name_of(part), 0, tag.dim, mesh, entities)
-    if mesh.comm.allreduce(len(tag.entities)) == 0:
+    if reduced(mesh.comm, len(tag.entities)) == 0:
         raise TagError(f"{role} '{name_of(part)}' holds no {_word(mesh, tag.dim)}: check the physical group in the gmsh model")
     return tag
 

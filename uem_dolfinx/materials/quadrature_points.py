@@ -15,6 +15,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.log import compiling
+from uem_dolfinx.parallel import reduced
 
 #: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
 #: [convention; reference cell; test_thresholds_motion.py::test_points_beside_the_centre]
@@ -97,7 +98,7 @@ class QuadraturePoints:
 
     def integrate(self, values: Array) -> float:
         """Integral of values ``(n_cells * n_points,)`` over the cells of all ranks (collective)."""
-        return float(self.mesh.comm.allreduce(values @ self.volumes.ravel()))
+        return float(reduced(self.mesh.comm, values @ self.volumes.ravel()))
 
     def average(self, values: Array, f: fem.Function) -> None:
         """Fill a DG0 Function with the means over each cell of values ``(n_cells * n_points, size)`` (collective)."""

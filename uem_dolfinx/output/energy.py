@@ -16,7 +16,7 @@ from uem_dolfinx.form_checks import check_functional, check_linear
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
 
@@ -159,7 +159,7 @@ class EnergyBook(Closing):
         self._read_forces()
         works = 0.5 * (forces + self._forces) @ (self._u - u)
         works[1] += self._driven - driven
-        self._works += self.problem.comm.allreduce(works)
+        self._works += reduced(self.problem.comm, works)
         self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
         return self._append(self._energies())
 

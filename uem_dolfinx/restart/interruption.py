@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import mark_as_agreed
+from uem_dolfinx.parallel import mark_as_agreed, reduced
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -87,7 +87,7 @@ class Interruption:
 
     def agreed(self, comm: MPI.Comm) -> int:
         """Number of a signal that any rank has got since it was asked last, 0 without one (collective)."""
-        number = int(comm.allreduce(self._asked, op=MPI.MAX))
+        number = int(reduced(comm, self._asked, op=MPI.MAX))
         if number:
             self._asked = 0
         return number

@@ -19,6 +19,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
 
 #: Sides of a cell are fewer.
@@ -74,7 +75,7 @@ class ContactEntry:
         self.numbering = Numbering(comm, places, nodes.total)
         surfaces = [hashes(self.numbering.to_table(places))]
         keys = pair.target.keys
-        if comm.allreduce(len(keys)):
+        if reduced(comm, len(keys)):
             surfaces.append(hashes(Numbering(comm, keys, MOST_SIDES * n_cells(contact.config.mesh)).to_table(keys)))
         self._surfaces = fingerprint(comm, surfaces)
         self._columns = " ".join(self.to_checkpoint().dtype.names or ())

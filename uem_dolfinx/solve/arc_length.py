@@ -17,7 +17,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InputError
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.newton import Iteration, IterationState, Settled
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState
@@ -76,7 +76,7 @@ class ArcLength:
 
     def _along(self, way: Array) -> float:
         """How far a way ``(n_owned * gdim,)`` goes in the step's direction (collective)."""
-        return float(self._problem.comm.allreduce(self._direction @ way))
+        return float(reduced(self._problem.comm, self._direction @ way))
 
     @property
     def _missing(self) -> float:
@@ -219,7 +219,7 @@ class AlongArc:
 
     def _size(self, way: Array) -> float:
         """Length of a way ``(n_owned * gdim,)`` (collective)."""
-        return float(np.sqrt(self._problem.comm.allreduce(way @ way)))
+        return float(np.sqrt(reduced(self._problem.comm, way @ way)))
 
 
 def _check_values(problem: UnitedProblem) -> None:

@@ -27,6 +27,7 @@ from uem_dolfinx.contact.friction import FrictionWrong
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.state import PairState, Pivot
 from uem_dolfinx.errors import ConvergenceError, FrictionError
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.first_touch import deepest_of
 from uem_dolfinx.solve.floating import FAR
 
@@ -158,7 +159,7 @@ class Exchanges:
             # with curvature the problem may have no solution, or several; without there is one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
         elif rule == Rule.WORST:
-            worst = comm.allreduce(max(w.worst for w in wrong), op=MPI.MAX)
+            worst = reduced(comm, max(w.worst for w in wrong), op=MPI.MAX)
             chosen = [w.among_the_worst(worst) for w in wrong]
         elif rule == Rule.FIRST:
             chosen = self._first(wrong)
@@ -167,7 +168,7 @@ class Exchanges:
                 raise self._circle(self._lately)
             self._pivoting, self.frozen = Pivoting(), True
             return self.choose(wrong, gaps, curved)
-        elif comm.allreduce(sum(int(w.enter.sum()) for w in wrong)) > sum(pair.n_active for pair in self._pairs):
+        elif reduced(comm, sum(int(w.enter.sum()) for w in wrong)) > sum(pair.n_active for pair in self._pairs):
             chosen = deepest_of(self._pairs, gaps, wrong)
         if rule != self._rule:
             self._rule, self._lately = rule, self._none()
@@ -257,7 +258,7 @@ class Exchanges:
             for i in range(len(self._pairs))
         ]
         comm = self._pairs[0].config.comm
-        if not comm.allreduce(sum(int(c.sum()) for c in changed)):
+        if not reduced(comm, sum(int(c.sum()) for c in changed)):
             if len(back) <= OFTEN:
                 return False
             self.convex, self._from = True, max(norm, self._from)
@@ -265,7 +266,7 @@ class Exchanges:
         self._visits, self._rounds = [], self._rounds + 1
         if self._rounds == MOST_ROUNDS:
             raise self._circle(changed)
-        return comm.allreduce(any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        return reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
 
     def _state(self) -> tuple[int, ...]:
         """What tells the present states of all contactors from others."""
@@ -291,4 +292,4 @@ class Exchanges:
 
 def count(pairs: Sequence[Interface], wrong: Sequence[Wrong]) -> int:
     """Number of wrong contactors over all pairs and ranks (collective)."""
-    return int(pairs[0].config.comm.allreduce(sum(w.count for w in wrong))) if pairs else 0
+    return int(reduced(pairs[0].config.comm, sum(w.count for w in wrong))) if pairs else 0

@@ -12,6 +12,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.active_set import Wrong
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 
@@ -29,19 +30,19 @@ def touch_ahead(forces: BodyForces, pairs: Sequence[Interface], rigid: RigidMoti
         place: projects all contactors.
     """
     config, comm = forces.config, forces.comm
-    known = comm.allreduce(any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
+    known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
     if known or rigid is None:
         return
     place()
     free, prescribed = forces.free[: config.n_owned], forces.prescribed
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
-    near = OPEN * float(comm.allreduce(np.abs(du).max(initial=0.0), op=MPI.MAX))
+    near = OPEN * float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
     gaps = [pair.predicted(du) for pair in pairs]
     wrong = []
     for pair, gap in zip(pairs, gaps):
         none = np.zeros(len(pair.nodes))
         wrong.append(pair.wrong(gap, pair.traction._replace(lam=none), none, none, near, False, du))
-    if comm.allreduce(any(w.enter.any() for w in wrong), op=MPI.LOR):
+    if reduced(comm, any(w.enter.any() for w in wrong), op=MPI.LOR):
         for pair, first in zip(pairs, deepest_of(pairs, gaps, wrong)):
             pair.exchange(first, False)
 

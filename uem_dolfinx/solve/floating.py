@@ -19,6 +19,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 from uem_dolfinx.solve.rigid_steps import least_motion, weighted
@@ -245,7 +246,7 @@ class FloatingBodies:
             return None, took
         # a step that no gap closes, nor takes a body out of an overlap, goes on for ever
         rate, some = R @ v, OPEN * np.abs(v).max()
-        if not comm.allreduce(bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
+        if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
             raise motions.error(v)
         return v, took
 

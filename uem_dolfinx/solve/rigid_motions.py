@@ -19,6 +19,7 @@ from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import rotation_matrix
+from uem_dolfinx.parallel import reduced
 
 #: A motion is open if conditions and contacts resist it with less than this part of its size.
 #: [convention; size of the motion; test_rigid_motions.py::test_what_counts_as_open]
@@ -68,7 +69,7 @@ class RigidMotions:
     def _middles(self) -> Array:
         """Means of the bodies' nodes ``(count, gdim)`` (collective)."""
         own = self._body[: self.config.n_owned]
-        sums = self.comm.allreduce(sums_of_rows(own, np.column_stack([np.ones(len(own)), self._places]), self.count))
+        sums = reduced(self.comm, sums_of_rows(own, np.column_stack([np.ones(len(own)), self._places]), self.count))
         return np.asarray(sums[:, 1:] / sums[:, :1])
 
     def _modes(self, x: Array, body: Ints) -> Array:
@@ -118,7 +119,7 @@ class RigidMotions:
         if self.finite:
             self.middle = self._middles()
         body, modes, _ = self._held()
-        values, vectors = np.linalg.eigh(self.comm.allreduce(self._products(body, modes, modes)))
+        values, vectors = np.linalg.eigh(reduced(self.comm, self._products(body, modes, modes)))
         b, k = np.nonzero(values < OPEN**2)
         free = self._spread(vectors[b, :, k], b).T.tocsc()
         if rates is None:
@@ -157,7 +158,7 @@ class RigidMotions:
             self.middle = self._middles()
         body, modes, at = self._held()
         sums = self._products(body, modes, np.column_stack([modes, prescribed[at]]))
-        sums = self.comm.allreduce(sums)
+        sums = reduced(self.comm, sums)
         return np.asarray(np.linalg.pinv(sums[:, :, :-1], OPEN**2, hermitian=True) @ sums[:, :, -1:]).ravel()
 
     def forces(self, residual: Array, among: Array | None = None) -> tuple[Array, float]:

@@ -23,6 +23,7 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
@@ -239,7 +240,7 @@ class BodySystem:
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             # held limits follow what a solve foretells: it is as good as a direct one
             left = 0.0 if self.solver.exact else min(accuracy, FORESEEN) if self.exchanges.held else accuracy
-            way = float(self.comm.allreduce(np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
             near = max(FORESEEN, left) * way
             foreseen = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)

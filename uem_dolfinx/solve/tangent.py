@@ -20,6 +20,7 @@ from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
+from uem_dolfinx.parallel import reduced
 
 
 class Tangent:
@@ -60,7 +61,7 @@ class Tangent:
         same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
         same &= factor == self._factor
         comm = self.K.comm.tompi4py()
-        if comm.allreduce(int(same)) == comm.size:
+        if reduced(comm, int(same)) == comm.size:
             return
         with timed("assemble tangent"):
             forms.assemble_matrix(self.K, self._form)
@@ -130,7 +131,7 @@ def curvature_of(pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex:
     if not apart:
         parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
     # a plane has none
-    if not du.comm.tompi4py().allreduce(any(blocks.any() for _, blocks in parts)):
+    if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
         return None
     return contact_curvature(parts, du)
 
@@ -144,7 +145,7 @@ def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | N
     """
     g = du.getBlockSize()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
-    if not du.comm.tompi4py().allreduce(sum(len(nodes) for nodes, _, _ in parts)) if parts else True:
+    if not reduced(du.comm.tompi4py(), sum(len(nodes) for nodes, _, _ in parts)) if parts else True:
         return None, None
     held = du.duplicate()
     held.set(0.0)

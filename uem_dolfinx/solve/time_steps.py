@@ -15,7 +15,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
 from uem_dolfinx.log import logger, progress
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
@@ -223,7 +223,7 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
         return
     n = problem.config.gdim * problem.config.n_owned
     way = problem.u.x.array[:n] - problem.committed[:n]
-    given = problem.comm.allreduce(0.5 * float(sum(f @ way for f in forces)))
+    given = reduced(problem.comm, 0.5 * float(sum(f @ way for f in forces)))
     if given <= MOST_GIVEN * control.largest_energy:
         return
     control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
@@ -255,7 +255,7 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
     if K is None:
         return 0.0
     compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()
-    return float(problem.comm.allreduce(sum(0.25 * float(f @ (compliance * f)) for f in forces)))
+    return float(reduced(problem.comm, sum(0.25 * float(f @ (compliance * f)) for f in forces)))
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:

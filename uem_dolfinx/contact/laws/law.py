@@ -18,7 +18,7 @@ from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 #: A number, or a function of place that is given points ``(3, n)`` as drawn and returns ``(n,)``.
 Field: TypeAlias = float | Callable[[Array], npt.ArrayLike]
@@ -74,4 +74,4 @@ def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str
     with agreed(config.comm):
         if value.shape != (len(nodes),) or not given.NOT_NEGATIVE.holds(value).all():
             raise InputError(f"{words}(x) has shape {value.shape}: expected {len(nodes)} numbers, 0 or positive and finite")
-    return value if config.comm.allreduce(int((value > 0).any())) else None
+    return value if reduced(config.comm, int((value > 0).any())) else None
