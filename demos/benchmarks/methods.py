@@ -67,12 +67,12 @@ def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None
         options.setdefault("max_iterations", MOST_BARRIER_ITERATIONS)
         method_of = partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter)
         return uem.UnitedProblem(F, u, method=method_of, **options)
-    rough = [contact.friction for contact in options.get("contacts", ())]
+    frictional = [contact.friction for contact in options.get("contacts", ())]
     for contact in options.get("contacts", ()):
         # springs have friction of their own
         contact.friction = 0.0
     system = partial(
-        PenaltySystem, tags=tags, stiffness=parameter, friction=rough,
+        PenaltySystem, tags=tags, stiffness=parameter, friction=frictional,
         points=SurfacePoints if method == "penalty_surface" else NodePoints,
     )  # fmt: skip
     if method == "augmented":

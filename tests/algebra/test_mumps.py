@@ -46,8 +46,8 @@ def test_room_has_an_end(comm, room, gets, monkeypatch):
     """A factorisation that lacked room gets twice as much as it had, up to the most; then the error tells what MUMPS says."""
     _, problem = pressed(comm, {"pc_type": "cholesky"} | TOO_LITTLE)
     with monkeypatch.context() as m:
-        m.setattr(mumps, "MOST_ROOM", 0)
+        m.setattr(mumps, "MOST_WORKSPACE", 0)
         raised(uem.LinearSolveError, r"MUMPS: INFOG\(1\) = -\d", problem.solve)
     pc = problem.system.solver.pc
     pc.getFactorMatrix().setMumpsIcntl(14, room)
-    assert mumps.more_room(pc) == gets
+    assert mumps.more_workspace(pc) == gets

@@ -28,7 +28,7 @@ def wrong_ones(s, gap, lam=None, *, off=None, movable=None, rounding=0.0, stiffn
     off = np.zeros(len(gap), bool) if off is None else np.array(off)
     movable = np.ones(len(gap), bool) if movable is None else np.array(movable)
     lam = s.lam if lam is None else np.array(lam, dtype=float)
-    return active_set.find_wrong(
+    return active_set.find_violations(
         s, gap, lam, off, movable, np.full(len(gap), stiffness), force_rounding=rounding, gap_rounding=1e-13
     )
 
@@ -87,7 +87,7 @@ def settle(M, q, first, most=100):
         lam, i = np.zeros(len(q)), np.flatnonzero(s.active)
         lam[i] = np.linalg.solve(M[np.ix_(i, i)], -q[i])
         gap = np.where(s.active, 0.0, M @ lam + q)
-        wrong = active_set.find_wrong(s, gap, lam, q != q, q == q, 1 / np.diag(M), force_rounding=1e-9, gap_rounding=1e-9)
+        wrong = active_set.find_violations(s, gap, lam, q != q, q == q, 1 / np.diag(M), force_rounding=1e-9, gap_rounding=1e-9)
         if not wrong.count:
             return lam, rules, number
         rules.append(pivoting.choose(wrong.count, s.active.tobytes()))
@@ -227,7 +227,7 @@ def test_gaps_below_rounding_do_not_activate(size):
     for depth, enters in ((3e-14, False), (3e-13, True)):
         s, gap, none = state([False]), np.array([-depth * size]), np.zeros(1)
         rounding = active_set.GAP_ROUNDING * size
-        wrong = active_set.find_wrong(s, gap, none, none > 0, none == 0, none, force_rounding=0.0, gap_rounding=rounding)
+        wrong = active_set.find_violations(s, gap, none, none > 0, none == 0, none, force_rounding=0.0, gap_rounding=rounding)
         assert wrong.enter.all() == enters
 
 

@@ -54,12 +54,12 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     list(uem.load_steps(problem, 2))
     pair, state, size = contact.pair, contact.pair.trial, problem.config.n_owned
     stick = state.active & state.friction.stick
-    assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().upright.circular
+    assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().frictionless.circular
     made, placed, free = pair.equations(), pair.kinematics, problem.forces.free[:size].ravel()
     kept = made.frictionless.active
     rows, who, normal = rows_of(made.frictionless.select(kept), size)[:, free], made.contactor[kept], made.tangent[kept] < 0
     # no motion that is left opens a gap or moves what sticks
-    P = gathered_matrix(problem.system._rows().upright.P)[free]
+    P = gathered_matrix(problem.system._rows().frictionless.P)[free]
     assert np.abs(rows @ P).max() <= 1e-13 and np.linalg.matrix_rank(P) == free.sum() - len(rows)
     problem.forces.assemble()
     share = placed.force_per_multiplier

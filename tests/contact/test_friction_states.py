@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 
 from uem_dolfinx.contact import friction
-from uem_dolfinx.contact.active_set import Wrong
+from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.state import FrictionState
 
 
@@ -19,7 +19,7 @@ def state(stick, direction):
 
 
 def nothing(n):
-    return Wrong(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
+    return Violations(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
 
 
 def test_tangents_in_free_components():
@@ -49,7 +49,7 @@ def test_stick_and_slip():
     contact = nothing(5)
     contact.release[4] = True
     seen = friction.Seen(np.ones(5), tau, np.full(5, 0.3), slip, np.zeros(5))
-    wrong = friction.find_wrong(contact, s, np.ones(5, bool), seen, np.full(5, 2.0), force_rounding=1e-9, gap_rounding=1e-9)
+    wrong = friction.find_violations(contact, s, np.ones(5, bool), seen, np.full(5, 2.0), force_rounding=1e-9, gap_rounding=1e-9)
     assert wrong.slide.tolist() == [False, True, False, False, False]
     assert wrong.hold.tolist() == [False, False, False, True, False]
     assert wrong.count == 3
@@ -73,7 +73,9 @@ def test_springs_that_are_dragged(way, bound, stick, back):
         slipped = np.where(s.stick, 0.0, way - bound * s.direction[:, 0])
         tau = -(way - slipped)[:, None] * [[1.0, 0.0]]
         seen = friction.Seen(np.ones(8), tau, bound, slipped[:, None] * [[1.0, 0.0]], np.zeros(8))
-        wrong = friction.find_wrong(nothing(8), s, np.ones(8, bool), seen, np.ones(8), force_rounding=1e-12, gap_rounding=1e-12)
+        wrong = friction.find_violations(
+            nothing(8), s, np.ones(8, bool), seen, np.ones(8), force_rounding=1e-12, gap_rounding=1e-12
+        )
         if not wrong.count:
             break
         s = friction.exchange(s, wrong, tau)

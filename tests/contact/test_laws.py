@@ -59,8 +59,8 @@ def test_a_block_slides_at_the_stress_times_its_area(cell, degree, rigid, coupli
 def test_what_sticks_under_tresca_bears_less():
     """Pushed by less than the stress times the area the block sticks; the force is that of a bonded one."""
     held, _ = dragged("quadrilateral", uem.Tresca(10.0), way=1e-3)
-    rough, _ = dragged("quadrilateral", 10.0, way=1e-3)
-    both = [np.array(contact.resultant().force) for contact in (held, rough)]
+    frictional, _ = dragged("quadrilateral", 10.0, way=1e-3)
+    both = [np.array(contact.resultant().force) for contact in (held, frictional)]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-9)
     assert held.dissipation <= 1e-15 * 1e-3 * abs(both[0][0])
 

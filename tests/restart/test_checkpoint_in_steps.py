@@ -84,7 +84,8 @@ def test_one_number_between_steps(folder, monkeypatch):
             self.comm = comm
 
         def __getattr__(self, name):
-            calls.append(name)
+            # what a communicator knows of itself sends nothing
+            calls.extend([name] if callable(getattr(self.comm, name)) else [])
             return getattr(self.comm, name)
 
     checkpoint = uem.Checkpoint(folder / "run", every=100)
@@ -93,10 +94,11 @@ def test_one_number_between_steps(folder, monkeypatch):
     state.collect.append(lambda: calls.append("collect"))
     for _ in range(99):
         checkpoint.step()
-    assert calls == ["allreduce"] * 99
+    assert calls == ["Allreduce"] * (99 if COMM.size > 1 else 0)
     monkeypatch.undo()
+    calls.clear()
     checkpoint.step()
-    assert calls[99:] == ["collect"] and (folder / "run").exists()
+    assert calls == ["collect"] and (folder / "run").exists()
 
 
 def test_sigterm_on_one_rank_ends_all(folder):

@@ -66,8 +66,8 @@ def driven(
     g = b.gdim
     if target is None:
         target = uem.RigidPlane([0.0] * g, [0.0] * (g - 1) + [1.0]) if rigid else b.low
-    rough = {} if mu is None else {"friction": mu}
-    contact = uem.Contact(*((target, b.high) if swap else (b.high, target)), **rough, **(how or {}))
+    frictional = {} if mu is None else {"friction": mu}
+    contact = uem.Contact(*((target, b.high) if swap else (b.high, target)), **frictional, **(how or {}))
     top = fem.Function(b.V)
     sides = [clamp(b.V, b.scene.tag("side", 1, at(1, end)), 1) for end in (0.0, 1.0) if walls]
     bcs = [

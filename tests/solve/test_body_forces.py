@@ -64,9 +64,9 @@ def test_forces_told_from_rounding(length):
         config.displacement[upper] = length * np.array([1.0, 2.0]) * (1.0 + strain * np.sin(config.X[upper] / length))
         b.u.x.scatter_forward()
         forces.assemble()
-        assert (forces.told_apart(False) > 0.0) == told
+        assert (forces.above_rounding(False) > 0.0) == told
     # a soft body's forces are told from its own rounding, not from that of a stiff one
     config.displacement[~upper, 1] = 1e-3 * (config.X[~upper, 1] + length)
     b.u.x.scatter_forward()
     forces.assemble()
-    assert forces.told_apart(False) > 1e-5 * length * 1e-3
+    assert forces.above_rounding(False) > 1e-5 * length * 1e-3

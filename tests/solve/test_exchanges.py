@@ -19,8 +19,8 @@ from helpers import Body, at, blocks, box, clamp, linear, modulus, raised, run, 
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.active_set import Rule, Wrong
-from uem_dolfinx.contact.friction import FrictionWrong, Seen
+from uem_dolfinx.contact.active_set import Rule, Violations
+from uem_dolfinx.contact.friction import FrictionViolations, Seen
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.solve.exchanges import ALONG, Exchanges
 
@@ -30,12 +30,12 @@ COMM = MPI.COMM_WORLD
 class Nodes:
     """A pair of which one knows the places of its contactors in the drawing and whether they are active; each rank has its own part."""
 
-    def __init__(self, X, name="upper on lower", rough=False):
+    def __init__(self, X, name="upper on lower", frictional=False):
         X = np.asarray(X, dtype=float)[COMM.rank :: COMM.size]
         config = SimpleNamespace(
             comm=COMM, X=X, gdim=X.shape[1], size=1.0, describe=lambda i: "(" + ", ".join(f"{c:.6g}" for c in X[i]) + ")"
         )
-        self.config, self.nodes, self.name, self.frictional, self.friction = config, np.arange(len(X)), name, rough, None
+        self.config, self.nodes, self.name, self.frictional, self.friction = config, np.arange(len(X)), name, frictional, None
         self.active, self.calmed, self.n_active = np.zeros(len(X), bool), False, len(X)
 
     @property
@@ -55,7 +55,7 @@ def wrong(pair, which, alike=True):
     """Contactors that would be released, all as wrong as each other or not."""
     here = pair.of_all(which)
     size = np.ones(len(here)) if alike else 1.0 + pair.of_all(np.arange(len(which)))
-    return Wrong(np.zeros(len(here), bool), here, np.where(here, size, 0.0))
+    return Violations(np.zeros(len(here), bool), here, np.where(here, size, 0.0))
 
 
 def all_released(pair, chosen):
@@ -88,8 +88,8 @@ def test_the_order_does_not_depend_on_ranks():
 def test_who_goes_in_a_circle_is_named():
     """Contacts and places of the contactors that the last rule has exchanged, three at most and how many more, in one order."""
     X = [(float(i), 0.5) for i in range(6)]
-    for rough, error in ((False, uem.ConvergenceError), (True, uem.FrictionError)):
-        pair = Nodes(X, rough=rough)
+    for frictional, error in ((False, uem.ConvergenceError), (True, uem.FrictionError)):
+        pair = Nodes(X, frictional=frictional)
         exchanges = Exchanges([pair])
 
         def exchange_for_ever(exchanges=exchanges, pair=pair):
@@ -130,7 +130,7 @@ def test_convex_until_it_gets_better():
 
 def test_limits_are_held_until_they_settle():
     """A mechanism takes back the exchange that has made it; limits are held until they change by less than a tenth of the largest."""
-    pair = Nodes([(float(i), 0.0) for i in range(4)], rough=True)
+    pair = Nodes([(float(i), 0.0) for i in range(4)], frictional=True)
     n, held = len(pair.nodes), []
 
     def hold_limits(lam):
@@ -142,7 +142,7 @@ def test_limits_are_held_until_they_settle():
     def seen(lam, slide=False):
         none, zero = np.zeros(n, bool), np.zeros(n)
         by = Seen(np.full(n, lam), np.zeros((n, 2)), zero, np.zeros((n, 2)), zero)
-        return [FrictionWrong(none, none, zero + slide, none | slide, none, none, by)]
+        return [FrictionViolations(none, none, zero + slide, none | slide, none, none, by)]
 
     pair.trial, pair.taken = PairState.initial(n, 2), []
     pair.take = pair.taken.append
@@ -315,7 +315,7 @@ def test_signals_are_heeded_between_exchanges():
     d = driven(mu=0.3)
     d.to(0.0, -0.01)
     heeded = []
-    d.problem.progress.heed = lambda comm: heeded.append(comm)
+    d.problem.progress.check_signals = lambda comm: heeded.append(comm)
     history = d.to(0.05, -0.01)
     solves = sum(i.exchanges + 1 for i in history[:-1])
     assert solves > len(history) - 1

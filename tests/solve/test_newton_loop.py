@@ -21,7 +21,7 @@ def vector(value):
 class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
 
-    linear = tolerant = in_contact = rough = inexact = convex = False
+    linear = tolerant = in_contact = frictional = inexact = convex = False
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0
@@ -46,7 +46,7 @@ class OneUnknown:
             closed=True,
         )  # fmt: skip
 
-    def forces_told_apart(self):
+    def forces_above_rounding(self):
         return 0.0
 
     def differentiate(self, first):

@@ -239,7 +239,7 @@ class UnitedSolver:
         with timed("factorisation or preconditioner set-up"), self._in_database(**options):
             if self._condensed.factorise(P, Q, K, G, pc, symmetric):
                 return True
-        more = mumps.more_room(pc)
+        more = mumps.more_workspace(pc)
         if more:
             logger.debug("MUMPS lacked room, and gets more: %s", more)
             return self._factorise_inside(P, Q, K, G, **options | more)
@@ -329,7 +329,7 @@ class UnitedSolver:
         with self._in_database(**options):
             self.ksp.setUp()
             self.ksp.setUpOnBlocks()
-        more = mumps.more_room(self.pc)
+        more = mumps.more_workspace(self.pc)
         if more:
             logger.debug("MUMPS lacked room, and gets more: %s", more)
             operators = self.ksp.getOperators()

@@ -20,9 +20,9 @@ from uem_dolfinx.arrays import Array, Ints
 FACTORISATIONS = ("cholesky", "lu")
 #: MUMPS has at most so much room beyond what it foresees; a matrix that needs more is better not factorised.
 #: [convention; per cent; test_mumps.py::test_room_has_an_end]
-MOST_ROOM = 2000
+MOST_WORKSPACE = 2000
 #: Ends of a factorisation that lacked room: for integers, for entries, for messages that were sent and received.
-SHORT_OF_ROOM = (-8, -9, -17, -20)
+SHORT_OF_WORKSPACE = (-8, -9, -17, -20)
 #: The option by which the determinant is told.
 TELLS_SIGN = {"mat_mumps_icntl_33": 1}
 
@@ -32,7 +32,7 @@ def solves(pc: PETSc.PC) -> bool:
     return bool(pc.getType() in FACTORISATIONS and pc.getFactorSolverType() == "mumps")
 
 
-def more_room(pc: PETSc.PC) -> dict[str, Any]:
+def more_workspace(pc: PETSc.PC) -> dict[str, Any]:
     """PETSc's options by which a factorisation that lacked room gets twice as much; none if it did not, or has had enough.
 
     On several ranks MUMPS works in the order in which messages come: what it had foreseen does not always do, for the same matrix.
@@ -42,7 +42,7 @@ def more_room(pc: PETSc.PC) -> dict[str, Any]:
     factors = pc.getFactorMatrix()
     # what is foreseen is 100 per cent
     room = 2 * factors.getMumpsIcntl(14) + 100
-    short = factors.getMumpsInfog(1) in SHORT_OF_ROOM and room <= MOST_ROOM
+    short = factors.getMumpsInfog(1) in SHORT_OF_WORKSPACE and room <= MOST_WORKSPACE
     return {"mat_mumps_icntl_14": room} if short else {}
 
 

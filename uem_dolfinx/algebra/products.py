@@ -78,7 +78,7 @@ class UnitedMatrix:
         begins = self._A is None or self._begins
         places, there = self._find(self._K if begins else self._A, changes)
         if begins or reduced(self.space.comm, int(not there.all())):
-            self._make_room(begins, changes, P, Q, G)
+            self._make_places(begins, changes, P, Q, G)
             places, _ = self._find(self._A, changes)
         values = self._A.values
         if self._changed is None:
@@ -202,7 +202,7 @@ class UnitedMatrix:
         row, column = lines[i] - n + self._first // g, self._K.columns[places] // g
         return Blocks(row, column.astype(np.int64), np.column_stack([places, width]))
 
-    def _make_room(self, begins: bool, changes: Blocks, P: Restriction, Q: Restriction, G: Blocks | None) -> None:
+    def _make_places(self, begins: bool, changes: Blocks, P: Restriction, Q: Restriction, G: Blocks | None) -> None:
         """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective)."""
         comm = self.space.comm
         wanted = self._missing(changes)

@@ -2,8 +2,8 @@
 
 The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are settled on the linearised problem, before anything
 moves: its solution foretells gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again
-(block pivoting; Judice and Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Wrong.count`` and
-``Wrong.worst`` over them between ``find_wrong`` and ``exchange``.
+(block pivoting; Judice and Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` and
+``Violations.worst`` over them between ``find_violations`` and ``exchange``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ PATIENCE = 30
 
 
 @dataclass(frozen=True)
-class Wrong:
+class Violations:
     """Contactors that break the conditions of contact, each ``(n,)``.
 
     Attributes:
@@ -69,21 +69,21 @@ class Wrong:
         """All of them ``(n,)``."""
         return self.enter | self.release
 
-    def among(self, kept: Bools) -> Wrong:
+    def among(self, kept: Bools) -> Violations:
         """Those alone that are ``kept (n,)``."""
-        return Wrong(self.enter & kept, self.release & kept, np.where(kept, self.violation, 0.0))
+        return Violations(self.enter & kept, self.release & kept, np.where(kept, self.violation, 0.0))
 
-    def among_the_worst(self, worst: float) -> Wrong:
+    def among_the_worst(self, worst: float) -> Violations:
         """Those alone whose violation equals the ``worst`` of all."""
         return self.among(self.violation >= (1.0 - TIED) * worst)
 
-    def of_contact(self) -> Wrong:
+    def of_contact(self) -> Violations:
         """Those alone that break the conditions of contact."""
         return self
 
-    def on_first_touch(self, gap: Array, depth: float) -> Wrong:
+    def on_first_touch(self, gap: Array, depth: float) -> Violations:
         """Those alone that enter by so much at least, a length, besides all that are released; ``gap (n,)`` decides on contact."""
-        return Wrong(self.enter & (gap <= -depth), self.release, self.violation)
+        return Violations(self.enter & (gap <= -depth), self.release, self.violation)
 
 
 def deep_enough(span: float, gdim: int) -> float:
@@ -102,7 +102,7 @@ def deep_enough(span: float, gdim: int) -> float:
     return max(DEEP_ENOUGH, 1.0 - 1.0 / (np.log(4.0 * GIVING_WAY / (HALF_WIDTH * min(span, 1.0))) - 0.5))
 
 
-def find_wrong(
+def find_violations(
     state: PairState,
     gap: Array,
     lam: Array,
@@ -112,7 +112,7 @@ def find_wrong(
     *,
     force_rounding: Array | float,
     gap_rounding: float,
-) -> Wrong:
+) -> Violations:
     """Find the contactors that break the conditions.
 
     Args:
@@ -128,12 +128,12 @@ def find_wrong(
     release = state.active & ((lam < -force_rounding) | ~movable)
     enter = ~state.active & ~off & movable & (gap < -gap_rounding)
     violation = np.where(enter, -gap * stiffness, np.where(release, np.where(movable, -lam, np.inf), 0.0))
-    return Wrong(enter, release, violation)
+    return Violations(enter, release, violation)
 
 
-def exchange(state: PairState, wrong: Wrong) -> PairState:
+def exchange(state: PairState, violated: Violations) -> PairState:
     """The state in which the wrong contactors have changed sides; forces stay until they are read anew."""
-    active = (state.active | wrong.enter) & ~wrong.release
+    active = (state.active | violated.enter) & ~violated.release
     return replace(state, active=active, passed=state.passed & ~active)
 
 

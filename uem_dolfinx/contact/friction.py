@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.active_set import Wrong
+from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.state import FrictionState
 
 #: A tangential direction of which prescribed components leave less than this part is prescribed.
@@ -53,7 +53,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class FrictionWrong(Wrong):
+class FrictionViolations(Violations):
     """Contactors that break the conditions of contact or of friction, each ``(n,)``.
 
     Attributes:
@@ -78,17 +78,17 @@ class FrictionWrong(Wrong):
         """All of them ``(n,)``."""
         return super().which | self.slide | self.hold
 
-    def among(self, kept: Bools) -> FrictionWrong:
+    def among(self, kept: Bools) -> FrictionViolations:
         """Those alone that are ``kept (n,)``."""
         own = super().among(kept)
         return replace(self, **vars(own), slide=self.slide & kept, hold=self.hold & kept)
 
-    def of_contact(self) -> FrictionWrong:
+    def of_contact(self) -> FrictionViolations:
         """Those alone that break the conditions of contact: they enter or are released."""
         return self.among(self.enter | self.release)
 
-    def on_first_touch(self, gap: Array, depth: float) -> FrictionWrong:
-        """As that of ``Wrong``; friction changes with what is there."""
+    def on_first_touch(self, gap: Array, depth: float) -> FrictionViolations:
+        """As that of ``Violations``; friction changes with what is there."""
         return replace(self, **vars(super().on_first_touch(gap, depth)))
 
 
@@ -109,8 +109,8 @@ def along(directions: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("nrg,nr->ng", directions, np.einsum("nrg,ng->nr", directions, vectors)))
 
 
-def find_wrong(
-    wrong: Wrong,
+def find_violations(
+    violated: Violations,
     state: FrictionState,
     frictional: Bools,
     seen: Seen,
@@ -118,11 +118,11 @@ def find_wrong(
     *,
     force_rounding: Array | float,
     gap_rounding: float,
-) -> FrictionWrong:
+) -> FrictionViolations:
     """Add the contactors that break the conditions of friction to those that break the conditions of contact.
 
     Args:
-        wrong: contactors that break the conditions of contact.
+        violated: contactors that break the conditions of contact.
         state: of the contactors.
         frictional: those that friction acts on ``(n,)``.
         seen: forces and slips.
@@ -130,29 +130,29 @@ def find_wrong(
         force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
         gap_rounding: lengths below it are zero.
     """
-    staying = frictional & ~wrong.release
+    staying = frictional & ~violated.release
     excess = np.linalg.norm(seen.tau, axis=1) - seen.bound
     driven = seen.forced > gap_rounding
     slide = staying & state.stick & ((excess > force_rounding) | driven)
     forward = np.einsum("ng,ng->n", seen.slip, state.direction)
     hold = staying & ~state.stick & ((forward < -gap_rounding) | ~state.direction.any(axis=1))
     excess = np.where(driven, seen.forced * stiffness, excess)
-    violation = np.where(slide, excess, np.where(hold, -forward * stiffness, wrong.violation))
-    return FrictionWrong(wrong.enter, wrong.release, violation, slide, hold, driven, seen)
+    violation = np.where(slide, excess, np.where(hold, -forward * stiffness, violated.violation))
+    return FrictionViolations(violated.enter, violated.release, violation, slide, hold, driven, seen)
 
 
-def exchange(state: FrictionState, wrong: FrictionWrong, tau: Array) -> FrictionState:
+def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> FrictionState:
     """The state in which contactors that break the conditions of friction have changed between stick and slip.
 
     Args:
         state: of the contactors.
-        wrong: those to change.
+        violated: those to change.
         tau: contact force along the target ``(n, gdim)``; it points against the slip of those that begin to.
     """
     size = np.linalg.norm(tau, axis=1, keepdims=True)
-    direction = np.where(wrong.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
-    direction[wrong.hold] = 0.0
-    return replace(state, stick=(state.stick | wrong.hold) & ~wrong.slide, direction=direction)
+    direction = np.where(violated.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
+    direction[violated.hold] = 0.0
+    return replace(state, stick=(state.stick | violated.hold) & ~violated.slide, direction=direction)
 
 
 def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:

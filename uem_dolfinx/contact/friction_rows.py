@@ -20,7 +20,7 @@ def with_friction(
     own: Constraints,
     frame: Frame,
     *,
-    rubbing: Bools,
+    of_friction: Bools,
     stick: Bools,
     directions: Array,
     slope: Array,
@@ -33,7 +33,7 @@ def with_friction(
     Args:
         own: equations across the target.
         frame: directions along it and relative motions.
-        rubbing: active contactors that friction acts on ``(n,)``.
+        of_friction: active contactors that friction acts on ``(n,)``.
         stick: those that stick when they are ``(n,)``.
         directions: of slip ``(n, gdim)``.
         slope: by how much the limit of friction grows with the multiplier across the target ``(n,)``.
@@ -52,15 +52,15 @@ def with_friction(
         row, weight = place[ties.row[there]], ties.weight[there, None]
         return UnitingEquations(test.node[across], t, gap, active, row, ties.followed[there], weight * t[row])
 
-    T, rubbing, stick = frame.free_tangents[who], rubbing[who], stick[who]
+    T, of_friction, stick = frame.free_tangents[who], of_friction[who], stick[who]
     away = np.einsum("nrg,ng->nr", T, frame.away[who])
-    resisted = [rubbing & T[:, r].any(axis=1) for r in range(g - 1)]
+    resisted = [of_friction & T[:, r].any(axis=1) for r in range(g - 1)]
 
     def with_those_along(rows: UnitingEquations, ties: Ties) -> UnitingEquations:
         return UnitingEquations.join([rows, *(along(T[:, r], away[:, r], resisted[r] & stick, ties) for r in range(g - 1))], g)
 
     frictionless = tilted = trial = with_those_along(test, frame.ties)
-    slipping = rubbing & ~stick
+    slipping = of_friction & ~stick
     tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
     slips = reduced(comm, bool(tilt.any()), op=MPI.LOR)
     # rows of contactors that stick are symmetric where they follow by the weights of now

@@ -234,7 +234,7 @@ class Interface:
         """Gaps that decide on contact, to first order in an increment; see ``Kinematics.predicted`` (collective)."""
         return self.kinematics.predicted(du)
 
-    def wrong(
+    def violated(
         self,
         gap: Array,
         seen: Traction,
@@ -243,7 +243,7 @@ class Interface:
         gap_rounding: float,
         swept: bool,
         du: Array | None = None,
-    ) -> active_set.Wrong:
+    ) -> active_set.Violations:
         """Contactors that break the conditions of contact with such gaps and forces (collective).
 
         Args:
@@ -263,25 +263,25 @@ class Interface:
         # the facets of a corner are let go of one by one, which ``follow`` does
         pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
         rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
-        wrong = active_set.find_wrong(
+        violated = active_set.find_violations(
             self.trial, gap, pulled, off, self.movable & ~apart, stiffness, force_rounding=force_rounding, gap_rounding=rounding
         )
         if self.friction is None:
-            return wrong
-        return self.friction.wrong(wrong, self.trial, seen, stiffness, (force_rounding, rounding), du)
+            return violated
+        return self.friction.violated(violated, self.trial, seen, stiffness, (force_rounding, rounding), du)
 
-    def exchange(self, wrong: active_set.Wrong, ahead: bool) -> bool:
+    def exchange(self, violated: active_set.Violations, ahead: bool) -> bool:
         """Let wrong contactors change sides, and those that are to follow them if ``ahead`` (collective): whether there are any."""
 
         def enter(state: PairState) -> PairState:
             self.trial = state
-            self._set_active(active_set.exchange(state, wrong))
+            self._set_active(active_set.exchange(state, violated))
             return self.trial
 
         if self.friction is None:
             enter(self.trial)
             return False
-        self.trial, led = self.friction.exchange(wrong, self.trial, self.committed, self.kinematics, ahead, enter)
+        self.trial, led = self.friction.exchange(violated, self.trial, self.committed, self.kinematics, ahead, enter)
         return led
 
     def calm(self, which: Bools) -> bool:

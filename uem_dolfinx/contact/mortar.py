@@ -152,7 +152,7 @@ class Mortar(Contactors):
             pieces = self._over_segments(planes, x[facets], facets, reach)
         else:
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
-        segments, pairs, to_gap, N, nodes, y, bend, facing = pieces
+        segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
         covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
         dofs = surface.dofs[facets]
@@ -162,7 +162,7 @@ class Mortar(Contactors):
         other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
             segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
-            surface.shape, other, x[facets], y, surface.sign[facets], bend,
+            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator,
         )  # fmt: skip
         rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
         return replace(rows, facing=facing)
@@ -251,7 +251,7 @@ class Mortar(Contactors):
             parts = parts + more
             equations, length = self.elimination.derivatives(plain, beside)
         share = np.where(is_covered, size / scale, 1.0)
-        weights = upright = slope = push = whole = None
+        weights = frictionless = slope = push = whole = None
         if self.frictional:
             along = self.elimination.of_themselves(plain, beside)
             slope = np.linalg.norm(along, axis=1)
@@ -259,7 +259,7 @@ class Mortar(Contactors):
             pushed = config.add_at_owners(own[f, i], pushed)[self.nodes]
             taken = np.bincount(beside[0], minlength=n) > 0
             push = np.where(is_covered, np.where(taken, pushed[:, 1], pushed[:, 0]) / scale, 1.0)
-            upright = along / slope[:, None]
+            frictionless = along / slope[:, None]
             whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
             means = [
                 terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
@@ -270,7 +270,7 @@ class Mortar(Contactors):
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
             weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
         return WeightedRows(
-            equations, length, plain, at, facets, is_covered, ratio, size, stretch, share, weights, upright, slope, push, parts, whole,
+            equations, length, plain, at, facets, is_covered, ratio, size, stretch, share, weights, frictionless, slope, push, parts, whole,
         )  # fmt: skip
 
     def begin_step(self) -> None:

@@ -44,7 +44,7 @@ class Pieces(NamedTuple):
     N: Array
     opposite: Ints
     y: Array
-    bend: Array | None
+    shape_operator: Array | None
     facing: Ints
 
 

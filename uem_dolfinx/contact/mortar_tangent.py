@@ -57,7 +57,7 @@ class SegmentPoints:
         x: nodes of the contactor facets ``(m, nc, gdim)``.
         y: of the target facets, pair by pair ``(k, nt, gdim)``.
         sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
-        bend: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
+        shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
     """
 
     segments: Segments
@@ -76,7 +76,7 @@ class SegmentPoints:
     x: Array
     y: Array
     sign: Array
-    bend: Array | None
+    shape_operator: Array | None
 
     @cached_property
     def turning(self) -> Array:
@@ -191,10 +191,10 @@ class SegmentPoints:
             sides = self.sides(self.other, pressing).between()
             step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
             half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
-        elif self.bend is not None:
+        elif self.shape_operator is not None:
             # there are as many pairs as facets, and points in their order
-            bend = self.bend[np.isin(self.segments.pair, pressing)]
-            for row, unit in zip(np.moveaxis(bend, 1, 0), np.eye(g)):
+            shape_operator = self.shape_operator[np.isin(self.segments.pair, pressing)]
+            for row, unit in zip(np.moveaxis(shape_operator, 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
         if self.shape.degree == 2:
             gaps = motions.along(t) + motions.of_area(((2 if nt else 1) * gap / size[pair])[:, None] * n[pair])
@@ -275,8 +275,8 @@ class SegmentPoints:
             change = np.zeros(slide.shape)
             change[:, motions.nc :] = -tab.dN[:, :, f, None] * t[:, None]
             if not shape.affine:
-                bend = np.einsum("qg,qag,qae->qe", t, y, tab.ddN[:, :, f])
-                change -= 0.5 * sum(bend[:, e, None, None] * other for e, other in enumerate(slides))
+                shape_operator = np.einsum("qg,qag,qae->qe", t, y, tab.ddN[:, :, f])
+                change -= 0.5 * sum(shape_operator[:, e, None, None] * other for e, other in enumerate(slides))
             yield slide, change
 
     def sides(self, shape: FacetShape, which: Ints, cuts: bool = False) -> Sides:

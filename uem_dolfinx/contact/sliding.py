@@ -14,7 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import friction
-from uem_dolfinx.contact.active_set import GAP_ROUNDING, Wrong
+from uem_dolfinx.contact.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.anchors import anchored, anchors_of, way_since
 from uem_dolfinx.contact.corners import friction_in
 from uem_dolfinx.contact.frame import Frame
@@ -188,13 +188,19 @@ class Sliding:
         now = friction.come_and_go(_of(state), was, state.active & (value > 0), value > 0)
         return replace(state, friction=now)
 
-    def wrong(
-        self, wrong: Wrong, state: PairState, seen: Traction, stiffness: Array, rounding: tuple[Array, float], du: Array | None
-    ) -> friction.FrictionWrong:
+    def violated(
+        self,
+        violated: Violations,
+        state: PairState,
+        seen: Traction,
+        stiffness: Array,
+        rounding: tuple[Array, float],
+        du: Array | None,
+    ) -> friction.FrictionViolations:
         """Add those that break the conditions of friction (collective).
 
         Args:
-            wrong: contactors that break the conditions of contact.
+            violated: contactors that break the conditions of contact.
             state: of the interface.
             seen: contact forces, here or predicted.
             stiffness: of the contactors ``(n,)``.
@@ -209,7 +215,7 @@ class Sliding:
         turned = replace(_of(state), direction=self.directions(state))
         forces, lengths = rounding
         who = self.active(state)
-        return friction.find_wrong(wrong, turned, who, by, stiffness, force_rounding=forces, gap_rounding=lengths)
+        return friction.find_violations(violated, turned, who, by, stiffness, force_rounding=forces, gap_rounding=lengths)
 
     @property
     def _lost(self) -> Bools:
@@ -217,7 +223,7 @@ class Sliding:
 
     def exchange(
         self,
-        wrong: Wrong,
+        violated: Violations,
         state: PairState,
         committed: PairState,
         kinematics: Kinematics,
@@ -227,7 +233,7 @@ class Sliding:
         """Let wrong contactors change between stick and slip (collective).
 
         Args:
-            wrong: contactors to change.
+            violated: contactors to change.
             state: of the interface.
             committed: that of the last step.
             kinematics: of the contactors.
@@ -237,24 +243,24 @@ class Sliding:
         Returns:
             The state, and whether any slip ahead.
         """
-        assert isinstance(wrong, friction.FrictionWrong)
-        seen, pivot, share = wrong.seen, self.pivot, kinematics.force_per_multiplier[:, None]
-        tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, wrong.driven
+        assert isinstance(violated, friction.FrictionViolations)
+        seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
+        tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
         space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
         if ahead:
-            taken, tau = self._next_in_line(wrong, state, kinematics.points, tau)
+            taken, tau = self._next_in_line(violated, state, kinematics.points, tau)
             pivot = replace(pivot, taken=taken)
-        slide = wrong.slide | pivot.taken if ahead else wrong.slide
+        slide = violated.slide | pivot.taken if ahead else violated.slide
         # one whose slip turns slips the other way first: where a surface turns back they would else follow one after the other; if it
         # turns again it is held: where the bodies give way more than the surface has moved it would turn for ever. Nodes in space that
         # begin to slip turn as long as the force q is beyond the cone; bodies that slide without end are held
         q, beyond = pivot.stiffness[:, None] * slip - tau / share, ~pivot.turned
         if space:
             beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(lam) / share[:, 0])
-        turns = wrong.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
+        turns = violated.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
         # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
-        back = (wrong.enter & (committed.active | pivot.released | forced) | wrong.slide & forced) & (size > 0)
-        changed = replace(wrong, slide=slide, hold=wrong.hold & ~turns)
+        back = (violated.enter & (committed.active | pivot.released | forced) | violated.slide & forced) & (size > 0)
+        changed = replace(violated, slide=slide, hold=violated.hold & ~turns)
         state = enter(replace(state, friction=friction.exchange(_of(state), changed, tau)))
         led_by = pivot.stiffness[:, None] * slip if self.config.gdim == 3 else slip
         way = np.where((turns & ~forced)[:, None] & space, q, led_by)
@@ -263,16 +269,18 @@ class Sliding:
         q, of_q, led = pivot.q.copy(), pivot.tau.copy(), slide | back | turns
         q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
-        released, turned, begun = pivot.released | wrong.release, pivot.turned | turns, pivot.begun | slide
+        released, turned, begun = pivot.released | violated.release, pivot.turned | turns, pivot.begun | slide
         self.pivot = replace(pivot, released=released, turned=turned, begun=begun, q=q, tau=of_q)
         return state, ahead and bool(reduced(self.config.comm, pivot.taken.any(), op=MPI.LOR))
 
-    def _next_in_line(self, wrong: friction.FrictionWrong, state: PairState, points: Array, tau: Array) -> tuple[Bools, Array]:
+    def _next_in_line(
+        self, violated: friction.FrictionViolations, state: PairState, points: Array, tau: Array
+    ) -> tuple[Bools, Array]:
         """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
-        stick, begin = self.active(state) & _of(state).stick, wrong.slide & ~wrong.driven
+        stick, begin = self.active(state) & _of(state).stick, violated.slide & ~violated.driven
         back = bool((self.pivot.taken & stick).any())
         near, force = self.pivot.front.move(points[begin], tau[begin], back, points)
-        near &= stick & ~begin & ~wrong.release
+        near &= stick & ~begin & ~violated.release
         return near, np.where(near[:, None], self.frame.tangential(force), tau)
 
     def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
@@ -305,7 +313,7 @@ class Sliding:
         return with_friction(
             own,
             self.frame,
-            rubbing=self.active(state),
+            of_friction=self.active(state),
             stick=_of(state).stick,
             directions=self.directions(state),
             slope=self._cone(state)[1] * kinematics.cone,

@@ -21,7 +21,7 @@ Renumber = Callable[[Ints], Ints]
 #: Attributes that number facets.
 FACETS = ("facet", "held", "friction_facet")
 #: Before the names of what friction remembers, in checkpoints.
-RUBBING = "friction_"
+OF_FRICTION = "friction_"
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class PairState:
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
         if self.friction is not None:
-            kept |= {RUBBING + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
+            kept |= {OF_FRICTION + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
         return {name: _renumbered(name, array, keys_of) for name, array in kept.items()}
 
     @classmethod
@@ -187,8 +187,12 @@ class PairState:
             facets_of: present numbers of facets, from what tells them in any partition ``(k,)``.
         """
         arrays = {name: _renumbered(name, np.array(array), facets_of) for name, array in kept.items()}
-        rubbing = {name: array for name, array in arrays.items() if name.startswith(RUBBING)}
-        friction = FrictionState(**{name.removeprefix(RUBBING): array for name, array in rubbing.items()}) if rubbing else None
+        of_friction = {name: array for name, array in arrays.items() if name.startswith(OF_FRICTION)}
+        friction = (
+            FrictionState(**{name.removeprefix(OF_FRICTION): array for name, array in of_friction.items()})
+            if of_friction
+            else None
+        )
         own = [f.name for f in fields(cls) if f.name != "friction"]
         return cls(**{name: arrays[name] for name in own}, friction=friction)
 

@@ -120,7 +120,7 @@ class FacetProjection:
         x: positions of the facet's nodes ``(n, nn, gdim)``.
         dN: derivatives of the weights ``(n, nn, fdim)``.
         ddN: second derivatives ``(n, nn, fdim, fdim)``.
-        bend: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero where the normal is the facet's.
+        shape_operator: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero where the normal is the facet's.
     """
 
     gap: Array
@@ -136,7 +136,7 @@ class FacetProjection:
     x: Array
     dN: Array
     ddN: Array
-    bend: Array
+    shape_operator: Array
 
     @property
     def facet_size(self) -> Array:
@@ -177,30 +177,30 @@ class FacetProjection:
         return np.concatenate([ds[:, None], -on_target], axis=1).reshape(k, size, size)
 
     def _at(self, which: Ints) -> list[Array]:
-        return [getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "bend")]
+        return [getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "shape_operator")]
 
 
-def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array) -> Array:
+def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, shape_operator: Array) -> Array:
     """Second derivatives of the gap ``(k, (1 + nn) g, (1 + nn) g)``; arguments as the fields of ``FacetProjection``.
 
     A side of a facet is served too: ``dN`` then has one column, and ``n`` is any direction across the side.
     """
-    _, m, b, N, D, L = _foot_derivatives(n, g, w, dN, ddN, x, bend)
+    _, m, b, N, D, L = _foot_derivatives(n, g, w, dN, ddN, x, shape_operator)
     H = -np.einsum("kfi,kfj->kij", D, N)
     H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
     return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
 
 
 def _foot_derivatives(
-    n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, bend: Array
+    n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, shape_operator: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Tangents, their products m, bend b, and the rows N, D and ``N + b D``, each ``(k, fdim, ...)``; see ``hessians``."""
+    """Tangents, their products m, shape operator b, and the rows N, D and ``N + b D``, each ``(k, fdim, ...)``; see ``hessians``."""
     k, nn, fdim = dN.shape
     gdim = n.shape[1]
     size = (1 + nn) * gdim
     t = np.einsum("kaf,kag->kfg", dN, x)
     m = np.einsum("kfg,keg->kfe", t, t)
-    slope = np.einsum("kfg,keg->kfe", t, bend)
+    slope = np.einsum("kfg,keg->kfe", t, shape_operator)
     b = np.einsum("kg,kag,kafe->kfe", n, x, ddN) - 0.5 * (slope + slope.transpose(0, 2, 1))
     # rows over (contactor, nodes) x gdim
     N = np.zeros((k, fdim, 1 + nn, gdim))

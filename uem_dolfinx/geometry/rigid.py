@@ -56,7 +56,7 @@ class RigidProjection:
 
     Attributes:
         points: where it was taken ``(n, gdim)``.
-        bend: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
+        shape_operator: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
         motion: of the surface when it was taken; None where it was drawn.
     """
 
@@ -67,7 +67,7 @@ class RigidProjection:
     facet: Ints
     beyond: Array
     points: Array
-    bend: Array
+    shape_operator: Array
     motion: Motion | None = None
 
     @property
@@ -91,11 +91,11 @@ class RigidProjection:
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap ``(k, gdim, gdim)``."""
-        return self.bend[which]
+        return self.shape_operator[which]
 
     def turnings(self, which: Ints, s: Array) -> Array:
         """Derivative of tangents ``s (k, gdim)``, which turn with the normal ``(k, gdim, gdim)``."""
-        return -np.einsum("kg,kh,khi->kgi", self.normal[which], s, self.bend[which])
+        return -np.einsum("kg,kh,khi->kgi", self.normal[which], s, self.shape_operator[which])
 
 
 class RigidSurface:
@@ -198,25 +198,25 @@ class RigidSurface:
         with np.errstate(divide="ignore", invalid="ignore"):
             normal = slope / length[:, None]
             gap = self._asked("distance", self.distance, X, (n,)) / length
-        bend = self._bend(X, normal, length)
+        shape_operator = self._shape_operator(X, normal, length)
         if motion is not None:
-            normal, bend = normal @ motion.Q.T, motion.Q @ bend @ motion.Q.T
+            normal, shape_operator = normal @ motion.Q.T, motion.Q @ shape_operator @ motion.Q.T
         return RigidProjection(
             gap, normal, np.zeros((n, 0), np.int64), np.zeros((n, 0)), np.zeros(n, np.int64), np.zeros((n, g)), points.copy(),
-            bend, motion,
+            shape_operator, motion,
         )  # fmt: skip
 
     def follow(self, points: Array, old: RigidProjection) -> RigidProjection:
         """Gaps in the tangent planes of an earlier projection, which move with the surface."""
-        touched, normal, bend = old.points, old.normal, old.bend
+        touched, normal, shape_operator = old.points, old.normal, old.shape_operator
         if self.motion is not old.motion:
             g = points.shape[1]
             still = Motion.none(g)
             then, now = old.motion or still, self.motion or still
             Q = now.Q @ then.Q.T
-            touched, normal, bend = now.carry(then.back(touched)), normal @ Q.T, Q @ bend @ Q.T
+            touched, normal, shape_operator = now.carry(then.back(touched)), normal @ Q.T, Q @ shape_operator @ Q.T
         gap = old.gap + np.einsum("ng,ng->n", normal, points - touched)
-        return replace(old, gap=gap, normal=normal, points=points.copy(), bend=bend, motion=self.motion)
+        return replace(old, gap=gap, normal=normal, points=points.copy(), shape_operator=shape_operator, motion=self.motion)
 
     def continued(self, projection: RigidProjection, which: Ints) -> RigidProjection:
         """The surface has no end."""
@@ -234,7 +234,7 @@ class RigidSurface:
         """The surface has no facets to number."""
         return keys
 
-    def _bend(self, points: Array, normal: Array, length: Array) -> Array:
+    def _shape_operator(self, points: Array, normal: Array, length: Array) -> Array:
         """``t . grad^2 phi . t / |grad phi|`` in the tangent plane."""
         n, g = points.shape
         if self.hessian is not None:

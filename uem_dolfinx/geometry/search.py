@@ -261,9 +261,9 @@ class MeshTarget:
         use_average = np.full(len(points), True) if self.averaged else at_side & (on_side & ~is_open).any(axis=1)
         use_average &= length[:, 0] > 0
         normal = np.where(use_average[:, None], averaged_normal, facet_normal)
-        bend = np.einsum("naf,nag->nfg", tab.dN, feet.nodal_normals) / divisor[:, :, None]
-        bend -= np.einsum("nfg,ng,nh->nfh", bend, averaged_normal, averaged_normal)
-        bend[~use_average] = 0.0
+        shape_operator = np.einsum("naf,nag->nfg", tab.dN, feet.nodal_normals) / divisor[:, :, None]
+        shape_operator -= np.einsum("nfg,ng,nh->nfh", shape_operator, averaged_normal, averaged_normal)
+        shape_operator[~use_average] = 0.0
         # along an averaged normal, which leans, the way to the facet is longer than to its closest point
         lean = np.einsum("ng,ng->n", normal, facet_normal)
         gap = np.einsum("ng,ng->n", facet_normal, away) / np.where(lean > LEAST_LEAN, lean, 1.0)
@@ -274,7 +274,20 @@ class MeshTarget:
         from_end = np.where(is_open, self.shape.side_distances(xi), np.inf).min(axis=1, initial=np.inf)
         from_end[at_end] = 0.0
         return FacetProjection(
-            gap, normal, feet.nodes, tab.N, feet.facet, beyond, from_end, xi, foot, averaged_normal, x, tab.dN, tab.ddN, bend
+            gap,
+            normal,
+            feet.nodes,
+            tab.N,
+            feet.facet,
+            beyond,
+            from_end,
+            xi,
+            foot,
+            averaged_normal,
+            x,
+            tab.dN,
+            tab.ddN,
+            shape_operator,
         )
 
 

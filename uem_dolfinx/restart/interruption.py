@@ -92,7 +92,7 @@ class Interruption:
             self._asked = 0
         return number
 
-    def heed(self, comm: MPI.Comm) -> None:
+    def check_signals(self, comm: MPI.Comm) -> None:
         """Raise ``InterruptedStepError`` on all ranks if any has got a signal (collective)."""
         number = self.agreed(comm)
         if number:

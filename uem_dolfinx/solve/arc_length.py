@@ -18,7 +18,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.newton import Iteration, IterationState, Settled
+from uem_dolfinx.solve.newton import InEquilibrium, Iteration, IterationState
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState
 from uem_dolfinx.solve.system import BodySystem
@@ -83,9 +83,9 @@ class ArcLength:
         """How much further the displacement has to go (collective)."""
         return self._length - self._along(self._system.displacement().array_r - self._start.array_r)
 
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong; the state is closed if the arc has its length, too."""
-        state = self._system.unite(settled)
+        state = self._system.unite(in_equilibrium)
         there = abs(self._missing) <= ON_THE_PLANE * self._length
         return replace(state, closed=state.closed and there)
 

@@ -27,7 +27,7 @@ from uem_dolfinx.solve.tangent import Inversions, Tangent
 FORCE_ROUNDING = 4.0 * np.finfo(float).eps
 #: A force is told from rounding where it is larger by this factor.
 #: [convention; rounding of K u; test_body_forces.py::test_forces_told_from_rounding]
-TOLD_APART = 100.0
+ABOVE_ROUNDING = 100.0
 #: Dirichlet values are met if they are to this part of the largest.
 #: [derived; the largest prescribed value; test_body_forces.py::test_dirichlet_values_are_met]
 VALUE_ROUNDING = 4.0 * np.finfo(float).eps
@@ -144,7 +144,7 @@ class BodyForces:
             FORCE_ROUNDING * (np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])).max(axis=1, initial=0.0)
         )
 
-    def told_apart(self, positioned: bool) -> float:
+    def above_rounding(self, positioned: bool) -> float:
         """Norm of the forces at those components where they are told from rounding (collective).
 
         Rounding of a body's displacement is seen at all of its nodes, also where they are held.
@@ -160,7 +160,7 @@ class BodyForces:
         np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
-        limit = TOLD_APART * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
+        limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
         return float(self.config.vector(np.where(np.abs(F) > limit.ravel(), F, 0.0)).norm())
 
     def strain_rounding(self) -> float:

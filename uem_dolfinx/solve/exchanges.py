@@ -22,8 +22,8 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.active_set import TOUCHING, Pivoting, Rule, Wrong
-from uem_dolfinx.contact.friction import FrictionWrong
+from uem_dolfinx.contact.active_set import TOUCHING, Pivoting, Rule, Violations
+from uem_dolfinx.contact.friction import FrictionViolations
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.state import PairState, Pivot
 from uem_dolfinx.errors import ConvergenceError, FrictionError
@@ -91,7 +91,7 @@ class Exchanges:
 
     def __init__(self, pairs: Sequence[Interface]):
         self._pairs = pairs
-        self._rough = any(pair.frictional for pair in pairs)
+        self._frictional = any(pair.frictional for pair in pairs)
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -124,11 +124,11 @@ class Exchanges:
         """See ``Pivoting``."""
         self._pivoting.start_again()
 
-    def choose(self, wrong: list[Wrong], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Wrong]:
+    def choose(self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Violations]:
         """Which of the wrong contactors are exchanged now; none if no contactor is to.
 
         Args:
-            wrong: of every pair.
+            violated: of every pair.
             gaps: that decide on contact, of every pair ``(n,)``.
             curved: whether the linearised problem has a curvature of contact.
             way: how far a node goes at most, a length.
@@ -138,38 +138,38 @@ class Exchanges:
         """
         comm = self._pairs[0].config.comm
         if self.frozen:
-            wrong = [w.of_contact() for w in wrong]
-        self.again, number = False, count(self._pairs, wrong)
+            violated = [w.of_contact() for w in violated]
+        self.again, number = False, count(self._pairs, violated)
         if not number:
             if self.held:
-                self._let_limits_follow(wrong)
-            return wrong
-        free = self._rough and not self.held
+                self._let_limits_follow(violated)
+            return violated
+        free = self._frictional and not self.held
         far = free and way > FAR * self._pairs[0].config.size and self._known is not None
         if free and not far:
-            self._known = self._here(wrong)
-        chosen, rule = wrong, self._rule if far else self._pivoting.choose(number, self._state())
+            self._known = self._here(violated)
+        chosen, rule = violated, self._rule if far else self._pivoting.choose(number, self._state())
         if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
             if curved:
                 # without curvature the problem with held limits is a convex one
                 self.straight = self.convex = True
             self._hold_limits()
-            return [w.among(np.zeros_like(w.enter)) for w in wrong]
+            return [w.among(np.zeros_like(w.enter)) for w in violated]
         if rule >= Rule.FIRST and curved and not self.straight:
             # with curvature the problem may have no solution, or several; without there is one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
         elif rule == Rule.WORST:
-            worst = reduced(comm, max(w.worst for w in wrong), op=MPI.MAX)
-            chosen = [w.among_the_worst(worst) for w in wrong]
+            worst = reduced(comm, max(w.worst for w in violated), op=MPI.MAX)
+            chosen = [w.among_the_worst(worst) for w in violated]
         elif rule == Rule.FIRST:
-            chosen = self._first(wrong)
+            chosen = self._first(violated)
         elif rule == Rule.NONE:
-            if not self._rough or self.frozen:
+            if not self._frictional or self.frozen:
                 raise self._circle(self._lately)
             self._pivoting, self.frozen = Pivoting(), True
-            return self.choose(wrong, gaps, curved)
-        elif reduced(comm, sum(int(w.enter.sum()) for w in wrong)) > sum(pair.n_active for pair in self._pairs):
-            chosen = deepest_of(self._pairs, gaps, wrong)
+            return self.choose(violated, gaps, curved)
+        elif reduced(comm, sum(int(w.enter.sum()) for w in violated)) > sum(pair.n_active for pair in self._pairs):
+            chosen = deepest_of(self._pairs, gaps, violated)
         if rule != self._rule:
             self._rule, self._lately = rule, self._none()
         self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
@@ -181,11 +181,11 @@ class Exchanges:
         if self._number > MOST_EXCHANGES:
             raise self._circle(self._lately)
 
-    def _here(self, wrong: Sequence[Wrong]) -> list[tuple[PairState, Pivot] | None]:
+    def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
         """States of the pairs with friction, with the forces along the normal that are foreseen."""
         here: list[tuple[PairState, Pivot] | None] = []
-        for pair, w in zip(self._pairs, wrong):
-            if pair.friction is None or not isinstance(w, FrictionWrong):
+        for pair, w in zip(self._pairs, violated):
+            if pair.friction is None or not isinstance(w, FrictionViolations):
                 here.append(None)
             else:
                 here.append((replace(pair.trial, lam=w.seen.lam), pair.friction.pivot))
@@ -201,9 +201,9 @@ class Exchanges:
         self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
 
-    def _let_limits_follow(self, wrong: Sequence[Wrong]) -> None:
+    def _let_limits_follow(self, violated: Sequence[Violations]) -> None:
         """Take the limits that held ones have led to, or Coulomb's law where these are near (collective)."""
-        self._known, each = self._here(wrong), np.zeros(2)
+        self._known, each = self._here(violated), np.zeros(2)
         for pair, known in zip(self._pairs, self._known):
             if pair.friction is not None and known is not None:
                 pair.trial = known[0]
@@ -220,15 +220,15 @@ class Exchanges:
     def _none(self) -> list[Bools]:
         return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
 
-    def _first(self, wrong: Sequence[Wrong]) -> list[Wrong]:
+    def _first(self, violated: Sequence[Violations]) -> list[Violations]:
         """The first of the wrong contactors alone, with those at the same place of the same pair."""
         config = self._pairs[0].config
         along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
-        least = np.array([np.where(w.which, a, np.inf).min(initial=np.inf) for w, a in zip(wrong, along)])
+        least = np.array([np.where(w.which, a, np.inf).min(initial=np.inf) for w, a in zip(violated, along)])
         config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
         k = int(np.argmax(np.isfinite(least)))
         at = least[k] + TOUCHING * config.size
-        return [w.among((a <= at) & (i == k)) for i, (w, a) in enumerate(zip(wrong, along))]
+        return [w.among((a <= at) & (i == k)) for i, (w, a) in enumerate(zip(violated, along))]
 
     def visit(self, norm: float) -> bool:
         """Note the state in which the bodies are, which is no equilibrium.
@@ -283,13 +283,13 @@ class Exchanges:
         found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
         names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])
         more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        why = "touch and let go, or stick and slip" if self._rough else "touch and let go"
-        return (FrictionError if self._rough else ConvergenceError)(
+        why = "touch and let go, or stick and slip" if self._frictional else "touch and let go"
+        return (FrictionError if self._frictional else ConvergenceError)(
             f"the active set goes in a circle: contactors {why} by turns: {names}{more}; take smaller load steps, or a target of finer "
-            f"facets there{', or less friction' if self._rough else ''}"
+            f"facets there{', or less friction' if self._frictional else ''}"
         )
 
 
-def count(pairs: Sequence[Interface], wrong: Sequence[Wrong]) -> int:
+def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
     """Number of wrong contactors over all pairs and ranks (collective)."""
-    return int(reduced(pairs[0].config.comm, sum(w.count for w in wrong))) if pairs else 0
+    return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0

@@ -10,7 +10,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact import active_set
-from uem_dolfinx.contact.active_set import Wrong
+from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.body_forces import BodyForces
@@ -38,29 +38,29 @@ def touch_ahead(forces: BodyForces, pairs: Sequence[Interface], rigid: RigidMoti
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
     gaps = [pair.predicted(du) for pair in pairs]
-    wrong = []
+    violated = []
     for pair, gap in zip(pairs, gaps):
         none = np.zeros(len(pair.nodes))
-        wrong.append(pair.wrong(gap, pair.traction._replace(lam=none), none, none, near, False, du))
-    if reduced(comm, any(w.enter.any() for w in wrong), op=MPI.LOR):
-        for pair, first in zip(pairs, deepest_of(pairs, gaps, wrong)):
+        violated.append(pair.violated(gap, pair.traction._replace(lam=none), none, none, near, False, du))
+    if reduced(comm, any(w.enter.any() for w in violated), op=MPI.LOR):
+        for pair, first in zip(pairs, deepest_of(pairs, gaps, violated)):
             pair.exchange(first, False)
 
 
-def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], wrong: Sequence[Wrong]) -> list[Wrong]:
+def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequence[Violations]) -> list[Violations]:
     """Of contactors that would all enter at once, those deep enough to touch at first, besides all that are released (collective).
 
     Args:
         pairs: of all contacts.
         gaps: that decide on contact, of every pair ``(n,)``.
-        wrong: who is to change sides, of every pair; some contactor enters.
+        violated: who is to change sides, of every pair; some contactor enters.
     """
     config = pairs[0].config
-    g, entering = config.gdim, [w.enter for w in wrong]
+    g, entering = config.gdim, [w.enter for w in violated]
     points = np.concatenate([pair.points[enter] for pair, enter in zip(pairs, entering)])
     overlap = -np.concatenate([gap[enter] for gap, enter in zip(gaps, entering)])
     reach = np.array([*points.max(axis=0, initial=-np.inf), *(-points).max(axis=0, initial=-np.inf), overlap.max(initial=0.0)])
     config.comm.Allreduce(MPI.IN_PLACE, reach, op=MPI.MAX)
     span = float(np.linalg.norm(reach[:g] + reach[g : 2 * g])) / config.size
     depth = active_set.deep_enough(span, g) * float(reach[-1])
-    return [w.on_first_touch(gap, depth) for w, gap in zip(wrong, gaps)]
+    return [w.on_first_touch(gap, depth) for w, gap in zip(violated, gaps)]

@@ -131,13 +131,13 @@ class FloatingBodies:
         force = self.motions.load(self._open, self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))
         return bool(force.any())
 
-    def fall_again(self, place: Callable[[], None], changed: bool, settled: bool) -> bool:
+    def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
         """Let bodies that have lost their hold fall (collective).
 
         Args:
             place: projects all contactors (collective).
             changed: whether the active set has, or is about to.
-            settled: whether the bodies are in equilibrium.
+            in_equilibrium: whether the bodies are in equilibrium.
 
         Returns:
             Whether anything else has changed now.
@@ -145,7 +145,7 @@ class FloatingBodies:
         if self.motions is None:
             return False
         # a body that has lost its hold on the way falls only when the others have come to rest
-        return (changed or settled) and self._fall(place, freely=not changed)
+        return (changed or in_equilibrium) and self._fall(place, freely=not changed)
 
     def without_open_motions(self, du: Array) -> Array:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""

@@ -42,14 +42,14 @@ NEWTON_LEAVES = 1e-2
 ACCURACY_AT_THE_END = 0.1
 #: A residual below this part of the forces at work is an equilibrium in which contact forces can be read from the bodies.
 #: [heuristic; norm of the forces; -]
-SETTLED = 1e-6
+IN_EQUILIBRIUM = 1e-6
 #: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
 #: [heuristic; norm of the forces; -]
 LARGEST_ROUNDING = 1e-4
 
 
 #: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
-Settled = Callable[[float, float, float], bool]
+InEquilibrium = Callable[[float, float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class UnitedSystem(Protocol):
         """Whether there are contacts at all."""
 
     @property
-    def rough(self) -> bool:
+    def frictional(self) -> bool:
         """Whether there is friction."""
 
     def place(self, returning: bool) -> None:
@@ -152,7 +152,7 @@ class UnitedSystem(Protocol):
     def assemble_residual(self) -> bool:
         """Residual at the present displacement; whether it is finite."""
 
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
 
     def differentiate(self, first: bool) -> None:
@@ -161,7 +161,7 @@ class UnitedSystem(Protocol):
     def linearise(self, state: IterationState) -> PETSc.Vec:
         """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)``."""
 
-    def forces_told_apart(self) -> float:
+    def forces_above_rounding(self) -> float:
         """Norm of the forces at those nodes where they are told from rounding."""
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
@@ -209,7 +209,7 @@ def solve_united(
     line_search: bool,
     verbose: bool,
     forces_before: float = 0.0,
-    heed: Callable[[], None] | None = None,
+    check_signals: Callable[[], None] | None = None,
 ) -> list[Iteration]:
     """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
 
@@ -220,7 +220,7 @@ def solve_united(
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
         forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
-        heed: called on all ranks after every linear solve; what it raises ends the loop.
+        check_signals: called on all ranks after every linear solve; what it raises ends the loop.
 
     Returns:
         The history; its last entry is the converged state.
@@ -234,8 +234,8 @@ def solve_united(
     history: list[Iteration] = []
     start, length, norm, stalled, left = 0.0, 1.0, 0.0, 0, 0.0
 
-    def settled(norm: float, scale: float, rounding: float) -> bool:
-        return norm <= max(max(SETTLED, rtol) * max(scale, start), rounding, left)
+    def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
+        return norm <= max(max(IN_EQUILIBRIUM, rtol) * max(scale, start), rounding, left)
 
     system.place(returning=False)
     if not system.assemble_residual():
@@ -245,7 +245,7 @@ def solve_united(
         )
     for k in range(max_iterations + 1):
         with _told(history):
-            state = system.unite(settled)
+            state = system.unite(in_equilibrium)
         if k == 0:
             # a displacement that comes back to nothing keeps the rounding of what it was
             start, left = state.norm, min(state.rounding, rtol * forces_before)
@@ -257,7 +257,7 @@ def solve_united(
         small = rtol * forces
         if small < norm <= rounding:
             # rounding excuses a residual that is small beside real forces, or where there are none
-            real = max(system.forces_told_apart(), forces_before)
+            real = max(system.forces_above_rounding(), forces_before)
             small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
         converged = steady and state.closed and norm <= small
         hidden = stalled >= 2 and small < norm <= rounding
@@ -279,7 +279,7 @@ def solve_united(
         else:
             wanted = left_anyway = 0.0
         with _told(history):
-            step = _solve_linearised(system, state, wanted, left_anyway, heed)
+            step = _solve_linearised(system, state, wanted, left_anyway, check_signals)
         residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
         changed = state.changed or step.exchanges > 0
         history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
@@ -335,7 +335,7 @@ class _Step:
 
 
 def _solve_linearised(
-    system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float, heed: Callable[[], None] | None
+    system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float, check_signals: Callable[[], None] | None
 ) -> _Step:
     """Solve the linearised problem together with the conditions of contact; nothing moves.
 
@@ -344,7 +344,7 @@ def _solve_linearised(
         state: to begin with.
         wanted: norm of the residual that convergence asks for; zero where solves are to be exact.
         left_anyway: part of the right-hand side that solves may leave, since another iteration follows in any case.
-        heed: see ``solve_united``.
+        check_signals: see ``solve_united``.
     """
     iterations, exchanges, du = 0, 0, None
     while True:
@@ -358,8 +358,8 @@ def _solve_linearised(
         for accuracy in (first, needed) if first > needed else (needed,):
             dq, solves = system.solve(rhs, accuracy, near)
             iterations += solves
-            if heed is not None:
-                heed()
+            if check_signals is not None:
+                check_signals()
             driving = max(driving, rhs.norm())
             du, near = system.move(state, dq), dq
             better = system.exchange(state, du, driving, accuracy)

@@ -188,7 +188,7 @@ class UnitedProblem:
         Arguments, return value and errors are those of :meth:`attempt`; a step that fails when it is taken again stays what it was.
         KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
         """
-        with self.progress.heeding(self.comm):
+        with self.progress.checking_signals(self.comm):
             if self.progress.inside and start is None and fraction == 1.0:
                 return self._solve_again()
             history = self.attempt(start=start, fraction=fraction)
@@ -259,7 +259,7 @@ class UnitedProblem:
                 line_search=self.line_search and along is None,
                 verbose=self.verbose,
                 forces_before=self.largest_forces,
-                heed=lambda: self.progress.heed(self.comm),
+                check_signals=lambda: self.progress.check_signals(self.comm),
             )
             self.system.end_step()
             refuse_passages(self.config, self.pairs, self.committed, self.motions, moving=self.dynamics is not None)
@@ -288,7 +288,7 @@ class UnitedProblem:
 
     def _keep(self) -> None:
         self.committed = np.array(self.u.x.array)
-        self.largest_forces = max(self.largest_forces, self.system.forces_told_apart())
+        self.largest_forces = max(self.largest_forces, self.system.forces_above_rounding())
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:

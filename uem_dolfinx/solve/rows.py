@@ -84,17 +84,17 @@ class Rows:
 
     Attributes:
         equations: of every pair.
-        trial: all that P is made of; None where it is ``upright``.
+        trial: all that P is made of; None where it is ``frictionless``.
         independent: how those that got in each other's way were resolved; None if none could.
         test: Q.
-        upright: Q as it is without the friction of contactors that slip, which closes the gaps as well.
+        frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
     """
 
     equations: list[Constraints]
     trial: UnitingEquations | None
     independent: IndependentEquations | None
     test: Restriction
-    upright: Restriction
+    frictionless: Restriction
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def make_rows(
     for pair in rigid if meetings.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    upright = trial = UnitingEquations.join([e.frictionless for e in equations], g)
+    frictionless = trial = UnitingEquations.join([e.frictionless for e in equations], g)
     if any(e.trial is not e.frictionless for e in equations):
         trial = UnitingEquations.join([e.trial for e in equations], g)
     resisting = stopping = trial
@@ -136,7 +136,7 @@ def make_rows(
         stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
-    Q, independent = meetings.restrict(equations, upright, free, prescribed)
+    Q, independent = meetings.restrict(equations, frictionless, free, prescribed)
     tilted = Q
     if any(e.test is not e.frictionless for e in equations):
         test = UnitingEquations.join([e.test for e in equations], g)
@@ -144,7 +144,7 @@ def make_rows(
             independent = _tilted(pairs, independent, test)
             test = independent.equations
         tilted = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
-    return Rows(equations, None if trial is upright else trial, independent, tilted, Q)
+    return Rows(equations, None if trial is frictionless else trial, independent, tilted, Q)
 
 
 def _tilted(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:

@@ -86,13 +86,13 @@ class Progress:
             self.control.begin(1.0 / steps)
         return self._calls == self.ramp
 
-    def heed(self, comm: MPI.Comm) -> None:
+    def check_signals(self, comm: MPI.Comm) -> None:
         """Raise ``InterruptedStepError`` on all ranks if any has got a signal since the stepping began (collective)."""
         if self.interruption is not None:
-            self.interruption.heed(comm)
+            self.interruption.check_signals(comm)
 
     @contextmanager
-    def heeding(self, comm: MPI.Comm) -> Iterator[None]:
+    def checking_signals(self, comm: MPI.Comm) -> Iterator[None]:
         """A block in which a signal to any rank ends the run on all, once the problem is in its last converged state (collective)."""
         outer, own = self.interruption, self.interruption or Interruption()
         self.interruption = own
@@ -100,7 +100,7 @@ class Progress:
             with own:
                 yield
                 if outer is None:
-                    self.heed(comm)
+                    self.check_signals(comm)
         except InterruptedStepError as interrupted:
             if outer is not None and not self.inside:
                 raise
@@ -168,7 +168,7 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
                     yield step
                     progress.inside = False
                     if checkpoint is None:
-                        progress.heed(comm)
+                        progress.check_signals(comm)
                     else:
                         checkpoint.step()
                 if checkpoint is not None:

@@ -28,13 +28,13 @@ from uem_dolfinx.solve.body_forces import BodyForces
 from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
-from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.newton import InEquilibrium, IterationState
 from uem_dolfinx.solve.rows import BodyState, Meetings, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
 #: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_foretells]
-FORESEEN = 1e-8
+PREDICTED = 1e-8
 #: Part of the model's size that an active contactor's gap may be left with.
 #: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
 CLOSED = 1e-13
@@ -71,7 +71,7 @@ class BodySystem:
         #: Whether P differs from Q.
         self._apart = False
         #: The state that was settled last, if its united matrix has a negative determinant.
-        self._doubtful: BodyState | None = None
+        self._not_unique: BodyState | None = None
         #: Whether the bodies have moved in this step.
         self._led = False
         #: Whether the last exchange has let go of a body that loads drive.
@@ -113,7 +113,7 @@ class BodySystem:
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
-        self._doubtful, self._led, place = None, False, partial(self.place, returning=False)
+        self._not_unique, self._led, place = None, False, partial(self.place, returning=False)
         self.exchanges.begin_step()
         for pair in self.pairs:
             pair.discretisation.begin_step()
@@ -126,12 +126,12 @@ class BodySystem:
         for pair in self.pairs:
             check_prescribed(pair)
         self.floating.end_step()
-        if (state := self._doubtful) is None:
+        if (state := self._not_unique) is None:
             return
         # between this equilibrium and that without friction the united matrix was singular
         self._factored = None
         added = together(self._curvature, state.added)
-        if not self.solver.negative_without(state.rows.upright, self.forces.tangent.K, added):
+        if not self.solver.negative_without(state.rows.frictionless, self.forces.tangent.K, added):
             raise FrictionError(
                 "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP is negative; take less "
                 "friction, or stiffer bodies"
@@ -150,7 +150,7 @@ class BodySystem:
         """Residual at the present displacement; whether it is finite."""
         return self.forces.assemble()
 
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong at the present displacement, and the equations that follow.
 
         1. Take Q'F with the present equations.
@@ -169,7 +169,7 @@ class BodySystem:
             rows = self._rows()
             y = rows.test.pass_on(F)
             residual = rows.test.reduce(y)
-            at_rest = settled(residual.norm(), F.norm(), rounding)
+            at_rest = in_equilibrium(residual.norm(), F.norm(), rounding)
             if at_rest:
                 self._take(self._read_forces(rows, y))
             self._swept = not at_rest
@@ -178,12 +178,13 @@ class BodySystem:
                 for pair in pairs:
                     pair.place_again()
             here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
-            wrong = count(
-                pairs, [pair.wrong(pair.gap, pair.traction, self._along(pair), least, 0.0, self._swept) for pair, least in here]
+            violated = count(
+                pairs,
+                [pair.violated(pair.gap, pair.traction, self._along(pair), least, 0.0, self._swept) for pair, least in here],
             )
             # one that is let go of falls, whatever the active set lacks
-            unsettled = moved or (wrong > 0 and not (at_rest and self.floating.adrift))
-            wanting = not (at_rest and wrong == 0 and not moved)
+            unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
+            wanting = not (at_rest and violated == 0 and not moved)
             # the residual that a step begins with does not know how far conditions lead the bodies
             if wanting and pairs and self._led and self.exchanges.visit(residual.norm()):
                 for pair in pairs:
@@ -193,7 +194,7 @@ class BodySystem:
             if moved or fallen:
                 rows = self._rows()
                 residual = rows.test.transpose(self._residual())
-        return self._state(rows, residual, rounding, moved or fallen, at_rest and wrong == 0)
+        return self._state(rows, residual, rounding, moved or fallen, at_rest and violated == 0)
 
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
@@ -205,8 +206,8 @@ class BodySystem:
         # where equations get in each other's way, those of P might eliminate other components than those of Q
         contested = self.meetings.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
-        self._apart = apart is not None or rows.test is not rows.upright
-        trial = rows.upright
+        self._apart = apart is not None or rows.test is not rows.frictionless
+        trial = rows.frictionless
         if apart is not None:
             trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)
         added, held = slip_terms(self.pairs, self.config.vector())
@@ -235,30 +236,30 @@ class BodySystem:
             return None
         assert isinstance(state, BodyState)
         with timed("uniting equations"):
-            F = self._foreseen_forces(state, du, self.solver.forces(self.forces.tangent.K, du))
+            F = self._predicted_forces(state, du, self.solver.forces(self.forces.tangent.K, du))
             increment = du.array_r.reshape(-1, self.config.gdim)
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             # held limits follow what a solve foretells: it is as good as a direct one
-            left = 0.0 if self.solver.exact else min(accuracy, FORESEEN) if self.exchanges.held else accuracy
+            left = 0.0 if self.solver.exact else min(accuracy, PREDICTED) if self.exchanges.held else accuracy
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            near = max(FORESEEN, left) * way
-            foreseen = [pair.predicted(increment) for pair in self.pairs]
+            near = max(PREDICTED, left) * way
+            predicted = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            wrong = []
-            for pair, gap, seen in zip(self.pairs, foreseen, forces):
+            violated = []
+            for pair, gap, seen in zip(self.pairs, predicted, forces):
                 along = self._along(pair)
                 least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                wrong.append(pair.wrong(gap, seen, along, least, near, self._swept, moved))
-            chosen = wrong if self._adrift else self.exchanges.choose(wrong, foreseen, self._curvature is not None, way)
-            settled = not (self.exchanges.again or count(self.pairs, chosen))
-            if settled and sliding is not None and not self.exchanges.frozen:
+                violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
+            chosen = violated if self._adrift else self.exchanges.choose(violated, predicted, self._curvature is not None, way)
+            in_equilibrium = not (self.exchanges.again or count(self.pairs, chosen))
+            if in_equilibrium and sliding is not None and not self.exchanges.frozen:
                 raise FrictionError(
                     "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
                     "Dirichlet condition, give it inertia, or take less load"
                 )
-            if settled or self._adrift:
-                self._doubtful = state if self.solver.negative else None
+            if in_equilibrium or self._adrift:
+                self._not_unique = state if self.solver.negative else None
                 self._take(forces)
                 return None
             if self.exchanges.straight:
@@ -271,7 +272,7 @@ class BodySystem:
             residual = rows.test.transpose(self._residual())
         return self._state(rows, residual, state.rounding, state.changed, False)
 
-    def _foreseen_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
+    def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
         """What contact, friction and present forces add to ``F = K du`` (collective)."""
         for more in (self._curvature, state.added):
             if more is not None:
@@ -283,7 +284,7 @@ class BodySystem:
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
         """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
-        if self.floating.motions is None or not self.rough:
+        if self.floating.motions is None or not self.frictional:
             return None
         # known forces are among those of the contact
         every = F + (self.forces.residual - self._residual())
@@ -329,9 +330,9 @@ class BodySystem:
         active = [pair.nodes[pair.trial.active] for pair in self.pairs]
         return self.forces.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
 
-    def forces_told_apart(self) -> float:
+    def forces_above_rounding(self) -> float:
         """Norm of the forces at those nodes where they are told from rounding of displacements and positions (collective)."""
-        return self.forces.told_apart(self.in_contact)
+        return self.forces.above_rounding(self.in_contact)
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` at the present displacement, with the active set of ``state``.
@@ -382,7 +383,7 @@ class BodySystem:
             self.solver.set_operator(P, K, curvature, Q, same)
         self._factored = made_of
         self.solver.begin_at(c := P.c)
-        return -Q.transpose(self._foreseen_forces(state, c, K * c))
+        return -Q.transpose(self._predicted_forces(state, c, K * c))
 
     @property
     def inexact(self) -> bool:
@@ -391,7 +392,7 @@ class BodySystem:
 
     def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
-        return self.solver.solve(rhs, min(accuracy, FORESEEN) if self.exchanges.held else accuracy, near)
+        return self.solver.solve(rhs, min(accuracy, PREDICTED) if self.exchanges.held else accuracy, near)
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
@@ -435,7 +436,7 @@ class BodySystem:
         return self.exchanges.convex
 
     @property
-    def rough(self) -> bool:
+    def frictional(self) -> bool:
         """Whether there is friction."""
         return any(pair.frictional for pair in self.pairs)
 

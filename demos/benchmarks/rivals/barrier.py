@@ -21,7 +21,7 @@ from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx import forms
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.newton import IterationState, InEquilibrium
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -194,7 +194,7 @@ class BarrierSystem(PushedSystem):
         R.array[:] -= self._push()[: self.config.n_owned].ravel()
         return restriction.reduce(R)
 
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, settled: InEquilibrium) -> IterationState:
         """Forces of the barrier."""
         P = self.restriction()
         with timed("barrier"):

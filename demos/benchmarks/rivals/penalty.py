@@ -21,7 +21,7 @@ from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx import forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.newton import IterationState, InEquilibrium
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -39,7 +39,7 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 #: A multiplier is brought up to date when the bodies are in equilibrium to this part of the forces.
-SETTLED = 1e-7
+IN_EQUILIBRIUM = 1e-7
 #: The target's end holds points up to this part of its facet beyond.
 HELD_AT_END = 1e-3
 #: After so many full Newton steps of a load step the line search sees to it that springs do not come and go for ever.
@@ -172,7 +172,7 @@ class PenaltySystem(PushedSystem):
         self._points = [points(pair, tag) for pair, tag in zip(pairs, tags)]
         self._none = [np.zeros(len(p.area)) for p in self._points]
         self._multipliers = self._committed = self._none
-        self._rough = any(self._mu)
+        self._frictional = any(self._mu)
         #: Friction at the start of the step, with Uzawa as last brought up to date, and the displacement there.
         self._held = self._held_before = [np.zeros((len(p.area), self.config.gdim)) for p in self._points]
         self._start = np.array(self.config.displacement)
@@ -256,7 +256,7 @@ class PenaltySystem(PushedSystem):
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, settled: InEquilibrium) -> IterationState:
         """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
         F = self.forces.residual
         P = self.restriction()
@@ -265,7 +265,7 @@ class PenaltySystem(PushedSystem):
             R = P.reduce(F - forces)
             changed, rounding = False, self._rounding_of_springs()
             deep = self._overlap is not None and overlap > self._overlap * self.config.size
-            if deep and R.norm() <= max(SETTLED * F.norm(), rounding):
+            if deep and R.norm() <= max(IN_EQUILIBRIUM * F.norm(), rounding):
                 self._multipliers = [s.force for s in self._springs]
                 self._held = [s.friction[0] if s.friction else held for s, held in zip(self._springs, self._held)]
                 forces, _ = self._stretch()
@@ -308,7 +308,7 @@ class PenaltySystem(PushedSystem):
         sliding = any(pair.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
         made_of = self.comm.allgather((self.forces.tangent.number, on))
-        if self._A is None or sliding or self._rough or made_of != self.made_of:
+        if self._A is None or sliding or self._frictional or made_of != self.made_of:
             with timed("springs"):
                 A = self._with_springs()
             self.solver.set_operator(state.trial, A, None)
@@ -333,7 +333,7 @@ class PenaltySystem(PushedSystem):
         blocks = self._stiffness_of_springs * s.area[i, None, None] * np.einsum("ki,kj->kij", slope, slope)
         finite = isinstance(s.projection, FacetProjection) or s.projection.nodes.shape[1] == 0
         if finite and self.consistent_tangent and any(pair.sliding == "finite" for pair in self.pairs):
-            blocks -= s.force[i, None, None] * self._bend(s, i)
+            blocks -= s.force[i, None, None] * self._shape_operator(s, i)
         if s.friction:
             blocks += self._friction_blocks(s, i, weights[i], mu)
         return nodes, blocks
@@ -352,7 +352,7 @@ class PenaltySystem(PushedSystem):
         k, m = weights.shape
         return np.einsum("ka,kgh,kb->kagbh", weights, part, weights).reshape(k, m * g, m * g)
 
-    def _bend(self, s: Springs, i: Ints) -> Array:
+    def _shape_operator(self, s: Springs, i: Ints) -> Array:
         """Second derivative of the gap in the displacements of the nodes on both sides."""
         H = s.projection.hessians(i)
         nb, nn, g = s.shape.shape[1], s.projection.nodes.shape[1], self.config.gdim
@@ -368,7 +368,7 @@ class PenaltySystem(PushedSystem):
         slope = dq.dot(state.residual)
         # friction has no potential
         if (
-            self._rough
+            self._frictional
             or self._solves <= FULL_STEPS
             or state.norm <= NEAR_BY * state.scale
             or state.trial.c.norm() > 0.0

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
-from uem_dolfinx.solve.newton import IterationState, Settled
+from uem_dolfinx.solve.newton import IterationState, InEquilibrium
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
@@ -44,7 +44,7 @@ class PushedSystem(ABC):
     # -- what a method has to say ------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def unite(self, settled: Settled) -> IterationState:
+    def unite(self, settled: InEquilibrium) -> IterationState:
         """Contact forces at the present displacement."""
 
     @abstractmethod
@@ -55,9 +55,9 @@ class PushedSystem(ABC):
         """Note whether this is the step's first iteration: the tangent is made with the matrix."""
         self.first = first
 
-    def forces_told_apart(self) -> float:
+    def forces_above_rounding(self) -> float:
         """Norm of the forces at those nodes where they are told from rounding of displacements and positions (collective)."""
-        return self.forces.told_apart(bool(self.pairs))
+        return self.forces.above_rounding(bool(self.pairs))
 
     def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> None:
         """Contactors are pushed by forces, none changes sides."""
@@ -166,7 +166,7 @@ class PushedSystem(ABC):
         return False
 
     @property
-    def rough(self) -> bool:
+    def frictional(self) -> bool:
         """Whether there is friction."""
         return any(pair.frictional for pair in self.pairs)
 
