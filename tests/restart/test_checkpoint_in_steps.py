@@ -198,6 +198,31 @@ def test_killed_without_warning(folder):
     assert np.array_equal(bits(whole.u.x.array), bits(problem.u.x.array))
 
 
+def test_a_signal_within_a_step_waits_for_its_end(folder):
+    """A script that counts its own steps has no other place to write: the step that a signal comes in is finished and written."""
+    _, _, problem = slider()
+    state, solve = problem.state(), problem.system.solver.solve
+    state.numbers["step"] = 0
+
+    def signalled(*how):
+        if COMM.rank == COMM.size - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return solve(*how)
+
+    with pytest.raises(SystemExit) as end, uem.Checkpoint(folder / "run", every=100) as checkpoint:
+        checkpoint.begin(state)
+        for k in (1, 2, 3):
+            if k == 2:
+                problem.system.solver.solve = signalled
+            lead(problem, [k])
+            state.numbers["step"] = k
+            checkpoint.step()
+    there = slider()[2].state()
+    there.numbers["step"] = None
+    uem.read_checkpoint(folder / "run", there)
+    assert end.value.code == 143 and there.numbers["step"] == 2
+
+
 @serial
 def test_terminated(folder):
     """SIGTERM ends a run with 143 after its step is written, far from the end of the interval."""

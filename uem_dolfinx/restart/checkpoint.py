@@ -287,7 +287,7 @@ class Checkpoint:
         self.path, self.every = Path(path), given.count("every", every)
         self._state: State | None = None
         #: Signals that ask the run to end.
-        self.interruption = Interruption()
+        self.interruption = Interruption(finishing=True)
 
     def begin(self, state: State) -> bool:
         """Go on from the file if there is one, and remove what a killed run has left of another (collective).

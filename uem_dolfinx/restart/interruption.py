@@ -41,10 +41,13 @@ class Interruption:
     """Signals that ask a run to end, noted within its ``with`` block; Ctrl-C after one does at once what it would have done outside.
 
     Blocks may stand within each other. Python allows handlers in the main thread only; elsewhere nothing is noted.
+
+    Args:
+        finishing: whether the script's steps within the block are finished first: blocks within it leave signals to it.
     """
 
-    def __init__(self) -> None:
-        self._asked, self._depth = 0, 0
+    def __init__(self, finishing: bool = False) -> None:
+        self._asked, self._depth, self._finishing = 0, 0, finishing
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -52,7 +55,8 @@ class Interruption:
         if self._depth == 1 and threading.current_thread() is threading.main_thread():
             # what is ignored stays so, and what C code handles cannot be put back
             before = {number: signal.getsignal(number) for number in SIGNALS}
-            self._before = {number: was for number, was in before.items() if was not in (signal.SIG_IGN, None)}
+            kept = {number for number, was in before.items() if was in (signal.SIG_IGN, None) or _finishes(was)}
+            self._before = {number: was for number, was in before.items() if number not in kept}
             for number in self._before:
                 signal.signal(number, self._note)
         return self
@@ -97,6 +101,12 @@ class Interruption:
         number = self.agreed(comm)
         if number:
             raise InterruptedStepError(number)
+
+
+def _finishes(handler: Any) -> bool:
+    """Whether a handler is that of a block whose steps are finished first."""
+    block = getattr(handler, "__self__", None)
+    return isinstance(block, Interruption) and block._finishing
 
 
 def end_run(number: int, kept: str) -> NoReturn:
