@@ -66,12 +66,12 @@ class UnitedSolver:
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
         #: The last factorisation, and the united matrix that it serves to solve with, if it does.
         self._kept = KeptFactor(space)
+        self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: K without the contact, and whether the present united matrix is made of it.
         self._condensed, self._on_condensed = Condensed(space), False
-        #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
+        #: Whether K is the same for every displacement and solves are few, and K of the last united matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
-        self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: P and K of the present united matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
         #: Iterations per digit that the preconditioner took at first and takes now.
@@ -110,10 +110,9 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self._A = self._crossed = self._served = self._factor_of = None
+        self._A = self._crossed = self._served = self._factor_of = self._of = None
         self._kept.drop()
         self._condensed.drop()
-        self._of = None
         self._use(self._first)
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
@@ -158,6 +157,9 @@ class UnitedSolver:
         symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``G`` second derivatives of gaps times forces.
         ``same`` tells that all of them have the values that they had the last time, although a step has begun since.
         """
+        if same and not self._on_condensed and self._served is None:
+            self._begins, self._of = False, (K, K.stateGet())
+            return
         test = test or restriction
         self._apart = test is not restriction
         if self._begins and self.options is not self._first:
@@ -215,16 +217,16 @@ class UnitedSolver:
     def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
         """Unite on the components of the contact; whether that is done (collective).
 
-        That pays where K lasts or, since no factorisation is kept then, where Q is not P; else from the second matrix of a K on that none
-        serves which is kept. Where one does it is noted.
+        A solve on the contact takes two of the bodies: that pays where K lasts, where Q is not P, since no factorisation is kept then, or
+        from the second matrix of a K in a step on. Where a factorisation that is kept serves it is noted.
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
-        possible = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
-        serves = possible and self._condensed.serves(P, Q, K, G)
+        pays = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
+        pays = pays and (self.lasting or self._apart or again)
+        serves = pays and self._condensed.serves(P, Q, K, G)
         if not (serves or self.lasting or self._apart) and self._kept.serves(P, K):
             self._served = P, K, G
             return False
-        pays = possible and (self.lasting or self._apart or again)
         if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
             return False
         if not (serves and same):
@@ -311,9 +313,8 @@ class UnitedSolver:
     @property
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
-        if self._on_condensed:
-            return self._apart and self._condensed.negative
-        return self._tells_sign and mumps.is_negative(self.pc)
+        condensed = self._on_condensed
+        return (self._apart and self._condensed.negative) if condensed else (self._tells_sign and mumps.is_negative(self.pc))
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
@@ -421,8 +422,8 @@ class UnitedSolver:
 
     @property
     def begins(self) -> bool:
-        """Whether a step begins in which the united matrix, although it may be the same, is to be made as if the step were the first."""
-        return self._begins and self._on_condensed
+        """Whether a step begins, in which the united matrix, although it may be the same, is solved with as if the step were the first."""
+        return self._begins
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
         """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
