@@ -93,6 +93,7 @@ def test_script(folder):
     """The demo on one and two ranks in a size that takes seconds: its file has all that is promised."""
     file = folder / "scaling.json"
     options = ["--dofs", "2000", "--plates", "6", "--plate-ranks", "2", "--searches", "4,8", "--json", str(file)]
+    options += ["--counted", "6000", "--count-ranks", "2"]
     run = f"import runpy, sys; sys.argv = {[str(SCRIPT), *options]!r}; sys.path.insert(0, {str(SCRIPT.parent)!r}); "
     process = start_process(run + f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')")
     process.communicate(timeout=300)
@@ -116,3 +117,8 @@ def test_script(folder):
     assert many["bytes_told_by_all"] == pytest.approx(few["bytes_told_by_all"] * (many["ranks"] - 1) / (few["ranks"] - 1))
     assert [row["contactors"] for row in found["search"]] == [25, 81]
     assert found["search"][0]["exponent"] is None and isinstance(found["search"][1]["exponent"], float)
+    # every collective call is in a stage, and products near the contact make few
+    (calls,) = found["collectives"]
+    stages = {k: v for k, v in calls.items() if k not in ("ranks", "dofs", "newton_iterations", "all", "solver")}
+    assert calls["ranks"] == 2 and sum(stages.values()) == calls["all"]
+    assert 0 < stages["restriction matrix P"] + stages["united matrix P'KP"] < 0.25 * calls["all"]
