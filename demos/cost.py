@@ -42,7 +42,7 @@ args = common.arguments(
 #: Timers of what contact adds, and of what there is without it; some hold others.
 CONTACT = (
     "search and projection", "uniting equations", "contact curvature", "restriction matrix P", "united matrix P'KP",
-    "united matrix Q'KP", "deflation",
+    "united matrix Q'KP", "condensed matrix", "deflation",
 )  # fmt: skip
 SET_UP = "factorisation or preconditioner set-up"
 BODIES = ("assemble residual", "assemble tangent", SET_UP, "linear solve")

@@ -56,7 +56,13 @@ STAGES = {
     "search and projection": ["projection"],
     "uniting equations": ["uniting equations", "contact curvature"],
     "assembly": ["assemble residual", "assemble tangent"],
-    "P and P'KP": ["restriction matrix P", "united matrix P'KP", "cross out prescribed components", "deflation"],
+    "P and P'KP": [
+        "restriction matrix P",
+        "united matrix P'KP",
+        "condensed matrix",
+        "cross out prescribed components",
+        "deflation",
+    ],
     "multigrid and CG": ["factorisation or preconditioner set-up", "linear solve"],
 }
 

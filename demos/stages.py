@@ -40,7 +40,7 @@ STAGES = {
     "search": ["search"],
     "projection": ["projection"],
     "P": ["restriction matrix P"],
-    "P'KP": ["united matrix P'KP"],
+    "P'KP": ["united matrix P'KP", "condensed matrix"],
     "tangent": ["assemble tangent"],
     "factorisation": ["factorisation or preconditioner set-up"],
     "mass": ["assemble mass", "redistribute mass", "first acceleration", "inertia forces"],

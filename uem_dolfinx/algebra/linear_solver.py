@@ -69,7 +69,7 @@ class UnitedSolver:
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: K without the contact, and whether the present united matrix is made of it.
         self._condensed, self._on_condensed = Condensed(space), False
-        #: Whether K is the same for every displacement and solves are few, and K of the last united matrix with the state of its values.
+        #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
         #: P and K of the present united matrix, if it is symmetric and factorised.
@@ -217,8 +217,8 @@ class UnitedSolver:
     def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
         """Unite on the components of the contact; whether that is done (collective).
 
-        A solve on the contact takes two of the bodies: that pays where K lasts, where Q is not P, since no factorisation is kept then, or
-        from the second matrix of a K in a step on. Where a factorisation that is kept serves it is noted.
+        A solve on the contact takes two of the bodies, a factorisation some ten: that pays where K lasts, where Q is not P, since
+        no factorisation is kept then, or from the second matrix of a K on. Where a factorisation that is kept serves it is noted.
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
         pays = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)

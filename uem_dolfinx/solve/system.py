@@ -63,7 +63,7 @@ class BodySystem:
         self.forces, self.pairs, self.solver = forces, list(pairs), solver
         self.config, self.comm = forces.config, forces.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
-        solver.lasting = (forces.tangent.linear or newton == "modified") and forces.dynamics is None
+        solver.lasting = forces.tangent.linear or newton == "modified"
         self._factored: object = None
         self.complete = solver.complete
         self._curvature: PETSc.Mat | None = None
