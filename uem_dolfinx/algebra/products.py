@@ -207,7 +207,8 @@ class UnitedMatrix:
         comm = self.space.comm
         wanted = self._missing(changes)
         if self.reserving:
-            more, _ = self._changes(P.reserved(), P.reserved() if Q is P else Q.reserved(), G)
+            trial = P.reserved()
+            more, _ = self._changes(trial, trial if Q is P else Q.reserved(), G)
             wanted = np.union1d(wanted, self._missing(more))
         self._begins = False
         if begins:
