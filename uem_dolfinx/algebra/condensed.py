@@ -51,12 +51,14 @@ class Condensed:
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
         #: Whether a step begins, which may not depend on what others have touched.
         self._begins = False
-        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, what solves with K_II, and S there.
+        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, what solves with K_II, S there, and
+        #: whether K_II has a negative determinant.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._pc: Any = None
         self._S: Any = None
+        self._negative_inside = False
         #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
         self.made_of: Any = None
         self._dense: _Dense | None = None
@@ -129,6 +131,17 @@ class Condensed:
         if S is None:
             self.drop()
             return False
+        self._negative_inside = mumps.is_negative(pc)
+        if not mumps.solves_with_schur_complement(space.comm):
+            inner = space.vector(P.free & ~nodes[:, None])
+            A.diagonalScale(inner, inner)
+            stiffen(A, K, inner.array_r == 0.0)
+            pc.reset()
+            pc.setOperators(A)
+            pc.setUp()
+            if pc.getFailedReason() != PETSc.PC.FailedReason.NOERROR:
+                self.drop()
+                return False
         self._pc, self._S, self._made_for = pc, S, (K, K.stateGet(), P.free)
         return True
 
@@ -148,7 +161,7 @@ class Condensed:
             self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
             if self.space.comm.rank == 0:
                 self._dense = _Dense(self._S, curvature, trial[:, used], None if P is Q else test[:, used], used)
-            self.negative = mumps.is_negative(self._pc) != self.space.comm.bcast(self._dense and self._dense.negative)
+            self.negative = self._negative_inside != self.space.comm.bcast(self._dense and self._dense.negative)
 
     def solve(self, rhs: PETSc.Vec, again: bool = False) -> PETSc.Vec:
         """Unknowns dq of the united problem; not finite where it is singular (collective).

@@ -11,6 +11,8 @@ import ctypes
 from functools import cache
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -68,8 +70,15 @@ def condenses(pc: PETSc.PC) -> bool:
     return solves(pc) and _petsc() is not None
 
 
+def solves_with_schur_complement(comm: MPI.Comm) -> bool:
+    """Whether PETSc solves with a factorisation that has a Schur complement: on several ranks those after 3.18 do not."""
+    return comm.size == 1 or PETSc.Sys.getVersion() < (3, 19)
+
+
 def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
-    """Factorise all unknowns but some, with which the PC then solves; what it makes of these is zero (collective).
+    """Factorise all unknowns but some (collective).
+
+    The PC then solves with them, and gives zero at those left, where ``solves_with_schur_complement``.
 
     Args:
         pc: of a type that factorises, with a matrix, not yet set up.
