@@ -45,18 +45,24 @@ class Condensed:
         self.space = space
         self.drop()
 
+    #: What solves with K_II.
+    _pc: Any = None
+
     def drop(self) -> None:
-        """Forget K."""
+        """Forget K (collective)."""
+        if self._pc is not None:
+            # garbage would keep the factors until the next iteration
+            self._pc.destroy()
         #: K, the state of its values, and the components without Dirichlet condition.
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
         #: Whether a step begins, which may not depend on what others have touched.
         self._begins = False
-        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, what solves with K_II, S there, and
-        #: whether K_II has a negative determinant.
+        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S there, and whether K_II has a
+        #: negative determinant.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
-        self._pc: Any = None
+        self._pc = None
         self._S: Any = None
         self._negative_inside = False
         #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
