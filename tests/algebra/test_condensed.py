@@ -91,6 +91,7 @@ def test_solutions_are_those_of_the_whole(name, kind, apart, curved):
             free = gathered_vector(P.space.vector(P.free)) > 0
             assert np.abs((gathered_vector(asked) - exact)[free]).max() <= EXACT * np.abs(exact).max() * np.linalg.cond(A)
             assert solver.negative == (Q is not P and np.linalg.slogdet(A)[0] < 0)
+            assert kind == "lu" or solver.indefinite == (np.linalg.eigvalsh(A)[0] < 0)
     # without anything that contact does, it is of the whole
     assert calls[FACTORISATION] == 1 + whole and calls[CONDENSED] == 3 - whole
 
@@ -103,6 +104,9 @@ def test_sign_of_the_determinant(inside, contact):
     solver, equations = solver_of(config), [(0, [0.0, 1.0], 1)]
     solver.set_operator(united(config, equations), K, None, united(config, equations))
     assert solver._on_condensed and solver.negative == (inside * contact < 0)
+    solver = solver_of(config, "cholesky")
+    solver.set_operator(united(config, equations), K, None)
+    assert solver._on_condensed and solver.indefinite == (min(inside, contact) < 0)
 
 
 def test_a_singular_problem():

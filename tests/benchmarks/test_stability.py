@@ -48,7 +48,7 @@ def test_correct(name):
 @pytest.mark.parametrize(
     "name",
     [
-        *("E ratio 1e-09", "edge 3D", "beside 2D finite", "two-pass 3:4", "chain"),
+        *("E ratio 1e-09", "edge 3D", "beside 2D finite", "two-pass 3:4", "chain", "mirrored hexahedron 2"),
         *(pytest.param(name, marks=pytest.mark.slow) for name in ("vertex ridge", "vertex flat", "sharp corner", "off the end")),
     ],
 )

@@ -71,6 +71,23 @@ class Arch:
         )
 
 
+def test_a_step_that_fails_after_an_unstable_equilibrium_says_so():
+    """The united matrix has a negative eigenvalue between the limit points, where the load falls, and at no stable equilibrium."""
+    arch, h, told = Arch(n=20), 1e-3, []
+
+    def path():
+        for _ in uem.load_steps(arch.problem, 20, arc_length=True):
+            slope = (shallow(arch.height() - h) - shallow(arch.height() + h)) / (2 * h)
+            if arch.floor.n_active == 0 and abs(slope) > 0.1 * shallow(LIMIT) / RISE:
+                told.append(arch.problem.solver.indefinite)
+                assert told[-1] == (slope < 0.0)
+                if told[-1]:
+                    arch.problem.max_iterations = 1
+
+    raised(uem.ConvergenceError, r"at the load factor 0\.\d+ the equilibrium was unstable.*take time steps", path)
+    assert False in told and True in told
+
+
 def test_arch_snaps_through():
     """Its load goes up to the limit, down, up again, and by the floor to its end: every state is in equilibrium under its load."""
     arch = Arch(rtol=1e-10, n=20)

@@ -58,18 +58,18 @@ class Condensed:
         #: Whether a step begins, which may not depend on what others have touched.
         self._begins = False
         #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S there, and whether K_II has a
-        #: negative determinant.
+        #: negative determinant, and negative eigenvalues.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._pc = None
         self._S: Any = None
-        self._negative_inside = False
+        self._negative_inside = self._indefinite_inside = False
         #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
         self.made_of: Any = None
         self._dense: _Dense | None = None
-        #: Whether the united matrix has a negative determinant.
-        self.negative = False
+        #: Whether the united matrix has a negative determinant, and, where it is symmetric, negative eigenvalues.
+        self.negative = self.indefinite = False
         #: What the increment is without dq, one of the last solves with K du, and whether the last solve was of I, too.
         self.closure: PETSc.Vec | None = None
         self._known: tuple[PETSc.Vec, PETSc.Vec] | None = None
@@ -137,7 +137,7 @@ class Condensed:
         if S is None:
             self.drop()
             return False
-        self._negative_inside = mumps.is_negative(pc)
+        self._negative_inside, self._indefinite_inside = mumps.is_negative(pc), mumps.is_indefinite(pc)
         if not mumps.solves_with_schur_complement(space.comm):
             inner = space.vector(P.free & ~nodes[:, None])
             A.diagonalScale(inner, inner)
@@ -167,7 +167,8 @@ class Condensed:
             self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
             if self.space.comm.rank == 0:
                 self._dense = _Dense(self._S, curvature, trial[:, used], None if P is Q else test[:, used], used)
-            self.negative = self._negative_inside != self.space.comm.bcast(self._dense and self._dense.negative)
+            negative, indefinite = self.space.comm.bcast(self._dense and (self._dense.negative, self._dense.indefinite))
+            self.negative, self.indefinite = self._negative_inside != negative, self._indefinite_inside or indefinite
 
     def solve(self, rhs: PETSc.Vec, again: bool = False) -> PETSc.Vec:
         """Unknowns dq of the united problem; not finite where it is singular (collective).
@@ -297,7 +298,7 @@ class _Dense:
         M = np.asarray((P if Q is None else Q).T @ np.ascontiguousarray((P.T @ S.T).T))
         if G is not None:
             M += ((P if Q is None else Q).T @ G @ P).toarray()
-        self._positive = self.negative = False
+        self._positive = self.negative = self.indefinite = False
         if not len(M):
             # every component is eliminated or prescribed
             return
@@ -305,6 +306,7 @@ class _Dense:
         if Q is None and (np.abs(M - M.T) <= SYMMETRIC * root[:, None] * root).all():
             factor, failed = lapack.dpotrf(M, lower=1)
             self._positive = failed == 0
+            self.indefinite = not self._positive
         if self._positive:
             self._factor = factor
             return

@@ -191,8 +191,7 @@ class UnitedSolver:
                 stiffen(self._A, K, ~restriction.used.ravel())
         else:
             self._A = self._united.update(restriction, restriction, K, G)
-        symmetric = is_symmetric(self._A)
-        if not symmetric and self._instead and self.iterative:
+        if not (symmetric := is_symmetric(self._A)) and self._instead and self.iterative:
             self._use(self._instead)
         self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
@@ -241,8 +240,7 @@ class UnitedSolver:
         with timed("factorisation or preconditioner set-up"), self._in_database(**options):
             if self._condensed.factorise(P, Q, K, G, pc, symmetric):
                 return True
-        more = mumps.more_workspace(pc)
-        if more:
+        if more := mumps.more_workspace(pc):
             logger.debug("MUMPS lacked room, and gets more: %s", more)
             return self._factorise_inside(P, Q, K, G, **options | more)
         return False
@@ -294,8 +292,8 @@ class UnitedSolver:
 
     def _keep_preconditioner(self, equations: UnitingEquations) -> None:
         """Decide whether the preconditioner serves the present matrix as well (collective)."""
-        keep, before = False, self._made_with
-        if self.iterative and before is not None:
+        keep = False
+        if self.iterative and (before := self._made_with) is not None:
             same = np.array_equal(equations.node, before.node)
             changed = (equations.active != before.active).sum() if same else len(before) + 1
             changed, present = reduced(self.space.comm, np.array([changed, before.active.sum()]))
@@ -313,8 +311,14 @@ class UnitedSolver:
     @property
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
-        condensed = self._on_condensed
-        return (self._apart and self._condensed.negative) if condensed else (self._tells_sign and mumps.is_negative(self.pc))
+        if self._on_condensed:
+            return self._apart and self._condensed.negative
+        return self._tells_sign and mumps.is_negative(self.pc)
+
+    @property
+    def indefinite(self) -> bool:
+        """Whether the symmetric united matrix that was factorised last has negative eigenvalues, as far as MUMPS tells."""
+        return self._condensed.indefinite if self._on_condensed else mumps.is_indefinite(self.pc)
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
@@ -330,8 +334,7 @@ class UnitedSolver:
         with self._in_database(**options):
             self.ksp.setUp()
             self.ksp.setUpOnBlocks()
-        more = mumps.more_workspace(self.pc)
-        if more:
+        if more := mumps.more_workspace(self.pc):
             logger.debug("MUMPS lacked room, and gets more: %s", more)
             operators = self.ksp.getOperators()
             self.pc.reset()
@@ -364,9 +367,7 @@ class UnitedSolver:
             self._tell_unused()
             if np.isfinite(dq.norm()):
                 return dq, 1
-            raise LinearSolveError(
-                "the united problem is singular: hold free bodies by Dirichlet conditions, or bring them into contact"
-            )
+            raise LinearSolveError("the united problem is singular: hold free bodies by Dirichlet conditions, or make them touch")
         self._condensed.whole = True
         if self._served is not None:
             found = self._kept.solve(*self._served, rhs, accuracy) if accuracy > 0 else None
@@ -378,9 +379,8 @@ class UnitedSolver:
             return self.solve(rhs, accuracy, near)
         dq = rhs.duplicate()
         # a factorisation has no use for a guess
-        near = near if self.iterative else None
-        self.ksp.setInitialGuessNonzero(near is not None)
-        if near is not None:
+        self.ksp.setInitialGuessNonzero(near is not None and self.iterative)
+        if near is not None and self.iterative:
             near.copy(dq)
         if self.inexact:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))

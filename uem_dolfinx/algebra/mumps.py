@@ -1,8 +1,9 @@
 """What is asked of MUMPS beside solving: whether it needs more room, and the sign of the determinant.
 
 Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the room it has beyond what the analysis foresees,
-ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa; with a Schur complement both are of what it is the complement of, and
-with ICNTL(26) = 0 so are solves. petsc4py has no Schur complements: PETSc's own library is called.
+INFOG(12) the number of negative pivots of a symmetric one, ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa. With a
+Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are solves. petsc4py has no Schur complements: PETSc's
+own library is called.
 """
 
 from __future__ import annotations
@@ -51,6 +52,11 @@ def more_workspace(pc: PETSc.PC) -> dict[str, Any]:
 def is_negative(pc: PETSc.PC) -> bool:
     """Whether the determinant of what was factorised with ``TELLS_SIGN`` is negative."""
     return bool(pc.getFactorMatrix().getMumpsRinfog(12) < 0.0)
+
+
+def is_indefinite(pc: PETSc.PC) -> bool:
+    """Whether a symmetric factorisation has negative pivots; not told if it is not MUMPS that made it."""
+    return bool(solves(pc) and pc.getType() == "cholesky" and pc.getFactorMatrix().getMumpsInfog(12) > 0)
 
 
 @cache

@@ -134,6 +134,8 @@ class Elimination:
             kept = ~lone[beside[0]]
             row, term, value = beside = row[kept], term[kept], value[kept]
             left = self._left_of_circles(plain, beside)
+            # the plain rows' own circles are not theirs to break
+            left[np.bincount(row, minlength=len(left)) == 0] = 0.0
             most = reduced(self.config.comm, float(left.max(initial=0.0)), op=MPI.MAX)
             if most <= FADED:
                 return beside, np.einsum("mjjg->mjg", on_facet)

@@ -136,14 +136,14 @@ class UnitedProblem:
             dynamics=dynamics,
             check_inversion=check_inversion,
         )
-        solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
+        self.solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
         free = self.forces.free[: self.config.n_owned]
         pairs = [contact.attach(self.config, free) for contact in self.contacts]
         if dynamics is not None:
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.forces.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
-        self.system = method(self.forces, pairs, solver, newton=newton, consistent_tangent=consistent_tangent)
+        self.system = method(self.forces, pairs, self.solver, newton=newton, consistent_tangent=consistent_tangent)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
         #: How far the problem is, in steps and in load.
