@@ -318,7 +318,7 @@ class UnitedSolver:
     @property
     def indefinite(self) -> bool:
         """Whether the symmetric united matrix that was factorised last has negative eigenvalues, as far as MUMPS tells."""
-        return self._condensed.indefinite if self._on_condensed else mumps.is_indefinite(self.pc)
+        return self._condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc))
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
