@@ -274,6 +274,12 @@ def create_vector(V: Any) -> PETSc.Vec:
     return b
 
 
+def dirichletbc(value: Any, dofs: Any, V: Any) -> Any:
+    """DOLFINx's Dirichlet condition of a value at d.o.f. of a space or of a part of it."""
+    # DOLFINx 0.5 tries the space itself first, and prints all d.o.f. into the error that it then catches: most of the call's time
+    return fem.dirichletbc(value, dofs, V._cpp_object if DOLFINX_VERSION < (0, 6) else V)
+
+
 def is_dirichlet(bc: Any) -> bool:
     """Whether this is a Dirichlet condition."""
     return hasattr(bc, "dof_indices") and hasattr(bc, "function_space")

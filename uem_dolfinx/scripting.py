@@ -51,10 +51,10 @@ def dirichlet(
     mesh.topology.create_connectivity(tag.dim, tdim)
     sub = V if component is None or V.dofmap.index_map_bs == 1 else V.sub(int(component))
     if not isinstance(value, fem.Function):
-        return fem.dirichletbc(value, fem.locate_dofs_topological(sub, tag.dim, tag.entities), sub)
+        return compat.dirichletbc(value, fem.locate_dofs_topological(sub, tag.dim, tag.entities), sub)
     if sub is V:
         return fem.dirichletbc(value, fem.locate_dofs_topological(V, tag.dim, tag.entities))
-    return fem.dirichletbc(value, fem.locate_dofs_topological((sub, value.function_space), tag.dim, tag.entities), sub)
+    return compat.dirichletbc(value, fem.locate_dofs_topological((sub, value.function_space), tag.dim, tag.entities), sub)
 
 
 def _checked(V: Any, component: int | None, value: Any) -> Any:
