@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import FacetProjection, gap_hessians
 from uem_dolfinx.geometry.search import MeshTarget
@@ -271,7 +271,7 @@ def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Ar
     Returns:
         Shape functions of the first facet, continued as far as need be, and their derivatives along the line ``(k, nn)``.
     """
-    along = np.cross(normals[:, 0], normals[:, 1])
+    along = cross_products(normals[:, 0], normals[:, 1])
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along /= np.where(length > 0, length, 1.0)
     vertex = x[:, node]
@@ -291,7 +291,7 @@ def _away(arms: Array, normals: Array, count: Ints) -> Array:
     gdim = arms.shape[2]
     along = arms - np.einsum("krg,krg->kr", arms, normals)[:, :, None] * normals
     if gdim == 3:
-        edge = np.cross(normals[:, 0], normals[:, 1])
+        edge = cross_products(normals[:, 0], normals[:, 1])
         size = np.linalg.norm(edge, axis=1, keepdims=True)
         edge = np.where((count == 2)[:, None], edge / np.where(size > 0, size, 1.0), 0.0)
         along -= np.einsum("krg,kg->kr", along, edge)[:, :, None] * edge[:, None]

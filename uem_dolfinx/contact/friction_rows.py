@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.contact.frame import Frame
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints
 from uem_dolfinx.contact.ties import Ties
@@ -70,7 +70,7 @@ def with_friction(
         tilted = _tilted(frictionless, across, tilt, place, frame.ties)
     stopping = trial
     if g == 3:
-        beside = along(np.cross(normal[who], directions[who]), np.zeros(len(who)), slipping, frame.ties)
+        beside = along(cross_products(normal[who], directions[who]), np.zeros(len(who)), slipping, frame.ties)
         stopping = UnitingEquations.join([trial, beside], g)
     return Constraints(
         trial,

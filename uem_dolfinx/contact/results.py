@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, cross_products
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ def moments(x: Array, f: Array) -> Array:
     """Moments about the origin of forces ``f (n, gdim)`` at ``x``, ``(n, 1)`` in 2D and ``(n, 3)`` in 3D."""
     if x.shape[1] == 2:
         return (x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0])[:, None]
-    return np.cross(x, f)
+    return cross_products(x, f)
 
 
 def sum_up(comm: MPI.Comm, x: Array, f: Array) -> Resultant:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.geometry.overlaps import SLIVER, cross
 from uem_dolfinx.geometry.shapes import FacetShape, area_vectors
 
@@ -243,7 +243,7 @@ def dual_tangents(tangent: Array, n: Array) -> Array:
     if tangent.shape[1] == 1:
         across = np.stack([-n[:, 1], n[:, 0]], axis=1)[:, None]
     else:
-        across = np.stack([np.cross(tangent[:, 1], n), np.cross(n, tangent[:, 0])], axis=1)
+        across = np.stack([cross_products(tangent[:, 1], n), cross_products(n, tangent[:, 0])], axis=1)
     return np.asarray(across / np.einsum("qfg,qfg->qf", across, tangent)[:, :, None])
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.geometry.search import ON_SIDE
 
 #: Halvings that find a time to the last bit.
@@ -102,7 +102,7 @@ def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Int
 def _normals(x: Array) -> Array:
     """Normals of simplices ``x (k, gdim, gdim)`` in the sense of their numbering, as long as the simplices are large."""
     t = x[:, 1:] - x[:, :1]
-    return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if x.shape[1] == 2 else np.cross(t[:, 0], t[:, 1])
+    return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if x.shape[1] == 2 else cross_products(t[:, 0], t[:, 1])
 
 
 def _extremes(f: Callable[[Array], Array], low: Array, high: Array) -> list[Array]:

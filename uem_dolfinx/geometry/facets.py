@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,10 +10,10 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.shapes import FacetShape, area_vectors, facet_shape, unit_normals
+from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import agree, count_keys
 
@@ -30,13 +30,13 @@ class FacetData:
         nodal_normals: averaged outward unit normals there ``(m, nn, gdim)``.
         corner_normals: sums of the outward unit normals of the facets around each corner, each times the angle that the facet has
             there ``(m, n_corners, gdim)``. Of a point whose closest point is the corner they tell whether it is outside (Baerentzen
-            and Aanaes, 2005, doi:10.1109/TVCG.2005.49).
+            and Aanaes, 2005, doi:10.1109/TVCG.2005.49). None where they were not asked for.
     """
 
     x: Array
     nodes: Ints
     nodal_normals: Array
-    corner_normals: Array
+    corner_normals: Array | None = None
 
 
 class TargetFacets:
@@ -120,35 +120,34 @@ class TargetFacets:
 
     def normals(self) -> Array:
         """Outward unit normals of the facets at their nodes, each its own ``(m, nn, gdim)``."""
-        x = self.x
-        at_nodes = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
-        return np.stack([self.sign[:, None] * unit_normals(tab, x) for tab in at_nodes], axis=1)
+        return _unit(self._area_vectors(self.x))
 
-    def current(self) -> FacetData:
-        """Facets where they are now (collective: normals are summed over ranks)."""
+    def _area_vectors(self, x: Array) -> Array:
+        """Outward normals at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``, as long as the facets are large."""
+        return self.sign[:, None, None] * nodal_area_vectors(self.shape, x)
+
+    def current(self, corners: bool = False) -> FacetData:
+        """Facets where they are now, with normals at corners if they are asked for (collective: normals are summed over ranks)."""
         x = self.x
-        at_nodes = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
         # every node sees its facet under the angle-free area weight
-        vectors = np.stack([self.sign[:, None] * area_vectors(tab, x) for tab in at_nodes], axis=1)
+        vectors = self._area_vectors(x)
+        data = FacetData(x, self.nodes, _unit(self._summed(vectors)))
+        if not corners:
+            return data
         angles = self.shape.corner_angles(x)
-        corners = vectors[:, : angles.shape[1]]
-        return FacetData(x, self.nodes, _unit(self._summed(vectors)), self._summed(angles[:, :, None] * _unit(corners)))
+        return replace(data, corner_normals=self._summed(angles[:, :, None] * _unit(vectors[:, : angles.shape[1]])))
 
     def _summed(self, vectors: Array) -> Array:
         """Sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, seen from each of them (collective)."""
         field, dofs = self._normal_field, self.dofs[:, : vectors.shape[1]]
-        field.x.array[:] = 0.0
         nodal = field.x.array.reshape(-1, self.config.gdim)
-        for a in range(vectors.shape[1]):
-            np.add.at(nodal, dofs[:, a], vectors[:, a])
+        nodal[:] = sums_of_rows(dofs.ravel(), vectors.reshape(-1, self.config.gdim), len(nodal))
         forms.sum_ghosts(field)
         return np.asarray(nodal[dofs])
 
     def spread(self) -> Array:
         """Areas of the facets around each node, over the length of their sum as vectors: 1 where all is flat ``(m, nn)`` (collective)."""
-        x = self.x
-        tabs = [self.shape.tabulate(np.tile(xi, (len(x), 1))) for xi in self.shape.nodes]
-        vectors = self.sign[:, None, None] * np.stack([area_vectors(tab, x) for tab in tabs], axis=1)
+        vectors = self._area_vectors(self.x)
         parts = np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2).reshape(
             -1, self.config.gdim + 1
         )

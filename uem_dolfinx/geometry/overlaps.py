@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Ints, cross_products
 from uem_dolfinx.geometry.shapes import FacetShape
 
 #: A segment that is smaller is rounding of two sides that coincide.
@@ -62,12 +62,12 @@ class Planes:
         ends = (corner[:, 3] - corner[:, 0], corner[:, 2] - corner[:, 1]) if shape.cell == "quadrilateral" else (
             along, corner[:, 2] - corner[:, 0],
         )  # fmt: skip
-        area = 0.5 * np.cross(*ends)
+        area = 0.5 * cross_products(*ends)
         size = np.linalg.norm(area, axis=1)
         n = area / size[:, None] * sign[:, None]
         t = along - np.einsum("mg,mg->m", along, n)[:, None] * n
         t /= np.linalg.norm(t, axis=1, keepdims=True)
-        return cls(corner[:, 0], np.stack([t, np.cross(n, t), n], axis=1), size)
+        return cls(corner[:, 0], np.stack([t, cross_products(n, t), n], axis=1), size)
 
     @property
     def normal(self) -> Array:

@@ -82,7 +82,7 @@ class MeshTarget:
 
     def project(self, points: Array) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
-        data, size = self.facets.current(), self.comm.size
+        data, size = self.facets.current(corners=True), self.comm.size
         if size == 1:
             return self._evaluate(points, self._project_here(points, data))
         # the answer of the rank that seems nearest tells who else can be as near
@@ -234,6 +234,7 @@ class MeshTarget:
             facet: this rank's numbers of the facets ``(n,)``.
             data: this rank's facets.
         """
+        assert data.corner_normals is not None
         n_corners = data.corner_normals.shape[1]
         height = np.einsum("ng,ng->n", away, unit_normals(tab, data.x[facet])) * self.facets.sign[facet]
         corner, is_open = tab.N[:, :n_corners] > 1 - ON_SIDE, self.facets.open_nodes[facet, :n_corners]

@@ -12,7 +12,7 @@ from functools import cache, cached_property
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array, Indices, cross_products
 from uem_dolfinx.forms import create_lagrange_element, reference_topology
 
 #: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
@@ -59,7 +59,7 @@ class FacetShape:
         else:
             ddN[..., 0, 0], ddN[..., 1, 1] = t[3], t[5]
             ddN[..., 0, 1] = ddN[..., 1, 0] = t[4]
-        return Tabulated(t[0], np.moveaxis(t[1 : 1 + d], 0, -1), ddN)
+        return Tabulated(t[0], t[1 : 1 + d].transpose(1, 2, 0), ddN)
 
     def functions(self, xi: Array) -> Array:
         """Shape functions alone at ``xi (n, fdim)``: ``(n, nn)``."""
@@ -85,6 +85,11 @@ class FacetShape:
         """Reference positions of the nodes ``(nn, fdim)``."""
         return np.zeros((1, 0)) if self._element is None else np.asarray(self._element.points)
 
+    @cached_property
+    def nodal(self) -> Tabulated:
+        """Shape functions at the nodes."""
+        return self.tabulate(self.nodes)
+
     @property
     def ring(self) -> list[int]:
         """Corners of a facet with an area in their order around it, in the sense of its parametrisation."""
@@ -94,16 +99,19 @@ class FacetShape:
         """Angles of facets ``x (n, nn, gdim)`` at their corners, 1 at either end of an interval ``(n, n_corners)``."""
         if self.dim == 1:
             return np.ones((len(x), 2))
+        ahead, back = (arms @ x for arms in self._sides_at_corners[:, None])
+        across = np.linalg.norm(cross_products(ahead, back), axis=2)
+        return np.asarray(np.arctan2(across, np.einsum("ncg,ncg->nc", ahead, back)))
+
+    @cached_property
+    def _sides_at_corners(self) -> Array:
+        """Weights of the nodes in the tangents at the corners along the next side and along the one before ``(2, n_corners, nn)``."""
         ring, corners = self.ring, facet_shape(self.cell, 1).nodes
-        angles = np.empty((len(x), len(ring)))
+        sides = np.empty((2, len(ring), len(self.nodes)))
         for i, corner in enumerate(ring):
-            dN = self.tabulate(corners[corner][None]).dN[0]
-            ahead, back = (
-                x.transpose(0, 2, 1) @ (dN @ (corners[ring[j]] - corners[corner])) for j in ((i + 1) % len(ring), i - 1)
-            )
-            across = np.linalg.norm(np.cross(ahead, back), axis=1)
-            angles[:, corner] = np.arctan2(across, np.einsum("ng,ng->n", ahead, back))
-        return angles
+            for which, j in enumerate(((i + 1) % len(ring), i - 1)):
+                sides[which, corner] = self.nodal.dN[corner] @ (corners[ring[j]] - corners[corner])
+        return sides
 
     @property
     def middle(self) -> Array:
@@ -163,8 +171,17 @@ def tangents(tab: Tabulated, x: Array) -> Array:
 
 def area_vectors(tab: Tabulated, x: Array) -> Array:
     """Normals ``(n, gdim)`` in the sense of the facet's own parametrisation, as long as the facet is large."""
-    t = tangents(tab, x)
-    return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if t.shape[1] == 1 else np.cross(t[:, 0], t[:, 1])
+    return _across(tangents(tab, x))
+
+
+def nodal_area_vectors(shape: FacetShape, x: Array) -> Array:
+    """The same at the nodes of facets ``x (n, nn, gdim)``: ``(n, nn, gdim)``."""
+    return _across(np.einsum("kaf,nag->nkfg", shape.nodal.dN, x))
+
+
+def _across(t: Array) -> Array:
+    """Vectors across tangents ``t (..., fdim, gdim)``: ``(..., gdim)``."""
+    return np.stack([t[..., 0, 1], -t[..., 0, 0]], axis=-1) if t.shape[-2] == 1 else cross_products(t[..., 0, :], t[..., 1, :])
 
 
 def unit_normals(tab: Tabulated, x: Array) -> Array:
