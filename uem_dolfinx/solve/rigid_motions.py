@@ -57,6 +57,8 @@ class RigidMotions:
         self.comm.Allreduce(MPI.IN_PLACE, radius, op=MPI.MAX)
         self.radius: Array = radius
         self._supports: tuple[Array, Bools] | None = None
+        #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; where bodies turn little always the same.
+        self._unheld: Any | None = None
         self.share = 0.0
 
     # -- motions ---------------------------------------------------------------------------------------------------------
@@ -87,8 +89,8 @@ class RigidMotions:
         Args:
             values: rows in the modes of a body ``(n, n_modes)``.
             body: which one ``(n,)``.
-            row: that each belongs to ``(n,)``; None numbers them.
-            number: of rows; None takes as many as there are values.
+            row: that each belongs to ``(n,)``, with their ``number``; None numbers them.
+            number: of rows.
 
         Returns:
             Sparse matrix ``(number, n_motions)``.
@@ -96,9 +98,11 @@ class RigidMotions:
         from scipy.sparse import csr_matrix
 
         n = self.n_modes
-        row = np.arange(len(values)) if row is None else row
-        at = np.repeat(row, n), (body[:, None] * n + np.arange(n)).ravel()
-        return csr_matrix((values.ravel(), at), shape=(len(values) if number is None else number, self.count * n))
+        column = (body[:, None] * n + np.arange(n)).ravel()
+        if row is None or number is None:
+            starts = np.arange(0, values.size + 1, n)
+            return csr_matrix((values.ravel(), column, starts), shape=(len(values), self.count * n))
+        return csr_matrix((values.ravel(), (np.repeat(row, n), column)), shape=(number, self.count * n))
 
     def rates(self, equations: UnitingEquations) -> Any:
         """How fast each motion opens the gap of each equation, a sparse matrix ``(m, n_motions)`` (collective)."""
@@ -118,10 +122,12 @@ class RigidMotions:
         """
         if self.finite:
             self.middle = self._middles()
-        body, modes, _ = self._held()
-        values, vectors = np.linalg.eigh(reduced(self.comm, self._products(body, modes, modes)))
-        b, k = np.nonzero(values < OPEN**2)
-        free = self._spread(vectors[b, :, k], b).T.tocsc()
+        if self.finite or self._unheld is None:
+            body, modes, _ = self._held()
+            values, vectors = np.linalg.eigh(reduced(self.comm, self._products(body, modes, modes)))
+            b, k = np.nonzero(values < OPEN**2)
+            self._unheld = self._spread(vectors[b, :, k], b).T.tocsr()
+        free = self._unheld
         if rates is None:
             return free
         here = rates @ free
