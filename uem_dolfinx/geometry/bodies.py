@@ -52,6 +52,8 @@ def _find_bodies(nodes: Nodes) -> tuple[Ints, int]:
     pairs = np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()])
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(nodes.n_local,) * 2)
     n_pieces, piece = connected_components(graph, directed=False)
+    if comm.size == 1:
+        return piece.astype(np.int64), int(n_pieces)
     sizes = comm.allgather(n_pieces)
     mine = piece + sum(sizes[: comm.rank])
     label = fem.Function(nodes.V)

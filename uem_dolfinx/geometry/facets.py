@@ -166,12 +166,12 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
     """Cell dofs of each local facet, in the numbering of the facet's own element ``(n_facets, nn)``."""
     layout = config.V.dofmap.dof_layout
     topology = forms.reference_topology(compat.cell_name(config.mesh))
+    number = [{tuple(sorted(entity)): i for i, entity in enumerate(entities)} for entities in topology]
     rows = []
     for vertices in topology[config.tdim - 1]:
         row: list[int] = []
         for dim, entities in enumerate(shape.topology):
             for local in entities:
-                i = [sorted(e) for e in topology[dim]].index(sorted(vertices[v] for v in local))
-                row += list(layout.entity_dofs(dim, i))
+                row += list(layout.entity_dofs(dim, number[dim][tuple(sorted(vertices[v] for v in local))]))
         rows.append(row)
     return np.array(rows, dtype=np.int32)

@@ -409,14 +409,18 @@ def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) 
         tree, largest = cKDTree(points[own]), within[own].max()
         for which, other, r in theirs:
             found = tree.sparse_distance_matrix(other, largest + r, output_type="ndarray")
+            if not len(found):
+                continue
             i, f = own[found["i"]], which[found["j"]]
             near = found["v"] <= within[i] + r
             rows.append(i[near])
             facets.append(f[near])
-    return np.concatenate(rows), np.concatenate(facets)
+    none = np.zeros(0, np.int64)
+    return np.concatenate([none, *rows]), np.concatenate([none, *facets])
 
 
 def _like(sizes: Array) -> list[Ints]:
     """Indices of positive sizes in classes that differ by less than a factor of two."""
     size_class = np.floor(np.log2(sizes / sizes.max(initial=0.0)))
-    return [np.flatnonzero(size_class == c) for c in np.unique(size_class)]
+    order = np.argsort(size_class, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(size_class[order])) + 1) if len(order) else []
