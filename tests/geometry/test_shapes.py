@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from uem_dolfinx.geometry.shapes import closest_point, facet_shape, unit_normals
+from uem_dolfinx.geometry.shapes import closest_point, facet_shape, nodal_area_vectors, tangents, unit_normals
 
 KINDS = [("interval", 1), ("interval", 2), ("triangle", 1), ("triangle", 2), ("quadrilateral", 1), ("quadrilateral", 2)]
 
@@ -105,3 +105,21 @@ def test_point_on_a_curved_facet_is_its_own_foot(cell, degree):
         same = np.sqrt(d2) > abs(height) - 1e-12
         assert same.mean() > 0.9 and (same.all() or height)
         assert np.abs(found - xi)[same].max() < 1e-12
+
+
+@pytest.mark.parametrize("cell,degree", KINDS)
+def test_vectors_and_angles_at_the_nodes(cell, degree):
+    """At all nodes at once the area vectors are those found point by point; corner angles are those between straight sides."""
+    shape = facet_shape(cell, degree)
+    x = random_facets(shape, 4, np.random.default_rng(3), 0.1)
+    vectors = nodal_area_vectors(shape, x)
+    for a, xi in enumerate(shape.nodes):
+        t = tangents(shape.tabulate(np.tile(xi, (len(x), 1))), x)
+        across = np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if shape.dim == 1 else np.cross(t[:, 0], t[:, 1])
+        assert np.abs(vectors[:, a] - across).max() < 1e-13 * np.abs(across).max()
+    if shape.dim == 2 and degree == 1:
+        angles = shape.corner_angles(x)
+        for i, corner in enumerate(shape.ring):
+            arms = x[:, [shape.ring[i - 1], shape.ring[(i + 1) % len(shape.ring)]]] - x[:, [corner]]
+            arms /= np.linalg.norm(arms, axis=2, keepdims=True)
+            np.testing.assert_allclose(np.cos(angles[:, corner]), (arms[:, 0] * arms[:, 1]).sum(axis=1), rtol=1e-12)
