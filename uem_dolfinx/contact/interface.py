@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.sliding import Sliding
 
 #: A normal return may change nodal forces by this part of the largest contact force.
-#: [heuristic; largest contact force; -]
+#: [heuristic; largest contact force; test_load_steps_resumed.py::test_scenes_have_what_they_are_made_for]
 GENTLE = 0.1
 
 
