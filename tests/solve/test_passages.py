@@ -261,6 +261,44 @@ def test_bodies_that_turn_together(angle):
     refuse_passages(problem.config, problem.pairs, problem.committed, [None])
 
 
+def across(slope, n, coupling):
+    """A small block that is led from flank to flank of a valley (slope > 0) or a ridge (slope < 0), in front of both all along."""
+    deep = 1.0 + abs(slope)
+
+    def bend(x):
+        return np.column_stack([x[:, 0], x[:, 1] + slope * np.abs(x[:, 0]) * (x[:, 1] + deep) / deep])
+
+    low = box("quadrilateral", [-1.0, -deep], [1.0, 0.0], [2 * n, 3]).mapped(bend)
+    flank, size = 0.45 * slope, 0.1
+    start = [-0.5, flank + 0.05 if slope > 0 else 0.6 * abs(slope)]
+    high = box("quadrilateral", start, np.array(start) + size, [1, 1])
+    s = scene(COMM, "quadrilateral", [low, high])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    faces = s.tag("faces", 0, lambda x: np.abs(x[:, 1] - slope * np.abs(x[:, 0])) < 1e-9)
+    contact = uem.Contact(s.tag("tip", 1, at(1, start[1])), faces, coupling=coupling)
+    # the lower corner of the block's base ends a little inside of the other flank
+    x = 0.4 if slope > 0 else 0.5
+    end = [x, slope * (x + (size if slope > 0 else 0.0)) - 0.01]
+    way = np.array(end) - start
+    bcs = [*clamp(V, s.tag("base", 0, at(1, -deep))), *clamp(V, s.tag("top", 1, at(1, start[1] + size)), value=way)]
+    problem = uem.UnitedProblem(linear(u, modulus(s, 10.0, 1.0)), u, bcs=bcs, contacts=[contact])
+    return problem, contact
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("slope", [0.4, 0.6])
+@pytest.mark.parametrize("n", [2, 5])
+def test_faces_that_look_at_each_other(slope, n, coupling):
+    """From flank to flank of a valley a contactor meets nothing, however long its way; over a ridge it might have met the other face."""
+    problem, contact = across(slope, n, coupling)
+    problem.solve()
+    assert contact.n_active > 0
+    problem, _ = across(-slope, n, coupling)
+    with pytest.raises(uem.TunnellingError, match="comes to a face beside an edge of the target"):
+        problem.solve()
+
+
 def test_small_ways_are_not_looked_at(monkeypatch):
     """Where nothing moves by half a facet no way is searched for crossings."""
     from uem_dolfinx.solve import passages

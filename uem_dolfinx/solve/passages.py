@@ -187,7 +187,10 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
         beside &= ~(nearest.beyond != 0.0).any(axis=1)
         # the mean of the normals about an edge leans from those of both faces
         sharp = 1.0 / np.hypot(1.0, CORNER)
-        other = (beside & (_dot(nearest.averaged, outward) < sharp)) | (_dot(target.outward(touched), outward) < sharp)
+        normal = target.outward(touched)
+        # from a face that stands before the one that they touch, they come by a concave edge or across free space
+        turned = (_dot(normal, outward) < sharp) & (_dot(nearest.foot - touched.foot, normal) <= PASSAGE_DEPTH * target.stride)
+        other = (beside & (_dot(nearest.averaged, outward) < sharp)) | turned
         way = np.linalg.norm(x - touched.foot, axis=1)
         unsure[new] = np.where(other & (way > target.stride), way, 0.0)
     return behind, unsure
