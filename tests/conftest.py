@@ -92,7 +92,7 @@ def every_converged_state(monkeypatch: pytest.MonkeyPatch) -> None:
             # another method of contact keeps other conditions
             return history
         # a step that unloads is in equilibrium against the forces that were there before
-        largest[self] = max(largest.get(self, 0.0), self.forces.residual.norm())
+        largest[self] = max(largest.get(self, 0.0), self.bodies.residual.norm())
         check_state(self, largest[self])
         return history
 
@@ -101,9 +101,9 @@ def every_converged_state(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def check_state(problem: uem.UnitedProblem, scale: float) -> None:
     """Bodies in equilibrium, contacts closed or free of force, forces in pairs; ``scale`` is the norm of forces (collective)."""
-    forces_of_bodies, config = problem.forces, problem.config
-    forces_of_bodies.assemble()
-    F = forces_of_bodies.residual
+    bodies, config = problem.bodies, problem.config
+    bodies.assemble()
+    F = bodies.residual
     rounding = 10 * problem.system.rounding()
     forces = F.duplicate()
     forces.set(0.0)
@@ -117,7 +117,7 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         # where the foot stays behind, the forces of a pair lie on two lines
         assert balance is None or (balance.force < 1e-11 and (balance.moment < lever(contact) or contact.sliding != "finite"))
         forces.axpy(1.0, compat.petsc_vector(contact.force))
-    left = (F - forces).array_r.reshape(-1, config.gdim) * forces_of_bodies.free[: config.n_owned]
+    left = (F - forces).array_r.reshape(-1, config.gdim) * bodies.free[: config.n_owned]
     assert highest(config.comm, np.abs(left)) <= 1e-5 * scale + rounding
 
 

@@ -175,15 +175,15 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     def residual(u: Array) -> PETSc.Vec:
         problem.u.x.array[:] = u.ravel()
         system.place(returning=False)
-        problem.forces.assemble()
+        problem.bodies.assemble()
         pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
-        r = problem.forces.residual
+        r = problem.bodies.residual
         r.axpy(-1.0, compat.petsc_vector(contact.force))
         return r
 
     residual(smooth)
     facets = pair.projection.facet.copy()
-    A = problem.forces.update_tangent().copy()
+    A = problem.bodies.update_tangent().copy()
     curvature = curvature_of(system.pairs, system.config.vector(), system._apart, False)
     assert curvature is not None
     du = A.createVecRight()

@@ -73,7 +73,7 @@ def strict_error(u: fem.Function, stress: Any, p: float, E: float, nu: float) ->
 
 def condition_ratio(problem: uem.UnitedProblem, dim: int, n: int, degree: int, E: float, nu: float) -> float:
     """Condition number of the last united matrix over the bodies' own: their largest eigenvalue, the smallest in one piece (serial)."""
-    largest = eigenvalues.largest_eigenvalue(problem.system.forces.tangent.K)
+    largest = eigenvalues.largest_eigenvalue(problem.system.bodies.tangent.K)
     return eigenvalues.condition_number(problem.system.solver.A) / (largest / smallest_in_one_piece(dim, n, degree, E, nu))
 
 

@@ -37,7 +37,7 @@ def iterations(problem):
     system, solver = problem.system, problem.system.solver
     solver.forget()
     P = system.restriction()
-    solver.set_operator(P, problem.forces.tangent.K, None)
+    solver.set_operator(P, problem.bodies.tangent.K, None)
     force = scattered(np.sin(np.arange(3.0 * problem.config.index_map.size_global)), P.P.createVecLeft())
     return solver.solve(P.transpose(force))[1]
 
@@ -54,7 +54,7 @@ def test_much_stiffer_contactors_are_found(ratio, found):
     """What lies on what is not much stiffer is left to multigrid."""
     problem, contact, _ = pressed(ratio)
     solver = problem.system.solver
-    hard = pressed_hard(problem.config, solver.A, problem.forces.tangent.K, problem.system.restriction())
+    hard = pressed_hard(problem.config, solver.A, problem.bodies.tangent.K, problem.system.restriction())
     assert bool(COMM.allreduce(int(hard.sum()))) == found
     assert (solver.ksp.getPC().getType() == "python") == found
 
@@ -63,7 +63,7 @@ def test_deflated_unknowns_are_solved_exactly():
     """On the columns of W, unknowns near the contact and rigid motions of the stiff block, the preconditioner is the inverse."""
     problem, _, _ = pressed(1e4, n=3)
     solver, P, config = problem.system.solver, problem.system.restriction(), problem.config
-    K = problem.forces.tangent.K
+    K = problem.bodies.tangent.K
     solver.set_operator(P, K, None)
     hard = pressed_hard(config, solver.A, K, P)
     W = deflated(config, solver.A, P, hard)

@@ -76,10 +76,10 @@ def test_trial_rows_apart_from_test_rows():
     """Chords stand in the trial rows alone; the matrix is ``Q'KP``, against dense products, and its solves are exact."""
     b, problem, _ = pressed("triangle", 2, chords=True)
     system, n = problem.system, problem.config.n_owned
-    problem.forces.assemble()
-    state = system.unite(lambda norm, scale, rounding: False)
+    problem.bodies.assemble()
+    state = system.assemble_constraints(lambda norm, scale, rounding: False)
     assert state.trial is not state.test
-    K = problem.forces.update_tangent()
+    K = problem.bodies.update_tangent()
     P, Q, Kd = gathered_matrix(state.trial.P), gathered_matrix(state.test.P), gathered_matrix(K)
     assert np.abs(P - Q).max() > 1e-3
     used = gathered_vector(scattered_like(state, n, b.gdim))

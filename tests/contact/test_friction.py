@@ -11,16 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import RADIUS, cylinder, driven, fields, history, loose
-from helpers import (
-    NU,
-    factors,
-    gathered_matrix,
-    highest,
-    lowest,
-    refused,
-    rotation,
-    st_venant,
-)
+from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, lowest, modulus, refused, rotation, run, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -181,11 +172,11 @@ def test_tangent_by_differences(cell):
         pair.trial = replace(pair.trial, active=np.ones(n, bool), lam=lam, nodal=lam, friction=friction)
         problem.u.x.array[:] = u.ravel()
         problem.system.place(returning=False)
-        problem.forces.assemble()
+        problem.bodies.assemble()
         pair.trial = replace(
             pair.trial, force=lam[:, None] * (pair.projection.normal - mu * pair.friction.directions(pair.trial))
         )
-        r = problem.forces.residual
+        r = problem.bodies.residual
         r.axpy(-1.0, compat.petsc_vector(scene.contact.force))
         return r
 
@@ -194,7 +185,7 @@ def test_tangent_by_differences(cell):
     residual(smooth, s)
     problem.system._apart = True
     du = problem.config.vector(way[: problem.config.n_owned])
-    plain = problem.forces.update_tangent() * du
+    plain = problem.bodies.update_tangent() * du
     full = plain + curvature_of([pair], du, problem.system._apart, False) * du
     difference = residual(smooth + 1e-5 * way, s) - residual(smooth - 1e-5 * way, s)
     difference.scale(0.5e5)
@@ -280,6 +271,22 @@ def test_a_moving_plane_takes_the_block_along():
             assert f[0] == pytest.approx(0.05 * f[1], rel=1e-10)
 
 
+def test_multigrid_between_stick_and_slip(comm):
+    """Multigrid of the user's serves united matrices that are symmetric and unsymmetric by turns: the answer of a factorisation."""
+
+    def solved(options):
+        b = blocks(comm, "hexahedron", 4, 5, overhang=0.5)
+        contact = uem.Contact(b.high, b.low, friction=0.3)
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.02, 0.02, -0.1])]
+        law = st_venant(b.u, modulus(b.scene, 1.0, 2.0))
+        problem = uem.UnitedProblem(law, b.u, bcs=bcs, contacts=[contact], petsc_options=options)
+        run(problem, 2)
+        return b.scene.gather(b.u)
+
+    multigrid = {"ksp_type": "cg", "pc_type": "gamg", "mg_levels_pc_type": "jacobi"}
+    np.testing.assert_allclose(solved(multigrid), solved(None), rtol=0, atol=1e-8)
+
+
 def test_the_sign_of_the_determinant():
     """Where Q'KP has a negative determinant, which dense algebra confirms, the answer is refused by name."""
     for mu, negative in ((0.5, False), (6.0, True)):
@@ -290,10 +297,10 @@ def test_the_sign_of_the_determinant():
         friction = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=np.tile([1.0, 0.0], (n, 1)))
         pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=friction)
         rows = system._rows()
-        state = system._state(rows, rows.test.transpose(scene.problem.forces.residual), 0.0, False, True)
+        state = system._state(rows, rows.test.transpose(scene.problem.bodies.residual), 0.0, False, True)
         system._factored = None
-        system.solve(system.linearise(state), 0.0)
-        P, Q, K = (gathered_matrix(A) for A in (state.trial.P, state.test.P, scene.problem.forces.tangent.K))
+        system.solve(system.linearise(state, None), 0.0, None)
+        P, Q, K = (gathered_matrix(A) for A in (state.trial.P, state.test.P, scene.problem.bodies.tangent.K))
         used = np.abs(P).max(axis=0) > 0
         assert (np.linalg.slogdet((Q.T @ K @ P)[np.ix_(used, used)])[0] < 0) == negative == system.solver.negative
         system._not_unique = state if negative else None

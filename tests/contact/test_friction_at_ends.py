@@ -55,16 +55,16 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     pair, state, size = contact.pair, contact.pair.trial, problem.config.n_owned
     stick = state.active & state.friction.stick
     assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().frictionless.circular
-    made, placed, free = pair.equations(), pair.kinematics, problem.forces.free[:size].ravel()
+    made, placed, free = pair.equations(), pair.kinematics, problem.bodies.free[:size].ravel()
     kept = made.frictionless.active
     rows, who, normal = rows_of(made.frictionless.select(kept), size)[:, free], made.contactor[kept], made.tangent[kept] < 0
     # no motion that is left opens a gap or moves what sticks
     P = gathered_matrix(problem.system._rows().frictionless.P)[free]
     assert np.abs(rows @ P).max() <= 1e-13 and np.linalg.matrix_rank(P) == free.sum() - len(rows)
-    problem.forces.assemble()
+    problem.bodies.assemble()
     share = placed.force_per_multiplier
     slipping = np.where(pair.friction.slipping(state)[:, None], state.friction.tau / share[:, None], 0.0)
-    F = problem.forces.residual.array_r[free] - problem.config.add_at_owners(*placed.ties.handed_on(slipping)).ravel()[free]
+    F = problem.bodies.residual.array_r[free] - problem.config.add_at_owners(*placed.ties.handed_on(slipping)).ravel()[free]
     found, *_ = np.linalg.lstsq(rows.T, F, rcond=None)
     assert np.linalg.norm(rows.T @ found - F) <= 1e-10 * np.linalg.norm(F)
     largest, lam, tau = state.lam.max(), np.zeros_like(state.lam), np.zeros_like(state.force)

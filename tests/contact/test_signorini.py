@@ -64,8 +64,8 @@ def test_against_quadratic_programming(cell, n):
     _, contact, problem = quarter(cell, n, vertical_gap(g, d, R), sliding="fixed")
     run(problem)
     config = problem.config
-    K = gathered_matrix(problem.forces.update_tangent())
-    free = np.concatenate(COMM.allgather(problem.forces.free[: config.n_owned].ravel()))
+    K = gathered_matrix(problem.bodies.update_tangent())
+    free = np.concatenate(COMM.allgather(problem.bodies.free[: config.n_owned].ravel()))
     first = config.index_map.local_range[0]
     own = (first + contact.pair.nodes) * g + g - 1
     normal = np.concatenate(COMM.allgather(own))
@@ -133,10 +133,10 @@ def test_complementarity_on_rigid_surfaces(target, cell):
         complementary(contact, 1e-14, 1e-13)
     assert contact.n_active > 1
     # equilibrium: the contact balances what base and symmetry planes hold, where a contactor may lie in a symmetry plane, too
-    problem.forces.assemble()
+    problem.bodies.assemble()
     n = problem.config.n_owned
-    held = problem.forces.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
-    fixed = ~problem.forces.free[:n]
+    held = problem.bodies.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
+    fixed = ~problem.bodies.free[:n]
     assert highest(COMM, np.abs(held[~fixed])) < 1e-10 * np.abs(contact.resultant().force).max()
     reaction = np.array(COMM.allreduce((held * fixed).sum(axis=0)))
     assert np.abs(reaction + contact.resultant().force).max() < 1e-10 * np.abs(reaction).max()

@@ -339,4 +339,4 @@ def test_what_is_told(name, how, moved, monkeypatch):
     value = getattr(target_corners, name)
     for factor, expected in moved.items():
         monkeypatch.setattr(target_corners, name, factor * value)
-        assert (contact.corner_inside(problem.forces.stiffness) is not None) == expected
+        assert (contact.corner_inside(problem.bodies.stiffness) is not None) == expected

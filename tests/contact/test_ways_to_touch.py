@@ -58,10 +58,10 @@ def in_equilibrium(problem, contact, history, size, stress):
     # places are rounded, and so are the forces that follow from them
     rounding = 1e-14 * stress * size ** (g - 1)
     assert not history[-1].changed and history[-1].residual * force <= problem.rtol * force + rounding
-    problem.forces.assemble()
+    problem.bodies.assemble()
     n = problem.config.n_owned
-    r = problem.forces.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
-    free = problem.forces.free[:n]
+    r = problem.bodies.residual.array_r.reshape(-1, g) - contact.force.x.array.reshape(-1, g)[:n]
+    free = problem.bodies.free[:n]
     assert highest(COMM, np.abs(r[free])) <= 1e-9 * force + rounding
 
 
@@ -94,8 +94,8 @@ def meet(
         assert step.cuts == 0
         iterations += step.newton_iterations
     assert iterations <= PATIENCE
-    problem.forces.assemble()
-    work = problem.forces.residual.array_r @ problem.config.displacement[: problem.config.n_owned].ravel()
+    problem.bodies.assemble()
+    work = problem.bodies.residual.array_r @ problem.config.displacement[: problem.config.n_owned].ravel()
     energy = 0.5 * float(COMM.allreduce(work)) / (stress * length**g)
     force = contact.resultant().force @ R / (stress * length ** (g - 1))
     return Meeting(b.scene.gather(b.u) @ R / length, force, contact.n_active, energy, iterations, contact)

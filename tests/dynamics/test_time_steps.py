@@ -109,7 +109,7 @@ def test_first_acceleration():
     held = Bar(20, gap=0.0, v=0.0, gravity=(0.0, -10.0), wall=False, held=True)
     held.run(1e-4, 1e-4)
     a = held.dynamics.acceleration.x.array.reshape(-1, 2)[:, 1]
-    free = held.problem.forces.free[:, 1]
+    free = held.problem.bodies.free[:, 1]
     assert np.allclose(a[free], -10.0, rtol=1e-2) and np.all(a[~free] == 0.0)
 
 
@@ -171,9 +171,9 @@ def test_linear_flight_assembles_once():
     """K is assembled once, and factored once, while nothing touches; so it is while the contact stays."""
     bar = Bar(20)
     bar.run(0.01, 0.45)
-    assert bar.problem.forces.tangent.number == 1
+    assert bar.problem.bodies.tangent.number == 1
     bar.run(0.01, 1.1)
-    assert bar.problem.forces.tangent.number == 1
+    assert bar.problem.bodies.tangent.number == 1
 
 
 def test_massy_contactors_warn(caplog):
@@ -347,14 +347,14 @@ def test_a_failed_step_leaves_the_committed_state():
     bar = Bar(20, gap=0.5, v=-2.0, law=uem.StVenantKirchhoff, gravity=(0.0, -10.0))
     bar.run(0.01, 0.3)
     problem, dynamics = bar.problem, bar.dynamics
-    problem.forces.assemble()
-    before = [np.array(x) for x in (bar.u.x.array, dynamics.velocity.x.array, problem.forces.residual.array_r)]
+    problem.bodies.assemble()
+    before = [np.array(x) for x in (bar.u.x.array, dynamics.velocity.x.array, problem.bodies.residual.array_r)]
     force, time = bar.contact.resultant().force, dynamics.time
     problem.max_iterations = 0
     with pytest.raises(uem.ConvergenceError):
         next(uem.time_steps(problem, 0.01, 0.35))
-    problem.forces.assemble()
-    after = (bar.u.x.array, dynamics.velocity.x.array, problem.forces.residual.array_r)
+    problem.bodies.assemble()
+    after = (bar.u.x.array, dynamics.velocity.x.array, problem.bodies.residual.array_r)
     assert all(np.array_equal(a, b) for a, b in zip(before, after))
     assert dynamics.time == time and np.array_equal(bar.contact.resultant().force, force)
     problem.max_iterations = 50

@@ -244,7 +244,7 @@ def test_going_on_is_not_having_stopped(cell, normals, folder):
     if COMM.size == 1:
         for name in ("committed", "largest_forces"):
             assert np.array_equal(getattr(first, name), getattr(second, name))
-        assert np.array_equal(first.forces.stiffness, second.forces.stiffness)
+        assert np.array_equal(first.bodies.stiffness, second.bodies.stiffness)
     assert lead(second, range(5, 11)) == iterations[4:]
     u, v = s.gather(whole.u), t.gather(second.u)
     assert np.abs(u - v).max() <= 1e-9 * np.abs(u).max()

@@ -272,11 +272,11 @@ def test_errors_leave_the_last_step(monkeypatch):
     """After a step that fails for good, and after a load that raises, forces are those of the last step, and it goes on from it."""
     impact = Impact(moving=False)
     list(uem.time_steps(impact.problem, DT, 0.04))
-    problem, forces = impact.problem, impact.problem.forces
+    problem, bodies = impact.problem, impact.problem.bodies
 
     def residual():
-        forces.assemble()
-        return forces.residual.array_r.copy()
+        bodies.assemble()
+        return bodies.residual.array_r.copy()
 
     before, u = residual(), impact.u.x.array.copy()
 

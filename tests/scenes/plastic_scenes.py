@@ -28,6 +28,6 @@ def block(comm: MPI.Comm, cell: str, n: int = 2, degree: int = 1, **how: Any) ->
 
 def reaction(problem: uem.UnitedProblem) -> float:
     """Work of the internal forces on the present displacement."""
-    problem.forces.assemble()
-    r = problem.forces.residual.array_r
+    problem.bodies.assemble()
+    r = problem.bodies.residual.array_r
     return problem.comm.allreduce(float(r @ problem.u.x.array[: len(r)]))

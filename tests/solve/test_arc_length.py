@@ -93,9 +93,9 @@ def test_arch_snaps_through():
     arch = Arch(rtol=1e-10, n=20)
     path, residuals = [], []
     for step in uem.load_steps(arch.problem, 10, arc_length=True):
-        arch.problem.forces.assemble()
-        F = arch.problem.system.restriction().transpose(arch.problem.forces.residual).norm()
-        residuals.append(F / arch.problem.forces.residual.norm())
+        arch.problem.bodies.assemble()
+        F = arch.problem.system.restriction().transpose(arch.problem.bodies.residual).norm()
+        residuals.append(F / arch.problem.bodies.residual.norm())
         path.append((arch.height(), float(arch.q.value), arch.floor.n_active, step.factor))
     a, q, active, factor = np.array(path).T
     free = active == 0
@@ -112,7 +112,7 @@ def test_length_of_the_arc():
     """Every step but the first and the last goes as far as the one before, along it; a state is closed only there."""
     arch, ends = Arch(), []
     for _ in uem.load_steps(arch.problem, 10, arc_length=True):
-        ends.append(arch.problem.forces.displacement())
+        ends.append(arch.problem.bodies.displacement())
         if len(ends) == 6:
             break
     ways = [b - a for a, b in zip(ends, ends[1:])]
@@ -122,7 +122,8 @@ def test_length_of_the_arc():
     direction = ways[-1].array_r / ways[-1].norm()
     for part, closed in ((1 - 3e-9, True), (1 - 3e-8, False)):
         led.begin(0.5, direction, 1.0)
-        led.displace(led.displacement(), arch.problem.config.vector(part * direction), 1.0)
+        bodies = arch.problem.bodies
+        bodies.displace(bodies.displacement(), arch.problem.config.vector(part * direction), 1.0)
         assert (abs(led._missing) <= arc_length.ON_THE_PLANE) == closed
 
 
@@ -142,14 +143,14 @@ def test_loads_that_are_not_proportional():
 
     arch = Arch(squared)
     led = ArcLength(arch.problem)
-    led.begin(0.5, np.zeros(arch.problem.forces.displacement().local_size), 1.0)
-    arch.problem.forces.assemble()
-    led.differentiate(first=True)
-    slope = arch.problem.forces.residual.copy()
+    led.begin(0.5, np.zeros(arch.problem.bodies.displacement().local_size), 1.0)
+    arch.problem.bodies.assemble()
+    led._differentiate()
+    slope = arch.problem.bodies.residual.copy()
     led._set(0.0)
-    arch.problem.forces.assemble()
+    arch.problem.bodies.assemble()
     # dF/ds = 2 s f, and F(0.5) - F(0) = f / 4
-    slope = 4 * (slope - arch.problem.forces.residual)
+    slope = 4 * (slope - arch.problem.bodies.residual)
     error = (led._slope - slope).norm() / slope.norm()
     assert 2e-5 < error < 2e-4
     path = Arch(lambda arch: {arch.q: lambda s: 2 * shallow(LIMIT) * s**2}).path(4)

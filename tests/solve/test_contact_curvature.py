@@ -58,9 +58,9 @@ def test_curvature_without_equations(again):
     b = blocks(COMM, "triangle", 2, 3)
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)])
     config = problem.config
-    free = problem.forces.free[: config.n_owned]
+    free = problem.bodies.free[: config.n_owned]
     none = Restriction(config, UnitingEquations.join([], config.gdim), free, np.zeros(free.shape))
-    K, pair = problem.forces.update_tangent(), problem.contacts[0].pair
+    K, pair = problem.bodies.update_tangent(), problem.contacts[0].pair
     nodes = np.column_stack([config.to_global(pair.nodes), pair.projection.nodes])
     size = nodes.shape[1] * config.gdim
     blocks_of = np.random.default_rng(COMM.rank).normal(size=(len(nodes), size, size))

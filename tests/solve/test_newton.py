@@ -36,8 +36,36 @@ def test_linear_body_assembles_its_tangent_once():
     b, contact, problem = pressed(law=linear, sliding="fixed", consistent_tangent=False)
     steps = run(problem, 3)
     assert sum(step.newton_iterations for step in steps) >= 3
-    assert problem.forces.tangent.number == 1
+    assert problem.bodies.tangent.number == 1
     assert contact.n_active > 0
+
+
+def test_solves_on_the_way_are_as_accurate_as_newton_needs():
+    """Looser solves take less than four fifths of the linear iterations of solves to 1e-8, and at most a quarter more Newton iterations."""
+
+    def iterations(cell, law, fine, **accuracy):
+        _, _, problem = pressed(cell, law=law, fine=fine, petsc_options={"ksp_type": "cg", "pc_type": "jacobi", **accuracy})
+        steps = [i for step in uem.load_steps(problem, 3) for i in step.iterations]
+        return sum(i.linear_iterations > 0 for i in steps), sum(i.linear_iterations for i in steps)
+
+    scenes = [("triangle", st_venant, 4), ("quadrilateral", linear, 4), ("hexahedron", linear, 1)]
+    loose, tight = (np.sum([iterations(*scene, **how) for scene in scenes], axis=0) for how in ({}, {"ksp_rtol": 1e-8}))
+    assert loose[0] <= 1.25 * tight[0] and loose[1] <= 0.79 * tight[1]
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_the_last_solve_is_as_accurate_as_convergence_asks(rtol):
+    """A linear problem takes one solve, which leaves neither more than a twentieth of what converges nor less than a 250th."""
+    left = []
+    for n in (4, 5, 6, 7, 8, 9):
+        b = blocks(COMM, "triangle", n, n, gap=0.5)
+        F = linear(b.u, 1.0) + 0.01 * ufl.TestFunction(b.V)[0] * ufl.dx
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top)]
+        problem = uem.UnitedProblem(F, b.u, bcs=bcs, petsc_options={"ksp_type": "cg", "pc_type": "jacobi"}, rtol=rtol)
+        history = problem.solve()
+        assert len(history) == 2
+        left.append(history[-1].residual / rtol)
+    assert 4e-3 < np.median(left) < 5e-2
 
 
 def test_modified_newton_gives_the_same_state():
@@ -48,7 +76,7 @@ def test_modified_newton_gives_the_same_state():
         answers[newton] = (
             b.scene.gather(b.u),
             contact.n_active,
-            problem.forces.tangent.number,
+            problem.bodies.tangent.number,
             sum(s.newton_iterations for s in steps),
         )
     full, modified = answers["full"], answers["modified"]

@@ -9,7 +9,7 @@ import pytest
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.newton import solve_united
+from uem_dolfinx.solve.newton import FORCING, Increment, IterationState, LinearisedProblem, solve_united
 
 
 def vector(value):
@@ -19,13 +19,13 @@ def vector(value):
 
 
 class OneUnknown:
-    """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none; see ``UnitedSystem``."""
+    """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none: bodies and ``ContactMethod`` in one."""
 
-    linear = tolerant = in_contact = frictional = inexact = convex = False
+    exact, iterative, passing, fits, convex, in_contact = True, False, False, False, False, False
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0
-        self.lengths = []
+        self.lengths, self.active_sets = [], 0
 
     def F(self):
         if self.solves < 2:
@@ -33,40 +33,8 @@ class OneUnknown:
             return 1.0 - (1.0 - self.left) * self.u if self.left < 1.0 else 1.0 + 2.0 * self.u**2 - 0.5 * self.u
         return 0.0
 
-    def place(self, returning):
-        pass
-
-    def assemble_residual(self):
+    def assemble(self):
         return True
-
-    def unite(self, settled):
-        R = vector(self.F())
-        return SimpleNamespace(
-            residual=R, norm=R.norm(), scale=1.0, rounding=0.0, strain_rounding=0.0, gap=0.0, active=0, changed=False, right=True,
-            closed=True,
-        )  # fmt: skip
-
-    def forces_above_rounding(self):
-        return 0.0
-
-    def differentiate(self, first):
-        pass
-
-    def exchange(self, state, du, driving, accuracy):
-        return None
-
-    def linearise(self, state):
-        self.solves += 1
-        return vector(-self.F())
-
-    def solve(self, rhs, accuracy, near):
-        return vector(1.0), 1
-
-    def complete(self, dq):
-        return dq
-
-    def move(self, state, dq):
-        return dq
 
     def displacement(self):
         return self.u
@@ -78,16 +46,49 @@ class OneUnknown:
     def inverted(self):
         return None
 
+    def above_rounding(self, in_contact):
+        return 0.0
+
+    def place(self, returning):
+        pass
+
+    def assemble_constraints(self, in_equilibrium):
+        R, rows = vector(self.F()), SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))
+        return IterationState(rows, rows, R, R.norm(), 1.0, 0.0, 0.0, 0.0, 0, False, True, True, self.in_contact)
+
+    def linearise(self, state, iteration):
+        self.solves += 1
+        return LinearisedProblem(state, vector(-self.F()), self.exact, self.iterative, self.passing, self.fits, self.convex)
+
+    def solve(self, problem, accuracy, near):
+        dq = vector(self.answer(problem.rhs, accuracy, near))
+        return Increment(dq, dq, problem.rhs, 1, accuracy)
+
+    def answer(self, rhs, accuracy, near):
+        return 1.0
+
+    def exchange(self, problem, step):
+        if self.active_sets == 0:
+            return None
+        self.active_sets -= 1
+        return self.assemble_constraints(None)
+
+    def complete(self, problem, step):
+        return step
+
     def reduced_residual(self, state):
         return vector(self.F())
+
+    def loop(self, max_iterations=10, line_search=True):
+        """The history of the Newton loop."""
+        return solve_united(self, self, rtol=1e-8, max_iterations=max_iterations, line_search=line_search, verbose=False)
 
 
 @pytest.mark.parametrize(("left", "length"), [(0.3, 1.0), (0.85, 1.0), (0.95, 1.0 / 64)])
 def test_what_the_line_search_accepts(left, length):
     """A step that leaves 0.85 of the residual is taken whole, one that leaves 0.95 is shortened until nothing is left to shorten."""
     system = OneUnknown(left)
-    history = solve_united(system, rtol=1e-8, max_iterations=10, line_search=True, verbose=False)
-    assert history[1].step_length == length
+    assert system.loop()[1].step_length == length
 
 
 @pytest.mark.parametrize("convex", [False, True])
@@ -100,17 +101,13 @@ def test_steps_go_on_downhill(convex):
         def F(self):
             return -np.sin(0.05 + self.u)
 
-        def linearise(self, state):
-            self.solves += 1
-            return vector(-self.F())
-
-        def solve(self, rhs, accuracy, near):
-            return vector(0.1 * np.sign(rhs.array_r[0])), 1
+        def answer(self, rhs, accuracy, near):
+            return 0.1 * np.sign(rhs.array_r[0])
 
     system = Hill(1.0)
     system.convex = convex
     with pytest.raises(uem.ConvergenceError) as caught:
-        solve_united(system, rtol=1e-8, max_iterations=1, line_search=True, verbose=False)
+        system.loop(max_iterations=1)
     # 0.05 + 0.1 * 16 < pi < 0.05 + 0.1 * 32
     assert caught.value.history[-1].step_length == (16.0 if convex else 1.0 / 64)
 
@@ -118,38 +115,35 @@ def test_steps_go_on_downhill(convex):
 def test_no_convergence_is_an_error_with_its_history():
     """Never a silent end of the loop."""
     system = OneUnknown(0.5)
-    system.linearise = lambda state: vector(-1.0)
     system.F = lambda: 1.0
     with pytest.raises(uem.ConvergenceError, match="no convergence in 4 iterations") as found:
-        solve_united(system, rtol=1e-8, max_iterations=4, line_search=False, verbose=False)
+        system.loop(max_iterations=4, line_search=False)
     assert [i.residual for i in found.value.history] == [1.0] * 5
 
 
 def test_exchanges_are_settled_by_loose_solves():
-    """Who is wrong is asked of solutions to 1e-3, each begun where the last one ended; the last is as accurate as convergence asks for."""
+    """Who is wrong is asked of loose solutions, each begun where the last one ended; the last is as accurate as convergence asks for."""
     system, asked = OneUnknown(0.5), []
-    system.inexact = system.in_contact = system.linear = True
-    system.F = lambda: 1.0 if system.solves < 3 else 0.0
+    system.exact, system.iterative, system.in_contact, system.active_sets = False, True, True, 1
+    system.F = lambda: 1.0 if len(asked) < 4 else 0.0
 
-    def solve(rhs, accuracy, near):
+    def answer(rhs, accuracy, near):
         asked.append((accuracy, None if near is None else near.array_r[0]))
-        return vector(float(len(asked))), 1
+        return float(len(asked))
 
-    def unite(settled):
-        state = OneUnknown.unite(system, settled)
-        state.trial = SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))
-        return state
-
-    def exchange(state, du, driving, accuracy):
-        return unite(None) if len(asked) == 1 else None
-
-    def linearise(state):
-        system.solves += 1
-        return vector(-1.0)
-
-    system.linearise, system.solve, system.unite, system.exchange = linearise, solve, unite, exchange
-    history = solve_united(system, rtol=1e-8, max_iterations=10, line_search=False, verbose=False)
+    system.answer = answer
+    history = system.loop(line_search=False)
     # the first may not be the last: contact has yet to be met
-    assert asked[:3] == [(1e-3, None), (1e-3, 10.0), (1e-4, 2.0)]
-    assert asked[3] == (1e-3, None) and asked[4] == (pytest.approx(1e-9), 4.0)
-    assert [(i.exchanges, i.linear_iterations) for i in history] == [(1, 3), (0, 2), (0, 0)]
+    assert asked[:2] == [(FORCING, None), (FORCING, 10.0)]
+    assert asked[2] == (FORCING, None) and asked[3] == (pytest.approx(1e-9), 3.0)
+    assert [(i.exchanges, i.linear_iterations) for i in history] == [(1, 2), (0, 2), (0, 0)]
+
+
+def test_solves_on_the_way_leave_the_more_the_less_is_known():
+    """Where tangents change a solve leaves a part of the right-hand side that falls with the residual, and no less than is asked for."""
+    system, asked = OneUnknown(0.5), []
+    system.exact, system.passing = False, True
+    system.F = lambda: (1.0, 1e-2, 1e-5, 1e-9)[len(asked)]
+    system.answer = lambda rhs, accuracy, near: asked.append(accuracy) or 1.0
+    system.loop(line_search=False)
+    assert asked == pytest.approx([FORCING, 1e-2 * FORCING, 0.1 * 1e-8 / 1e-5])

@@ -20,7 +20,7 @@ def test_no_references_in_circles(degree):
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.15])]
     problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact])
     run(problem, 2)
-    known = [weakref.ref(o) for o in (problem.system, problem.forces, contact.pair, problem.config)]
+    known = [weakref.ref(o) for o in (problem.system, problem.bodies, contact.pair, problem.config)]
     gc.disable()
     try:
         problem.__dict__.clear()

@@ -22,7 +22,7 @@ def body(request):
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [size, size], [3, 3])])
     u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
     problem = uem.UnitedProblem(linear(u, 1.0), u)
-    return RigidMotions(problem.config, problem.forces.free[: problem.config.n_owned], False), problem.config
+    return RigidMotions(problem.config, problem.bodies.free[: problem.config.n_owned], False), problem.config
 
 
 def corner_equation(config, direction):
@@ -71,7 +71,7 @@ def test_supports_are_the_same_on_every_number_of_ranks():
         config = problem.config
         # last bits that another partition would have
         config.X[:] += 4e-16 * np.random.default_rng(seed).integers(-1, 2, config.X.shape)
-        motions = RigidMotions(config, problem.forces.free[: config.n_owned], False)
+        motions = RigidMotions(config, problem.bodies.free[: config.n_owned], False)
         i, c = np.nonzero(motions.supports(motions.open_motions(None), UnitingEquations.join([], 2)))
         return sorted(sum(comm.allgather([(*np.round(config.X[k], 6), d) for k, d in zip(i, c)]), []))
 

@@ -1,4 +1,6 @@
-"""The united system: when gaps count as closed, and what steps a call of ``unite`` takes."""
+"""Contact by elimination: when gaps count as closed, and what a solve predicts."""
+
+from dataclasses import replace
 
 from mpi4py import MPI
 
@@ -8,6 +10,7 @@ from friction_scenes import driven
 from helpers import blocks, clamp, linear, run
 
 import uem_dolfinx as uem
+from uem_dolfinx.solve.newton import Increment
 
 COMM = MPI.COMM_WORLD
 
@@ -31,8 +34,8 @@ def test_gaps_that_count_as_closed(length):
         config.displacement[nodes, 1] += part * config.size
         b.u.x.scatter_forward()
         system.place(returning=False)
-        system.assemble_residual()
-        state = system.unite(equilibrium)
+        problem.bodies.assemble()
+        state = system.assemble_constraints(equilibrium)
         assert state.closed == closed and not state.changed
 
 
@@ -44,16 +47,15 @@ def test_what_a_solve_foretells(length):
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=[contact])
     system, config = problem.system, problem.config
     system.place(returning=False)
-    system.assemble_residual()
+    problem.bodies.assemble()
     for part, closes in ((3e-9, False), (3e-8, True)):
-        state = system.unite(equilibrium)
-        system.differentiate(first=True)
-        system.linearise(state)
+        state = system.assemble_constraints(equilibrium)
+        linearised = system.linearise(state, 0)
         du = problem.config.vector()
         way = np.zeros((config.n_owned, 2))
         way[config.X[: config.n_owned, 1] > 0.25 * length, 1] = -0.5 * length * (1 + part)
         du.array[:] = way.ravel()
-        assert (system.exchange(state, du, 0.0, 0.0) is not None) == closes
+        assert (system.exchange(linearised, Increment(du, du, linearised.rhs, 1, 0.0)) is not None) == closes
 
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
@@ -65,18 +67,17 @@ def test_the_united_matrix_follows_q(coupling):
     system, pair = d.problem.system, d.contact.pair
     assert d.states[1] > 0
     system.place(returning=False)
-    system.assemble_residual()
-    system.unite(lambda *norms: False)
-    system.differentiate(first=True)
+    d.problem.bodies.assemble()
+    system.linearise(system.assemble_constraints(lambda *norms: False), 0)
     for lam in (None, pair.trial.lam, None):
         pair.friction.hold_limits(lam)
         rows = system._rows()
         state = system._state(rows, rows.test.transpose(system._residual()), 0.0, False, False)
         assert (state.test is state.trial) == (lam is not None)
-        system.linearise(state)
-        loads = d.problem.forces.residual.duplicate()
+        linearised = system.linearise(state, None)
+        loads = d.problem.bodies.residual.duplicate()
         loads.set(1.0)
         rhs = state.test.transpose(loads)
-        dq, _ = system.solve(rhs, 0.0)
-        left = state.test.transpose(d.problem.forces.tangent.K * state.trial.expand(dq)) - rhs
+        dq = system.solve(replace(linearised, rhs=rhs), 0.0, None).dq
+        left = state.test.transpose(d.problem.bodies.tangent.K * state.trial.expand(dq)) - rhs
         assert left.norm() <= 1e-9 * rhs.norm()

@@ -225,7 +225,7 @@ def test_one_ufl_residual_for_any_number_of_loads():
     history = problem.solve()
     assert max(orders(history)) >= 1.8
     # K is not symmetric, which the direct solver sees, and no LDL' takes half of it
-    K = gathered_matrix(problem.system.forces.tangent.K)
+    K = gathered_matrix(problem.system.bodies.tangent.K)
     assert np.abs(K - K.T).max() > 1e-3 * np.abs(K).max() and problem.system.solver.pc.getType() == "lu"
     # global equilibrium: what the pressure pushes on the current top arrives at the contact
     J = ufl.det(F) * ufl.dot(ufl.inv(F).T * n, ufl.as_vector([0.0, 1.0]))

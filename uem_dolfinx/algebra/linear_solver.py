@@ -1,7 +1,4 @@
-"""The linear solve of the united system: ``P'KP`` with its pattern reused, near-null space carried to q, KSP and PC by size.
-
-Any KSP and PC can be chosen through ``petsc_options``.
-"""
+"""The linear solve of the united system: pattern of ``P'KP`` reused, near-null space carried to q, KSP and PC by size or options."""
 
 from __future__ import annotations
 
@@ -54,10 +51,9 @@ class UnitedSolver:
         self._prefix = prefix
         #: Options that are asked for first, and those that take over for the rest of a step where they fail or do not suit.
         self._first, self._instead = default_options(size, space.gdim) if options is None else (dict(options), {})
-        self.options = self._first
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
-        self._fixed_accuracy = "ksp_rtol" in self.options or PETSc.Options(prefix).hasName("ksp_rtol")
+        self._fixed_accuracy = "ksp_rtol" in self._first or PETSc.Options(prefix).hasName("ksp_rtol")
         self._A: Any = None
         self.ksp: Any = None
         self._use(self._first)
@@ -118,9 +114,8 @@ class UnitedSolver:
 
     def begin_step(self) -> None:
         """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
-        self._begins = True
+        self._begins, self._of = True, None
         self._kept.drop()
-        self._of = None
         for part in (self._condensed, self._united, self._unsymmetric):
             part.begin_step()
 
@@ -177,11 +172,17 @@ class UnitedSolver:
         if self._apart:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
-                self.set_operator(restriction, K, G)
-                self._apart = True
+                self._set_symmetric(restriction, K, G)
             self._adapt(False)
             self._set_unsymmetric(restriction, test, K, G)
             return
+        if not self._symmetric and self.pc.getType() == "gamg":
+            # its smoothers would keep bounds on eigenvalues that were found by GMRES
+            self._use(self.options)
+        self._set_symmetric(restriction, K, G)
+
+    def _set_symmetric(self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
+        """Give ``P'(K + G)P`` to the KSP (collective)."""
         if restriction.alone and G is None:
             with timed("cross out prescribed components"):
                 if self._crossed is None or self._crossed[0] != K:
@@ -377,11 +378,10 @@ class UnitedSolver:
             self._of = None
             self.set_operator(*self._served)
             return self.solve(rhs, accuracy, near)
-        dq = rhs.duplicate()
         # a factorisation has no use for a guess
-        self.ksp.setInitialGuessNonzero(near is not None and self.iterative)
-        if near is not None and self.iterative:
-            near.copy(dq)
+        guess = near if self.iterative else None
+        dq = rhs.duplicate() if guess is None else guess.copy()
+        self.ksp.setInitialGuessNonzero(guess is not None)
         if self.inexact:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
         try:

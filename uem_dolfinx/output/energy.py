@@ -125,10 +125,10 @@ class EnergyBook(Closing):
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
         self._u, self._time, self._driven = np.array(problem.u.x.array[:n]), self.dynamics.time, self.dynamics.driven
         contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
-        problem.forces.assemble()
+        problem.bodies.assemble()
         # the work of supports on mass, where velocities jump, is what the mass has got
-        driving = problem.forces.residual.array_r - self.dynamics.forces.x.array[:n]
-        reaction = (driving - contact) * ~problem.forces.free[: problem.config.n_owned].ravel()
+        driving = problem.bodies.residual.array_r - self.dynamics.forces.x.array[:n]
+        reaction = (driving - contact) * ~problem.bodies.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])

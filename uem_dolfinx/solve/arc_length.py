@@ -9,7 +9,6 @@ right-hand sides [Riks, International Journal of Solids and Structures 15 (1979)
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -18,7 +17,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.newton import InEquilibrium, Iteration, IterationState
+from uem_dolfinx.solve.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState
 from uem_dolfinx.solve.system import BodySystem
@@ -35,27 +34,27 @@ MOST_STEPS = 100
 
 
 class ArcLength:
-    """``newton.UnitedSystem`` of a problem's bodies with the load factor as an unknown more.
+    """A problem's contact by elimination, with the load factor as an unknown more; a ``newton.ContactMethod``.
 
     Args:
-        problem: whose system and load are taken.
+        problem: whose method and load are taken.
 
     Attributes:
         factor: the load factor now.
     """
 
     def __init__(self, problem: UnitedProblem):
-        self._problem, self._system = problem, problem.system
+        assert isinstance(problem.system, BodySystem)
+        self._problem, self._system, self._bodies = problem, problem.system, problem.bodies
         self.factor = 0.0
         self._direction, self._length = np.zeros(problem.config.n_owned * problem.config.gdim), 0.0
-        #: Displacement at the beginning of the step, and load factor at that of the iteration.
-        self._start, self._from = self._system.displacement(), 0.0
+        #: Displacement at the beginning of the step.
+        self._start = self._bodies.displacement()
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
         self._change, self._slope = 0.0, problem.config.vector()
-
-    def __getattr__(self, name: str) -> Any:
-        """All else is the system's."""
-        return getattr(self._system, name)
+        self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
+        self.accelerate, self.forget = self._system.accelerate, self._system.forget
+        self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
 
     def begin(self, factor: float, direction: Array, length: float) -> None:
         """Begin a step.
@@ -66,7 +65,7 @@ class ArcLength:
             length: how far the displacement goes along it.
         """
         self._direction, self._length = direction, length
-        self._start = self._system.displacement()
+        self._start = self._bodies.displacement()
         self._change = 0.0
         self._set(factor)
 
@@ -81,88 +80,62 @@ class ArcLength:
     @property
     def _missing(self) -> float:
         """How much further the displacement has to go (collective)."""
-        return self._length - self._along(self._system.displacement().array_r - self._start.array_r)
+        return self._length - self._along(self._bodies.displacement().array_r - self._start.array_r)
 
-    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
+    def place(self, returning: bool) -> None:
+        """Project the contactors of displaced bodies, whose load factor has changed with the displacement."""
+        self._set(self.factor + self._change)
+        self._change = 0.0
+        self._system.place(returning)
+
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong; the state is closed if the arc has its length, too."""
-        state = self._system.unite(in_equilibrium)
+        state = self._system.assemble_constraints(in_equilibrium)
         there = abs(self._missing) <= ON_THE_PLANE * self._length
         return replace(state, closed=state.closed and there)
 
-    def differentiate(self, first: bool) -> None:
-        """Tangents with respect to displacement and load factor."""
-        self._system.differentiate(first)
-        forces, factor = self._problem.forces, self.factor
-        before = forces.residual
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """United matrix of a state, with the right-hand side without load increment, and the residual's derivative with the load factor."""
+        if iteration is not None:
+            self._differentiate()
+        problem = self._system.linearise(state, iteration)
+        # the load increment is as accurate as the unknowns, and near limit points little is left by solutions that are far off
+        return replace(problem, exact=not problem.iterative, iterative=False, passing=True, convex=False)
+
+    def _differentiate(self) -> None:
+        """Derivative of the residual with respect to the load factor (collective)."""
+        bodies, factor = self._bodies, self.factor
+        before = bodies.residual
         self._problem.set_load(factor + DIFFERENCE)
-        forces.assemble()
-        self._slope = forces.residual
+        bodies.assemble()
+        self._slope = bodies.residual
         self._slope.axpy(-1.0, before)
         self._slope.scale(1.0 / DIFFERENCE)
         self._problem.set_load(factor)
-        forces.assemble()
+        bodies.assemble()
 
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """United matrix of a state, and the right-hand side without load increment."""
-        self._state = state
-        return self._system.linearise(state)
-
-    @property
-    def inexact(self) -> bool:
-        """The load increment is as accurate as the unknowns: there are no loose solves."""
-        return False
-
-    @property
-    def convex(self) -> bool:
-        """The load follows: forces do not drive the bodies downhill."""
-        return False
-
-    @property
-    def tolerant(self) -> bool:
-        """The load increment changes with the tangent."""
-        return True
-
-    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
-        """Unknowns with the load increment that takes them to the plane, which ``rhs`` gets, too."""
-        system, state = self._system, self._state
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Unknowns with the load increment that takes them to the plane."""
+        system, state = self._system, problem.state
         load = state.test.transpose(self._slope)
         load.scale(-1.0)
-        if not system.inexact:
-            # near limit points little is left by solutions that are far off
-            accuracy = 0.0
-        dq, iterations = system.solve(rhs, accuracy)
-        by_load, more = system.solve(load, accuracy)
-        still = rhs.duplicate()
+        free, by_load = (system.solve(replace(problem, rhs=rhs), accuracy, None) for rhs in (problem.rhs, load))
+        still = load.duplicate()
         still.set(0.0)
-        rest = system.move(state, still)
-        du = system.move(state, by_load)
-        du.axpy(-1.0, rest)
-        along = self._along(du.array_r)
+        along = self._along((by_load.du - system.move(state, still)).array_r)
         if along == 0.0:
             raise ConvergenceError("the load does not move the bodies in the direction they went: take smaller steps")
-        self._change = (self._missing - self._along(system.move(state, dq).array_r)) / along
-        dq.axpy(self._change, by_load)
-        rhs.axpy(self._change, load)
-        return dq, iterations + more
+        self._change = (self._missing - self._along(free.du.array_r)) / along
+        dq, rhs = free.dq + self._change * by_load.dq, problem.rhs + self._change * load
+        return Increment(dq, system.move(state, dq), rhs, free.linear_iterations + by_load.linear_iterations, free.left)
 
-    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
-        """The state in which wrong contactors have changed sides, as they are foreseen under the new load."""
-        assert isinstance(state, BodyState)
-        held = self._slope.copy()
-        held.scale(self._change)
-        if state.held is not None:
-            held.axpy(1.0, state.held)
-        return self._system.exchange(replace(state, held=held), du, driving, accuracy)
-
-    def displacement(self) -> PETSc.Vec:
-        """Copy of the displacement from which the next step of the loop starts, as does the load factor."""
-        self._from = self.factor
-        return self._system.displacement()
-
-    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
-        """Set the displacement to ``start + length du``, and the load factor likewise."""
-        self._system.displace(start, du, length)
-        self._set(self._from + length * self._change)
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
+        """The state in which wrong contactors have changed sides, as they are predicted under the new load."""
+        assert isinstance(problem.state, BodyState)
+        held = self._change * self._slope
+        if problem.state.held is not None:
+            held.axpy(1.0, problem.state.held)
+        return self._system.exchange(replace(problem, state=replace(problem.state, held=held)), step)
 
 
 class AlongArc:
@@ -225,7 +198,7 @@ class AlongArc:
 def _check_values(problem: UnitedProblem) -> None:
     """Refuse Dirichlet values that change with the load factor (collective)."""
     wanted = np.array(problem.committed)
-    compat.set_bc_values(wanted, problem.forces.bcs)
+    compat.set_bc_values(wanted, problem.bodies.bcs)
     with agreed(problem.comm):
         if not np.array_equal(wanted, problem.committed):
             at = problem.config.X[int(np.flatnonzero(wanted != problem.committed)[0]) // problem.config.gdim]

@@ -13,28 +13,28 @@ from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 
 
-def touch_ahead(forces: BodyForces, pairs: Sequence[Interface], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
+def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
     It saves the solve that would find them; who is wrong among them is released before anything moves. Contactors with friction are left
     to that solve, which tells the way that they slip.
 
     Args:
-        forces: of bodies that their conditions hold.
+        bodies: that their conditions hold.
         pairs: of all contacts.
         rigid: motions of the bodies; None without contacts.
         place: projects all contactors.
     """
-    config, comm = forces.config, forces.comm
+    config, comm = bodies.config, bodies.comm
     known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
     if known or rigid is None:
         return
     place()
-    free, prescribed = forces.free[: config.n_owned], forces.prescribed
+    free, prescribed = bodies.free[: config.n_owned], bodies.prescribed
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
     gaps = [pair.predicted(du) for pair in pairs]

@@ -20,7 +20,7 @@ from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 from uem_dolfinx.solve.rigid_steps import least_motion, weighted
 
@@ -44,7 +44,7 @@ class FloatingBodies:
     """What a step does about bodies that only contact holds.
 
     Args:
-        forces: of the bodies.
+        bodies: without contact.
         pairs: of all contacts; without any, nothing is done about bodies that float.
 
     Attributes:
@@ -52,14 +52,14 @@ class FloatingBodies:
         motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
-    def __init__(self, forces: BodyForces, pairs: Sequence[Interface]):
-        self._forces, self._pairs = forces, pairs
-        config, dynamics = forces.config, forces.dynamics
+    def __init__(self, bodies: Bodies, pairs: Sequence[Interface]):
+        self._bodies, self._pairs = bodies, pairs
+        config, dynamics = bodies.config, bodies.dynamics
         self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
         if pairs:
-            free, finite = forces.free[: config.n_owned], not forces.tangent.linear
+            free, finite = bodies.free[: config.n_owned], not bodies.tangent.linear
             self.rigid = RigidMotions(config, free, finite)
             self._at_rest = self.rigid if self.rigid.any_open() else None
             if dynamics is not None:
@@ -78,8 +78,8 @@ class FloatingBodies:
         Raises:
             FloatingBodyError: naming a body, and the motion that nothing stops.
         """
-        if self._forces.dynamics is not None:
-            self.motions = self._in_motion if self._forces.dynamics.moving else self._at_rest
+        if self._bodies.dynamics is not None:
+            self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
         if self.motions is not None:
             self.motions.forget_supports()
             self._fall(place, freely=True)
@@ -121,14 +121,14 @@ class FloatingBodies:
         if self.motions is None or self._sliding.shape[1] == self._open.shape[1]:
             return None
         motion = self.motions.load(self._sliding, driving, forces)
-        return FAR * self._forces.config.size * self.motions.field(motion / size) if (size := np.linalg.norm(motion)) else None
+        return FAR * self._bodies.config.size * self.motions.field(motion / size) if (size := np.linalg.norm(motion)) else None
 
     @property
     def adrift(self) -> bool:
         """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
         if self.motions is None:
             return False
-        force = self.motions.load(self._open, self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))
+        force = self.motions.load(self._open, self._bodies.residual.array_r.reshape(-1, self._bodies.config.gdim))
         return bool(force.any())
 
     def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
@@ -151,7 +151,7 @@ class FloatingBodies:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
         if self.motions is None:
             return du
-        return du - self.motions.part(self._sliding, du.reshape(-1, self._forces.config.gdim)).ravel()
+        return du - self.motions.part(self._sliding, du.reshape(-1, self._bodies.config.gdim)).ravel()
 
     def _rates(self, equations: UnitingEquations) -> Any:
         """Rates of the equations that hold, see ``RigidMotions`` (collective)."""
@@ -176,7 +176,7 @@ class FloatingBodies:
         changed, before, damping = False, np.zeros(motions.count * motions.n_modes), np.ones(motions.count)
         for _ in range(MOST_RIGID_STEPS):
             place()
-            self._forces.assemble()
+            self._bodies.assemble()
             for pair in self._pairs:
                 pair.release_apart()
             v, took = self._step(damping, freely)
@@ -201,7 +201,7 @@ class FloatingBodies:
         Raises:
             FloatingBodyError: if the bodies move and no gap closes.
         """
-        motions, config, comm = self.motions, self._forces.config, self._forces.comm
+        motions, config, comm = self.motions, self._bodies.config, self._bodies.comm
         assert motions is not None
         ahead = [pair.approach for pair in self._pairs]
         united = [pair.equations().resisting for pair in self._pairs]
@@ -253,7 +253,7 @@ class FloatingBodies:
     @property
     def _residual(self) -> Array:
         """Forces of the bodies at the owned nodes ``(n_owned, gdim)``."""
-        return np.asarray(self._forces.residual.array_r.reshape(-1, self._forces.config.gdim))
+        return np.asarray(self._bodies.residual.array_r.reshape(-1, self._bodies.config.gdim))
 
     def _ways(self, R: Any, gap: Array, v: Array) -> Array:
         """How far bodies go in motions ``v (n_motions,)`` until the first of their gaps closes ``(count,)`` (collective)."""
@@ -265,5 +265,5 @@ class FloatingBodies:
         large = np.abs(terms.data) > OPEN
         way = np.maximum(gap[closing], 0.0) / -rate[closing]
         np.minimum.at(ways, terms.col[large] // motions.n_modes, way[terms.row[large]])
-        self._forces.comm.Allreduce(MPI.IN_PLACE, ways, op=MPI.MIN)
+        self._bodies.comm.Allreduce(MPI.IN_PLACE, ways, op=MPI.MIN)
         return ways

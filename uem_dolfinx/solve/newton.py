@@ -1,6 +1,6 @@
-"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, unite, solve, until equilibrium and contact hold.
+"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, constraints, solve, until equilibrium and contact hold.
 
-The loop speaks to a ``UnitedSystem`` only, so it serves statics and dynamics alike.
+The loop speaks to the bodies and to a ``ContactMethod``, so it serves statics and dynamics, and any way to impose contact, alike.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
+from uem_dolfinx.solve.bodies import Bodies
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; -]
@@ -28,17 +29,12 @@ LONGEST_SEARCH = 64.0
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 ENOUGH_DECREASE = 0.9
-#: An iterative solve leaves this part of its right-hand side while the active set or the tangent is still to change.
-#: [heuristic; right-hand side; -]
-ACCURACY_ON_THE_WAY = 1e-4
-#: One that asks which contactors are wrong leaves this part of its right-hand side, and goes on where it sees none.
-#: [heuristic; right-hand side; -]
-ACCURACY_OF_EXCHANGES = 1e-3
-#: Newton's method leaves this part of the residual times the relative residual; where bodies are linear, and iterations cheap, up to all.
-#: [heuristic; relative residual; -]
-NEWTON_LEAVES = 1e-2
+#: A solve that another iteration follows leaves this part of its right-hand side, times the relative residual [Eisenstat and Walker,
+#: SIAM Journal on Scientific Computing 17 (1996) 16-32]; one that asks which contactors are wrong leaves this part as it is.
+#: [heuristic; right-hand side; test_newton.py::test_solves_on_the_way_are_as_accurate_as_newton_needs]
+FORCING = 1e-3
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
-#: [heuristic; right-hand side; -]
+#: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
 ACCURACY_AT_THE_END = 0.1
 #: A residual below this part of the forces at work is an equilibrium in which contact forces can be read from the bodies.
 #: [heuristic; norm of the forces; -]
@@ -92,6 +88,7 @@ class IterationState:
         changed: whether contactors have changed what they are united to because of where they are.
         right: whether no contactor breaks the conditions of contact, as far as the present forces tell.
         closed: whether gaps and Dirichlet conditions are met.
+        in_contact: whether there are contacts at all.
     """
 
     trial: Restriction
@@ -106,16 +103,97 @@ class IterationState:
     changed: bool
     right: bool
     closed: bool
+    in_contact: bool
 
 
-class UnitedSystem(Protocol):
-    """Bodies in contact as loop and problem see them; every method is collective.
+@dataclass(frozen=True)
+class LinearisedProblem:
+    """``Q'KP dq = rhs`` in one active set, and how it is to be solved.
 
-    ``system.BodySystem`` eliminates the contactors; another method of contact implements the same.
+    Attributes:
+        state: whose P and Q these are.
+        rhs: right-hand side ``Q'(r - K c)``.
+        exact: whether solves are to leave no more than rounding, since no iteration follows that makes up for it.
+        iterative: whether solves leave as much as they may, and can go on from the solution of another active set.
+        passing: whether another iteration follows in any case.
+        fits: whether a full step needs no line search.
+        convex: whether the tangent leaves out what could make it indefinite, so that steps are no longer than forces drive the bodies.
+    """
+
+    state: IterationState
+    rhs: PETSc.Vec
+    exact: bool
+    iterative: bool
+    passing: bool
+    fits: bool
+    convex: bool
+
+
+@dataclass(frozen=True)
+class Increment:
+    """Solution of a linearised problem.
+
+    Attributes:
+        dq: unknowns.
+        du: ``P dq + c``.
+        rhs: right-hand side that they belong to; a method that leads the load adds to it.
+        linear_iterations: number of linear iterations.
+        left: part of the right-hand side that may be left.
+        longest: part of it that may be taken at most; 1 unless the method knows better.
+    """
+
+    dq: PETSc.Vec
+    du: PETSc.Vec
+    rhs: PETSc.Vec
+    linear_iterations: int
+    left: float
+    longest: float = 1.0
+
+
+class ContactMethod(Protocol):
+    """How contact is imposed on bodies; every method is collective.
+
+    ``system.BodySystem`` eliminates the contactors; another method implements the same.
     """
 
     def begin_step(self) -> None:
         """Begin a step, before the loop."""
+
+    def place(self, returning: bool) -> None:
+        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
+        """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
+
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """The united matrix ``Q'KP`` and right-hand side of a state.
+
+        Args:
+            state: P and Q.
+            iteration: number of the iteration that begins with it; None for another active set in the same one, whose tangents stay.
+        """
+
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Solve a linearised problem.
+
+        Args:
+            problem: the last one.
+            accuracy: part of the right-hand side that may be left.
+            near: unknowns to begin with, those of another active set or accuracy, or None; with them only those need change that contact
+                asks for.
+        """
+
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
+        """The state in which contactors that ``step`` shows on the wrong side have changed sides; None if none is to change.
+
+        A ConvergenceError bounds the number of states.
+        """
+
+    def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
+        """The increment in all unknowns, if the last solve was of some."""
+
+    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
+        """``Q'F`` at the present displacement, with the active set of ``state``."""
 
     def end_step(self) -> None:
         """End a step in which the loop has converged; may refuse it."""
@@ -126,83 +204,10 @@ class UnitedSystem(Protocol):
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does."""
 
-    @property
-    def linear(self) -> bool:
-        """Whether the bodies' forces are linear in the displacement, so that a full step always fits them."""
-
-    @property
-    def tolerant(self) -> bool:
-        """Whether an iteration follows that makes up for what a solve leaves, so that none need be exact."""
-
-    @property
-    def convex(self) -> bool:
-        """Whether the tangent leaves out what could make it indefinite, so that steps are no longer than forces drive the bodies."""
-
-    @property
-    def in_contact(self) -> bool:
-        """Whether there are contacts at all."""
-
-    @property
-    def frictional(self) -> bool:
-        """Whether there is friction."""
-
-    def place(self, returning: bool) -> None:
-        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
-
-    def assemble_residual(self) -> bool:
-        """Residual at the present displacement; whether it is finite."""
-
-    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
-        """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
-
-    def differentiate(self, first: bool) -> None:
-        """Tangent of bodies and contact at the present displacement."""
-
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)``."""
-
-    def forces_above_rounding(self) -> float:
-        """Norm of the forces at those nodes where they are told from rounding."""
-
-    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> IterationState | None:
-        """The state in which contactors that ``du`` shows on the wrong side have changed sides; None if none is to change.
-
-        ``du`` solves the linearised problem, but for this ``accuracy`` of a right-hand side of norm ``driving``. A ConvergenceError bounds
-        the number of states.
-        """
-
-    @property
-    def inexact(self) -> bool:
-        """Whether solves are no more accurate than they are asked to be."""
-
-    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
-        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations.
-
-        They are looked for from ``near`` on, those of the state before, if it is given; the others alone need change then that contact
-        asks for. A system that leads the load adds to ``rhs`` what its change contributes.
-        """
-
-    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
-        """All unknowns of the last solve, if it was of some."""
-
-    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
-        """``du = P dq + c``."""
-
-    def displacement(self) -> PETSc.Vec:
-        """Copy of the present displacement."""
-
-    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
-        """Set the displacement to ``start + length du``."""
-
-    def inverted(self) -> str | None:
-        """Where a cell is inside out, if one is."""
-
-    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
-        """``Q'F`` at the present displacement, with the active set of ``state``."""
-
 
 def solve_united(
-    system: UnitedSystem,
+    bodies: Bodies,
+    method: ContactMethod,
     *,
     rtol: float,
     max_iterations: int,
@@ -214,7 +219,8 @@ def solve_united(
     """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
 
     Args:
-        system: the problem.
+        bodies: without contact.
+        method: how contact is imposed on them.
         rtol: bound on the norm of ``Q'r`` relative to the forces at work.
         max_iterations: bound on the number of iterations.
         line_search: shorten steps that invert cells or increase the work of the residual.
@@ -237,15 +243,15 @@ def solve_united(
     def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
         return norm <= max(max(IN_EQUILIBRIUM, rtol) * max(scale, start), rounding, left)
 
-    system.place(returning=False)
-    if not system.assemble_residual():
+    method.place(returning=False)
+    if not bodies.assemble():
         raise NotFiniteError(
             "the residual is not finite at the start of the step: "
             "check loads, material parameters and the initial displacement for NaN and division by zero"
         )
     for k in range(max_iterations + 1):
         with _told(history):
-            state = system.unite(in_equilibrium)
+            state = method.assemble_constraints(in_equilibrium)
         if k == 0:
             # a displacement that comes back to nothing keeps the rounding of what it was
             start, left = state.norm, min(state.rounding, rtol * forces_before)
@@ -257,7 +263,7 @@ def solve_united(
         small = rtol * forces
         if small < norm <= rounding:
             # rounding excuses a residual that is small beside real forces, or where there are none
-            real = max(system.forces_above_rounding(), forces_before)
+            real = max(bodies.above_rounding(state.in_contact), forces_before)
             small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
         converged = steady and state.closed and norm <= small
         hidden = stalled >= 2 and small < norm <= rounding
@@ -269,22 +275,16 @@ def solve_united(
             if hidden:
                 raise _no_precision(norm, rounding, real)
             break
-        system.differentiate(first=k == 0)
-        passing = not system.linear or state.changed or (k == 0 and system.in_contact)
-        if system.inexact:
-            wanted, left_anyway = rtol * forces, ACCURACY_ON_THE_WAY if passing else 0.0
-        elif system.tolerant:
-            newton = _ratio(norm, forces) * (1.0 if system.linear else NEWTON_LEAVES)
-            wanted, left_anyway = rtol * forces, newton if k > 0 else ACCURACY_ON_THE_WAY
-        else:
-            wanted = left_anyway = 0.0
+        # the residual that a step begins with knows nothing of conditions and gaps
+        relative = _ratio(norm, forces) if k > 0 else 1.0
         with _told(history):
-            step = _solve_linearised(system, state, wanted, left_anyway, check_signals)
-        residual = _ratio(step.driving, max(forces, step.driving if k == 0 else 0.0))
-        changed = state.changed or step.exchanges > 0
-        history.append(Iteration(residual, state.gap, step.state.active, changed, step.linear_iterations, length, step.exchanges))
+            problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * forces, relative, check_signals)
+        driving = max(problem.rhs.norm(), step.rhs.norm())
+        residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
+        changed = state.changed or exchanges > 0
+        history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
         _report(history, verbose)
-        length = _advance(system, step.state, step.rhs, step.dq, step.du, line_search)
+        length = _advance(bodies, method, problem, step, line_search)
     last = history[-1]
     raise ConvergenceError(
         f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
@@ -311,113 +311,98 @@ def _told(history: list[Iteration]) -> Iterator[None]:
         raise
 
 
-@dataclass(frozen=True)
-class _Step:
-    """Solution of a linearised problem.
-
-    Attributes:
-        state: with the active set that its solution agrees with.
-        rhs: right-hand side of the last solve.
-        dq: its unknowns.
-        du: its increment.
-        driving: norm of ``rhs``.
-        linear_iterations: of all solves.
-        exchanges: number of solves after the first.
-    """
-
-    state: IterationState
-    rhs: PETSc.Vec
-    dq: PETSc.Vec
-    du: PETSc.Vec
-    driving: float
-    linear_iterations: int
-    exchanges: int
-
-
 def _solve_linearised(
-    system: UnitedSystem, state: IterationState, wanted: float, left_anyway: float, check_signals: Callable[[], None] | None
-) -> _Step:
+    method: ContactMethod,
+    state: IterationState,
+    iteration: int,
+    wanted: float,
+    relative: float,
+    check_signals: Callable[[], None] | None,
+) -> tuple[LinearisedProblem, Increment, int, int]:
     """Solve the linearised problem together with the conditions of contact; nothing moves.
 
     Args:
-        system: the problem.
+        method: how contact is imposed.
         state: to begin with.
-        wanted: norm of the residual that convergence asks for; zero where solves are to be exact.
-        left_anyway: part of the right-hand side that solves may leave, since another iteration follows in any case.
+        iteration: number of this iteration.
+        wanted: norm of the residual that convergence asks for.
+        relative: residual over the forces at work.
         check_signals: see ``solve_united``.
+
+    Returns:
+        The problem whose active set agrees with its solution, the solution, and the numbers of linear iterations and of exchanges.
     """
-    iterations, exchanges, du = 0, 0, None
+    solves, exchanges = 0, 0
+    problem, near = method.linearise(state, iteration), None
     while True:
-        rhs = system.linearise(state)
-        driving = rhs.norm()
-        needed = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
-        needed = min(max(needed, left_anyway), ACCURACY_AT_THE_END)
-        # who is wrong by far is told long before the solution is accurate
-        first = ACCURACY_OF_EXCHANGES if system.inexact and system.in_contact else needed
-        near = None if du is None else state.trial.reduce(du)
-        for accuracy in (first, needed) if first > needed else (needed,):
-            dq, solves = system.solve(rhs, accuracy, near)
-            iterations += solves
+        accuracy = _accuracy(problem, iteration, wanted, relative)
+        # contactors that are wrong by far are told long before the solution is accurate
+        loose = problem.iterative and problem.state.in_contact and accuracy < FORCING
+        for left in (FORCING, accuracy) if loose else (accuracy,):
+            step = method.solve(problem, left, near)
+            solves, near = solves + step.linear_iterations, step.dq
             if check_signals is not None:
                 check_signals()
-            driving = max(driving, rhs.norm())
-            du, near = system.move(state, dq), dq
-            better = system.exchange(state, du, driving, accuracy)
+            better = method.exchange(problem, step)
             if better is not None:
                 break
         if better is None:
-            whole = system.complete(dq)
-            if whole is not dq:
-                dq, du = whole, system.move(state, whole)
-            return _Step(state, rhs, dq, du, driving, iterations, exchanges)
-        state, exchanges = better, exchanges + 1
+            return problem, method.complete(problem, step), solves, exchanges
+        problem, near, exchanges = method.linearise(better, None), better.trial.reduce(step.du), exchanges + 1
 
 
-def _advance(
-    system: UnitedSystem, state: IterationState, rhs: PETSc.Vec, dq: PETSc.Vec, du: PETSc.Vec, line_search: bool
-) -> float:
+def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relative: float) -> float:
+    """Part of the right-hand side that a solve may leave."""
+    if problem.exact:
+        return 0.0
+    state, driving = problem.state, problem.rhs.norm()
+    last = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
+    passing = problem.passing or state.changed or (iteration == 0 and state.in_contact)
+    return min(max(last, FORCING * min(relative, 1.0) if passing else 0.0), ACCURACY_AT_THE_END)
+
+
+def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, step: Increment, line_search: bool) -> float:
     """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
-    start = system.displacement()
-    work, norm = abs(dq.dot(rhs)), rhs.norm()
-    length = 1.0
+    start, state, dq = bodies.displacement(), problem.state, step.dq
+    work, norm, length = abs(dq.dot(step.rhs)), step.rhs.norm(), step.longest
     while True:
         last = not line_search or length <= SHORTEST_SEARCH
-        system.displace(start, du, length)
-        where = system.inverted()
+        bodies.displace(start, step.du, length)
+        where = bodies.inverted()
         if where is not None:
             if last:
                 raise InvertedElementError(
                     f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there"
                 )
-        elif not line_search or system.linear:
+        elif not line_search or problem.fits:
             break
         # the bodies are asked before the normal return, which has its own reasons to move a contactor
-        elif system.assemble_residual():
-            residual = system.reduced_residual(state)
+        elif bodies.assemble():
+            residual = method.reduced_residual(state)
             less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
-            downhill = system.convex and dq.dot(residual) < 0.0
+            downhill = problem.convex and dq.dot(residual) < 0.0
             if downhill and not less_work and length == 1.0:
-                length = _downhill(system, state, start, dq, du)
+                length = _downhill(bodies, method, state, start, step)
             if last or less_work or downhill or residual.norm() <= ENOUGH_DECREASE * norm:
                 break
         elif last:
             break
         length *= 0.5
-    system.place(returning=length == 1.0)
-    if not system.assemble_residual():
+    method.place(returning=length == 1.0)
+    if not bodies.assemble():
         raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
     return length
 
 
-def _downhill(system: UnitedSystem, state: IterationState, start: PETSc.Vec, dq: PETSc.Vec, du: PETSc.Vec) -> float:
+def _downhill(bodies: Bodies, method: ContactMethod, state: IterationState, start: PETSc.Vec, step: Increment) -> float:
     """Go on as long as forces still drive the bodies that way, and displace them: the length taken, of 1, 2, 4 ... up to a bound."""
     length = 1.0
     while length < LONGEST_SEARCH:
-        system.displace(start, du, 2.0 * length)
-        if system.inverted() is not None or not system.assemble_residual() or dq.dot(system.reduced_residual(state)) >= 0.0:
+        bodies.displace(start, step.du, 2.0 * length)
+        if bodies.inverted() is not None or not bodies.assemble() or step.dq.dot(method.reduced_residual(state)) >= 0.0:
             break
         length *= 2.0
-    system.displace(start, du, length)
+    bodies.displace(start, step.du, length)
     return length
 
 

@@ -26,9 +26,9 @@ from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.checks import check_conditions, check_load, check_materials, check_residual, check_values, set_constant
-from uem_dolfinx.solve.newton import Iteration, UnitedSystem, solve_united
+from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
@@ -66,7 +66,7 @@ class UnitedProblem:
         rtol: bound on the norm of ``P'r`` relative to the forces at work.
         max_iterations: bound on the linear solves of one step.
         method: how contact is reached, by default by elimination: called with the arguments of ``solve.system.BodySystem`` it makes a
-            ``solve.newton.UnitedSystem``.
+            ``solve.newton.ContactMethod``.
         verbose: print one line per iteration.
 
     Raises:
@@ -98,7 +98,7 @@ class UnitedProblem:
         check_inversion: bool | None = None,
         rtol: float = 1e-8,
         max_iterations: int = 50,
-        method: Callable[..., UnitedSystem] = BodySystem,
+        method: Callable[..., ContactMethod] = BodySystem,
         verbose: bool = False,
     ):
         self.u = given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
@@ -128,7 +128,7 @@ class UnitedProblem:
         if damping is not None:
             check_residual(damping, u, "the damping form")
         #: What the bodies do without contact.
-        self.forces = BodyForces(
+        self.bodies = Bodies(
             self.config,
             F if damping is None else F + damping,
             bcs,
@@ -137,13 +137,13 @@ class UnitedProblem:
             check_inversion=check_inversion,
         )
         self.solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
-        free = self.forces.free[: self.config.n_owned]
+        free = self.bodies.free[: self.config.n_owned]
         pairs = [contact.attach(self.config, free) for contact in self.contacts]
         if dynamics is not None:
             dynamics.make_contactors_massless(self.contacts)
-            warn_of_soft_targets(dynamics.mass, self.contacts, self.forces.initial_stiffness)
+            warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
-        self.system = method(self.forces, pairs, self.solver, newton=newton, consistent_tangent=consistent_tangent)
+        self.system = method(self.bodies, pairs, self.solver, newton=newton, consistent_tangent=consistent_tangent)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
         #: How far the problem is, in steps and in load.
@@ -222,7 +222,7 @@ class UnitedProblem:
         return history
 
     def attempt(
-        self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: UnitedSystem | None = None
+        self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: ContactMethod | None = None
     ) -> list[Iteration]:
         """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
@@ -246,13 +246,14 @@ class UnitedProblem:
             start = self.committed if start is None else given.vector("start", start, len(self.committed))
             fraction = given.number("fraction", fraction)
         wanted = np.array(start)
-        compat.set_bc_values(wanted, self.forces.bcs)
+        compat.set_bc_values(wanted, self.bodies.bcs)
         with agreed(self.comm):
-            check_values(self.config, self.forces.bcs, wanted)
-        self.forces.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
+            check_values(self.config, self.bodies.bcs, wanted)
+        self.bodies.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
         try:
             self.system.begin_step()
             history = solve_united(
+                self.bodies,
                 self.system if along is None else along,
                 rtol=self.rtol,
                 max_iterations=self.max_iterations,
@@ -273,7 +274,7 @@ class UnitedProblem:
     def _name_corner(self, error: UEMError) -> None:
         """Tell in an error of a convex corner of a target inside contactors, if there is one (collective)."""
         for contact in self.contacts:
-            corner = contact.corner_inside(self.forces.stiffness)
+            corner = contact.corner_inside(self.bodies.stiffness)
             if corner is not None:
                 error.amend(f"{contact.name}: {corner}")
                 return
@@ -288,7 +289,7 @@ class UnitedProblem:
 
     def _keep(self) -> None:
         self.committed = np.array(self.u.x.array)
-        self.largest_forces = max(self.largest_forces, self.system.forces_above_rounding())
+        self.largest_forces = max(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:
@@ -299,7 +300,7 @@ class UnitedProblem:
         self.motions = self._rigid_motions()
         for contact in self.contacts:
             contact.look_at_ends()
-            contact.look_at_corners(self.forces.stiffness)
+            contact.look_at_corners(self.bodies.stiffness)
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -332,7 +333,7 @@ class UnitedProblem:
         state = State(self.config.mesh, functions, self.contacts, settings=self._settings.describe(self.comm))
 
         def collect() -> None:
-            known = self.forces.to_checkpoint(stiffness)
+            known = self.bodies.to_checkpoint(stiffness)
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
             state.numbers |= {"largest forces": self.largest_forces, "stiffness known": known}
@@ -345,7 +346,7 @@ class UnitedProblem:
         def restore() -> None:
             self.committed, self.motions = np.array(self.u.x.array), self._rigid_motions()
             self.largest_forces = state.numbers["largest forces"]
-            self.forces.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
+            self.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
             self.progress.from_checkpoint(state.numbers, start.x.array if ramped else None)
             if self.dynamics is not None:
                 self.dynamics.from_checkpoint(state.numbers)
@@ -361,13 +362,13 @@ class UnitedProblem:
         Args:
             tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero.
         """
-        self.forces.assemble()
+        self.bodies.assemble()
         tdim, shape = self.config.tdim, (-1, self.config.gdim)
         nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
-        force = self.forces.residual.array_r.reshape(shape)[nodes]
+        force = self.bodies.residual.array_r.reshape(shape)[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(shape)[nodes]
-        return np.sum(self.comm.allgather(np.where(self.forces.free[nodes], 0.0, force).sum(axis=0)), axis=0)
+        return np.sum(self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0)), axis=0)
 
     @property
     def pairs(self) -> list[Interface]:

@@ -1,12 +1,13 @@
 """The united system: bodies, contact pairs, P and Q brought together for the Newton loop.
 
-It implements ``newton.UnitedSystem`` by elimination, and leaves load steps and commits to the problem.
+It implements ``newton.ContactMethod`` by elimination, and leaves load steps and commits to the problem.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from mpi4py import MPI
@@ -24,11 +25,11 @@ from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.body_forces import BodyForces
+from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
-from uem_dolfinx.solve.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.rows import BodyState, Meetings, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
@@ -44,7 +45,7 @@ class BodySystem:
     """Bodies whose active contactors are eliminated.
 
     Args:
-        forces: of the bodies without contact.
+        bodies: without contact.
         pairs: of all contacts, just made.
         solver: of the united system.
         newton: ``"full"`` or ``"modified"``.
@@ -53,19 +54,18 @@ class BodySystem:
 
     def __init__(
         self,
-        forces: BodyForces,
+        bodies: Bodies,
         pairs: Sequence[Interface],
         solver: UnitedSolver,
         *,
         newton: str = "full",
         consistent_tangent: bool = True,
     ):
-        self.forces, self.pairs, self.solver = forces, list(pairs), solver
-        self.config, self.comm = forces.config, forces.comm
+        self.bodies, self.pairs, self.solver = bodies, list(pairs), solver
+        self.config, self.comm = bodies.config, bodies.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
-        solver.lasting = forces.tangent.linear or newton == "modified"
+        solver.lasting = bodies.tangent.linear or newton == "modified"
         self._factored: object = None
-        self.complete = solver.complete
         self._curvature: PETSc.Mat | None = None
         self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
@@ -80,7 +80,7 @@ class BodySystem:
         self._swept = False
         #: How equations of several contacts can meet.
         self.meetings = Meetings(self.config, self.pairs)
-        self.floating = FloatingBodies(forces, self.pairs)
+        self.floating = FloatingBodies(bodies, self.pairs)
         self.place(returning=False)
         for pair in self.pairs:
             check_initial(pair)
@@ -92,11 +92,11 @@ class BodySystem:
         """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
         if not self.pairs:
             return
-        self.forces.check_displacement()
+        self.bodies.check_displacement()
         with timed("search and projection"):
             for pair in self.pairs:
                 pair.project()
-            stiffness = self.forces.stiffness
+            stiffness = self.bodies.stiffness
             if not returning or stiffness is None:
                 return
             for k, pair in enumerate(self.pairs):
@@ -109,7 +109,7 @@ class BodySystem:
             if self.meetings.shared:
                 for pair in self.pairs:
                     pair.project()
-            self.forces.u.x.scatter_forward()
+            self.bodies.u.x.scatter_forward()
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
@@ -118,8 +118,8 @@ class BodySystem:
         for pair in self.pairs:
             pair.discretisation.begin_step()
         self.floating.begin_step(place)
-        if self.forces.dynamics is None and self.floating.motions is None:
-            touch_ahead(self.forces, self.pairs, self.floating.rigid, place)
+        if self.bodies.dynamics is None and self.floating.motions is None:
+            touch_ahead(self.bodies, self.pairs, self.floating.rigid, place)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
@@ -131,7 +131,7 @@ class BodySystem:
         # between this equilibrium and that without friction the united matrix was singular
         self._factored = None
         added = together(self._curvature, state.added)
-        if not self.solver.negative_without(state.rows.frictionless, self.forces.tangent.K, added):
+        if not self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
             raise FrictionError(
                 "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP is negative; take less "
                 "friction, or stiffer bodies"
@@ -141,16 +141,12 @@ class BodySystem:
 
     def _residual(self) -> PETSc.Vec:
         """Forces of the bodies less those of friction that are known, which do not grow with the force along the normal (collective)."""
-        F = self.forces.residual
+        F = self.bodies.residual
         for nodes, forces in filter(None, (pair.known_forces() for pair in self.pairs)):
             F.array[:] -= self.config.add_at_owners(nodes, forces).ravel()
         return F
 
-    def assemble_residual(self) -> bool:
-        """Residual at the present displacement; whether it is finite."""
-        return self.forces.assemble()
-
-    def unite(self, in_equilibrium: InEquilibrium) -> IterationState:
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong at the present displacement, and the equations that follow.
 
         1. Take Q'F with the present equations.
@@ -159,10 +155,10 @@ class BodySystem:
         4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
         5. Take the equations that follow, Q'F with them, and who breaks the conditions of contact.
         """
-        forces, pairs = self.forces, self.pairs
-        if forces.stiffness is None and pairs:
+        bodies, pairs = self.bodies, self.pairs
+        if bodies.stiffness is None and pairs:
             # what tells tension from rounding
-            forces.update_tangent()
+            bodies.update_tangent()
         self._turn()
         F, rounding = self._residual(), self.rounding()
         with timed("uniting equations"):
@@ -177,7 +173,7 @@ class BodySystem:
             if moved:
                 for pair in pairs:
                     pair.place_again()
-            here = [(pair, self.forces.rounding_at(pair.nodes)) for pair in pairs]
+            here = [(pair, self.bodies.rounding_at(pair.nodes)) for pair in pairs]
             violated = count(
                 pairs,
                 [pair.violated(pair.gap, pair.traction, self._along(pair), least, 0.0, self._swept) for pair, least in here],
@@ -198,8 +194,8 @@ class BodySystem:
 
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
-        hold = partial(self.floating.hold, self.forces.free[: self.config.n_owned])
-        return make_rows(self.meetings, self.pairs, hold, self.forces.prescribed)
+        hold = partial(self.floating.hold, self.bodies.free[: self.config.n_owned])
+        return make_rows(self.meetings, self.pairs, hold, self.bodies.prescribed)
 
     def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
@@ -209,7 +205,7 @@ class BodySystem:
         self._apart = apart is not None or rows.test is not rows.frictionless
         trial = rows.frictionless
         if apart is not None:
-            trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.forces.prescribed)
+            trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
         added, held = slip_terms(self.pairs, self.config.vector())
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
@@ -217,30 +213,31 @@ class BodySystem:
             test=rows.test,
             residual=residual,
             norm=residual.norm(),
-            scale=self.forces.residual.norm(),
+            scale=self.bodies.residual.norm(),
             rounding=rounding,
-            strain_rounding=self.forces.strain_rounding(),
+            strain_rounding=self.bodies.strain_rounding(),
             gap=gap,
             active=sum(pair.n_active for pair in self.pairs),
             changed=changed,
             right=right,
-            closed=gap <= CLOSED * self.config.size and self.forces.dirichlet_met(),
+            closed=gap <= CLOSED * self.config.size and self.bodies.dirichlet_met(),
+            in_contact=bool(self.pairs),
             rows=rows,
             added=added,
             held=held,
         )
 
-    def exchange(self, state: IterationState, du: PETSc.Vec, driving: float, accuracy: float) -> BodyState | None:
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
         if not self.pairs:
             return None
+        state, du, left = problem.state, step.du, step.left
         assert isinstance(state, BodyState)
+        driving = max(problem.rhs.norm(), step.rhs.norm()) if left > 0.0 else 0.0
         with timed("uniting equations"):
-            F = self._predicted_forces(state, du, self.solver.forces(self.forces.tangent.K, du))
+            F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
             increment = du.array_r.reshape(-1, self.config.gdim)
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
-            # held limits follow what a solve foretells: it is as good as a direct one
-            left = 0.0 if self.solver.exact else min(accuracy, PREDICTED) if self.exchanges.held else accuracy
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
             near = max(PREDICTED, left) * way
             predicted = [pair.predicted(increment) for pair in self.pairs]
@@ -249,7 +246,7 @@ class BodySystem:
             violated = []
             for pair, gap, seen in zip(self.pairs, predicted, forces):
                 along = self._along(pair)
-                least = np.maximum(self.forces.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
+                least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
             chosen = violated if self._adrift else self.exchanges.choose(violated, predicted, self._curvature is not None, way)
             in_equilibrium = not (self.exchanges.again or count(self.pairs, chosen))
@@ -287,19 +284,19 @@ class BodySystem:
         if self.floating.motions is None or not self.frictional:
             return None
         # known forces are among those of the contact
-        every = F + (self.forces.residual - self._residual())
+        every = F + (self.bodies.residual - self._residual())
         return self.floating.slide(*unbalanced(self.pairs, every, forces))
 
     def _along(self, pair: Interface) -> Array:
         """Stiffness of the pair's contactors along their normals ``(n,)``."""
-        assert self.forces.stiffness is not None
-        return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.forces.stiffness[pair.nodes])))
+        assert self.bodies.stiffness is not None
+        return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def _turn(self) -> None:
         """Take the directions of friction from where the contactors are (collective)."""
         for pair in self.pairs:
-            assert self.forces.stiffness is not None
-            pair.turn(self.forces.stiffness)
+            assert self.bodies.stiffness is not None
+            pair.turn(self.bodies.stiffness)
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
@@ -328,11 +325,7 @@ class BodySystem:
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
         active = [pair.nodes[pair.trial.active] for pair in self.pairs]
-        return self.forces.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
-
-    def forces_above_rounding(self) -> float:
-        """Norm of the forces at those nodes where they are told from rounding of displacements and positions (collective)."""
-        return self.forces.above_rounding(self.in_contact)
+        return self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` at the present displacement, with the active set of ``state``.
@@ -345,37 +338,39 @@ class BodySystem:
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
-        dynamics = self.forces.dynamics
+        dynamics = self.bodies.dynamics
         if dynamics is not None and not dynamics.accelerated:
             self.place(returning=False)
-            self.forces.assemble()
+            self.bodies.assemble()
             self.floating.begin_motion()
-            dynamics.accelerate(self.restriction(), self.forces.residual)
+            dynamics.accelerate(self.restriction(), self.bodies.residual)
 
     # -- linear system ---------------------------------------------------------------------------------------------------
 
-    def differentiate(self, first: bool) -> None:
+    def _differentiate(self, first: bool) -> None:
         """Tangent of the bodies and curvature of the contact at the present displacement (collective)."""
         forms.free_petsc_garbage(self.comm)
         self._led = True
         if first:
             self.solver.begin_step()
         if first or self.newton == "full":
-            self.forces.update_tangent()
+            self.bodies.update_tangent()
         with timed("contact curvature"):
             how = self.config.vector(), self._apart, self.exchanges.convex
             self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
 
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """United matrix ``Q'KP`` of a state; returns the right-hand side ``Q'(r - K c)`` (collective)."""
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """United matrix ``Q'KP`` of a state, and the right-hand side ``Q'(r - K c)`` (collective)."""
+        if iteration is not None:
+            self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
-        K, P, Q = self.forces.tangent.K, state.trial, state.test
+        K, P, Q = self.bodies.tangent.K, state.trial, state.test
         curvature = together(self._curvature, state.added)
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
-        parts = self.forces.tangent.number, exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
+        parts = self.bodies.tangent.number, exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
         made_of = self.comm.allgather(parts)
         moving = (curvature is not None or Q is not P) and self.newton == "full"
         same = made_of == self._factored and not moving
@@ -383,23 +378,36 @@ class BodySystem:
             self.solver.set_operator(P, K, curvature, Q, same)
         self._factored = made_of
         self.solver.begin_at(c := P.c)
-        return -Q.transpose(self._predicted_forces(state, c, K * c))
+        linear, iterative = self.bodies.linear, self.solver.inexact
+        # momentum is kept exactly where solves can be
+        passing = not linear or (self._curvature is not None and self.bodies.dynamics is None)
+        return LinearisedProblem(
+            state=state,
+            rhs=-Q.transpose(self._predicted_forces(state, c, K * c)),
+            exact=not iterative and (self.bodies.dynamics is not None or not passing),
+            iterative=iterative,
+            passing=passing,
+            fits=linear,
+            convex=self.exchanges.convex,
+        )
 
-    @property
-    def inexact(self) -> bool:
-        """Whether solves are no more accurate than they are asked to be."""
-        return self.solver.inexact
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Unknowns dq, and ``du = P dq + c``; bodies stay where they are along neutral motions (collective)."""
+        # held limits follow what a solve foretells: it is as good as a direct one
+        accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
+        dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
+        left = 0.0 if self.solver.exact else accuracy
+        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, left)
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
-        """Unknowns dq, whose residual need be no less than this part of ``rhs``, and the number of linear iterations."""
-        return self.solver.solve(rhs, min(accuracy, PREDICTED) if self.exchanges.held else accuracy, near)
+    def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
+        """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
+        dq = self.solver.complete(step.dq)
+        return step if dq is step.dq else replace(step, dq=dq, du=self.move(problem.state, dq))
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
         self._factored = None
         self.solver.forget()
-
-    # -- displacement ----------------------------------------------------------------------------------------------------
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
         """``du = P dq + c``; bodies stay where they are along neutral motions."""
@@ -408,39 +416,7 @@ class BodySystem:
         du.array[:] = self.floating.without_open_motions(du.array_r)
         return du
 
-    def displacement(self) -> PETSc.Vec:
-        """Copy of the present displacement."""
-        return self.forces.displacement()
-
-    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
-        """Set the displacement to ``start + length du``."""
-        self.forces.displace(start, du, length)
-
-    def inverted(self) -> str | None:
-        """Where a cell is inside out, if one is (collective)."""
-        return self.forces.inverted()
-
-    @property
-    def linear(self) -> bool:
-        """Whether the bodies' forces are linear in the displacement."""
-        return self.forces.linear
-
-    @property
-    def tolerant(self) -> bool:
-        """Whether the united tangent changes with the displacement, so that an iteration follows in any case; momentum is kept exactly."""
-        return self.forces.dynamics is None and not (self.linear and self._curvature is None)
-
-    @property
-    def convex(self) -> bool:
-        """Whether the curvature of contact is without what could make the united tangent indefinite."""
-        return self.exchanges.convex
-
     @property
     def frictional(self) -> bool:
         """Whether there is friction."""
         return any(pair.frictional for pair in self.pairs)
-
-    @property
-    def in_contact(self) -> bool:
-        """Whether there are contacts at all."""
-        return bool(self.pairs)

@@ -251,7 +251,7 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
 
     Of bodies at rest it is what the work of these forces is compared with: their kinetic energy is the rounding of nothing.
     """
-    K = problem.forces.stiffness
+    K = problem.bodies.stiffness
     if K is None:
         return 0.0
     compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()

@@ -18,10 +18,9 @@ from scipy.sparse import coo_matrix
 from benchmarks.rivals.line_search import flat_length
 from benchmarks.rivals.pushed import PushedSystem
 from uem_dolfinx.contact.kinematics import Traction
-from uem_dolfinx import forms
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState, InEquilibrium
+from uem_dolfinx.solve.newton import InEquilibrium, IterationState
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -30,7 +29,7 @@ from uem_dolfinx.geometry.surfaces import tributary_areas
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.body_forces import BodyForces
+    from uem_dolfinx.solve.bodies import Bodies
     from collections.abc import Sequence
 
     from uem_dolfinx.contact.contact import Contact
@@ -59,7 +58,7 @@ class BarrierSystem(PushedSystem):
 
     def __init__(
         self,
-        forces: BodyForces,
+        bodies: Bodies,
         pairs: list[Interface],
         solver: UnitedSolver,
         *,
@@ -69,7 +68,7 @@ class BarrierSystem(PushedSystem):
         **options: Any,
     ):
         self._contacts, self.distance, self.stiffness = list(contacts), distance, stiffness
-        super().__init__(forces, pairs, solver, **options)
+        super().__init__(bodies, pairs, solver, **options)
         if self.comm.size > 1 or self.config.degree > 1:
             raise SpaceError("the barrier is for one rank and degree 1: ipctk takes straight surfaces, whole")
         self._make_collision_mesh()
@@ -108,9 +107,9 @@ class BarrierSystem(PushedSystem):
     def _pressure(self) -> float:
         """Stiffness of the barrier."""
         if self.stiffness is None:
-            self.forces.update_tangent()
+            self.bodies.update_tangent()
             spacing = np.concatenate(self._areas).mean() ** (1.0 / (self.config.gdim - 1))
-            diagonal = self.forces.stiffness.ravel()
+            diagonal = self.bodies.stiffness.ravel()
             self.stiffness = float(diagonal[diagonal > 0].min()) / spacing ** (self.config.gdim - 2)
         return self.stiffness
 
@@ -148,7 +147,7 @@ class BarrierSystem(PushedSystem):
 
     def _hessian(self) -> PETSc.Mat:
         """``K`` with the barrier's second derivative, made positive."""
-        A = self.forces.tangent.K.copy()
+        A = self.bodies.tangent.K.copy()
         rows, columns, values = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)], [np.zeros(0)]
         g = self.config.gdim
         if self._mesh is not None:
@@ -178,7 +177,7 @@ class BarrierSystem(PushedSystem):
 
     def begin_step(self) -> None:
         """Begin a step; bodies that are too near for the barrier are lifted."""
-        self._alpha, self._squeezes = 1.0, 0
+        self._squeezes = 0
         for pair in self.pairs:
             self.place(returning=False)
             gap = np.where(pair.off, np.inf, pair.projection.gap)
@@ -190,11 +189,11 @@ class BarrierSystem(PushedSystem):
         self.place(returning=False)
 
     def _out_of_balance(self, restriction: Restriction) -> PETSc.Vec:
-        R = self.forces.residual
+        R = self.bodies.residual
         R.array[:] -= self._push()[: self.config.n_owned].ravel()
         return restriction.reduce(R)
 
-    def unite(self, settled: InEquilibrium) -> IterationState:
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Forces of the barrier."""
         P = self.restriction()
         with timed("barrier"):
@@ -204,31 +203,33 @@ class BarrierSystem(PushedSystem):
             test=P,
             residual=R,
             norm=R.norm(),
-            scale=self.forces.residual.norm(),
+            scale=self.bodies.residual.norm(),
             rounding=self.rounding(),
-            strain_rounding=self.forces.strain_rounding(),
+            strain_rounding=self.bodies.strain_rounding(),
             gap=0.0,
             active=sum(pair.n_active for pair in self.pairs),
             changed=False,
             right=True,
-            closed=self.forces.dirichlet_met(),
+            closed=self.bodies.dirichlet_met(),
+            in_contact=bool(self.pairs),
         )
 
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """Tangent of bodies and barrier; returns the right-hand side."""
-        forms.free_petsc_garbage(self.comm)
-        self.forces.update_tangent()
+    def tangent(self, state: IterationState, first: bool) -> PETSc.Mat:
+        """Tangent of bodies and barrier."""
+        self.bodies.update_tangent()
         with timed("barrier"):
             A = self._hessian()
         self.solver.set_operator(state.trial, A, None)
         # the solver tells matrices by their handles, so that one must live until the next is made
         self._A = A
-        return self.right_hand_side(state, A)
+        return A
 
-    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
-        """The increment, as much of it as meets nothing on its way and does not pass the potential's minimum."""
-        du = super().move(state, dq)
-        start = np.array(self.forces.u.x.array)
+    #: ``longest`` has searched along the line.
+    fits = True
+
+    def longest(self, state: IterationState, dq: PETSc.Vec, du: PETSc.Vec) -> float:
+        """Part of the increment that meets nothing on its way and does not pass the potential's minimum."""
+        start = np.array(self.bodies.u.x.array)
         step = du.array_r.copy()
         with timed("barrier"):
             length = self._free_way(start, step)
@@ -236,19 +237,17 @@ class BarrierSystem(PushedSystem):
             if state.trial.c.norm() == 0.0 and slope < 0.0:
 
                 def look(length: float) -> tuple[float, float]:
-                    self.forces.u.x.array[:] = start + length * step
+                    self.bodies.u.x.array[:] = start + length * step
                     self.place(returning=False)
-                    if self.inverted() is not None or not self.assemble_residual():
+                    if self.bodies.inverted() is not None or not self.bodies.assemble():
                         return np.inf, np.inf
                     residual = self._out_of_balance(state.trial)
                     return float(dq.dot(residual)), residual.norm()
 
                 length = flat_length(look, (slope, state.norm), length)
-        self.forces.u.x.array[:] = start
+        self.bodies.u.x.array[:] = start
         self.place(returning=False)
-        self._alpha = length
-        du.scale(length)
-        return du
+        return length
 
     def _free_way(self, start: Array, step: Array) -> float:
         """Part of a step that meets nothing."""
@@ -279,12 +278,3 @@ class BarrierSystem(PushedSystem):
             return False
         nearest = self._collisions.compute_minimum_distance(self._mesh, self._vertices())
         return bool(nearest < (CRUSHED * self.distance) ** 2)
-
-    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
-        """Set the displacement; Dirichlet values are met to the last bit when the whole way was free."""
-        super().displace(start, du, length if self._alpha == 1.0 else length * (1.0 - np.finfo(float).eps))
-
-    @property
-    def linear(self) -> bool:
-        """The line search has been done by ``move``."""
-        return True

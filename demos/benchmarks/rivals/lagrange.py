@@ -19,13 +19,14 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.floating import FloatingBodies
+from uem_dolfinx.solve.newton import Increment, LinearisedProblem
 from uem_dolfinx.solve.system import BodySystem
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.body_forces import BodyForces
-    from uem_dolfinx.solve.newton import IterationState
+    from uem_dolfinx.solve.bodies import Bodies
     from uem_dolfinx.contact.interface import Interface
+    from uem_dolfinx.solve.newton import IterationState
 
 DIRECT = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 #: For large bodies that are held: Murphy, Golub and Wathen's block diagonal, with the Schur complement from the diagonal of K.
@@ -45,10 +46,10 @@ ITERATIVE = {
 class LagrangeSystem(BodySystem):
     """Contact by multipliers; arguments as those of ``BodySystem``."""
 
-    def __init__(self, forces: BodyForces, pairs: list[Interface], solver: UnitedSolver, **options: Any):
-        super().__init__(forces, pairs, solver, **options)
+    def __init__(self, bodies: Bodies, pairs: list[Interface], solver: UnitedSolver, **options: Any):
+        super().__init__(bodies, pairs, solver, **options)
         # nothing holds what floats
-        self.floating = FloatingBodies(forces, [])
+        self.floating = FloatingBodies(bodies, [])
         #: The saddle-point matrix of the last solve.
         self.saddle: PETSc.Mat | None = None
         self._made_of: object = None
@@ -60,15 +61,17 @@ class LagrangeSystem(BodySystem):
             self._options |= {f"fieldsplit_u_{key}": value for key, value in amg.items()}
         self._prefix = f"saddle_{id(self)}_"
 
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """Saddle-point matrix; returns what drives the step, as the united system would feel it."""
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """Saddle-point matrix, and what drives the step, as the united system would feel it."""
+        if iteration is not None:
+            self._differentiate(first=iteration == 0)
         curvature = self._curvature
         equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
-        self._c = self.config.vector(self.forces.prescribed)
+        self._c = self.config.vector(self.bodies.prescribed)
         if curvature is None and not any(pair.sliding == "finite" for pair in self.pairs):
             made_of = (
-                self.forces.tangent.number,
+                self.bodies.tangent.number,
                 equations.node.tobytes(),
                 equations.direction.tobytes(),
                 equations.coefficients.tobytes(),
@@ -80,28 +83,29 @@ class LagrangeSystem(BodySystem):
             if made_of is None or made_of != self._made_of:
                 self._build(equations, curvature)
         self._made_of = made_of
-        free = self.forces.free[: self.config.n_owned]
+        free = self.bodies.free[: self.config.n_owned]
         load = self._A * self._c
-        load.axpy(1.0, self.forces.residual)
+        load.axpy(1.0, self.bodies.residual)
         self._short = self._G_all * self._c
         self._short.array[:] += equations.gap
         self._short.array[:] *= -self._scale
         self._load = self.config.vector(-np.where(free, load.array_r.reshape(free.shape), 0.0))
-        self._restriction = state.test
         load = self._A * state.trial.c
-        load.axpy(1.0, self.forces.residual)
+        load.axpy(1.0, self.bodies.residual)
         driving = state.test.transpose(load)
         driving.scale(-1.0)
-        return driving
+        return LinearisedProblem(
+            state, driving, exact=True, iterative=False, passing=False, fits=self.bodies.linear, convex=False
+        )
 
     def _build(self, equations: UnitingEquations, curvature: PETSc.Mat | None) -> None:
         """Matrix, and the solver for it (collective)."""
         n = self.config.n_owned
-        free = self.forces.free[:n]
-        self._A = self.forces.tangent.K if curvature is None else self.forces.tangent.K.copy()
+        free = self.bodies.free[:n]
+        self._A = self.bodies.tangent.K if curvature is None else self.bodies.tangent.K.copy()
         if curvature is not None:
             self._A.axpy(1.0, curvature, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        used, own = self.config.vector(free.astype(float)), self.config.vector(self.forces.stiffness)
+        used, own = self.config.vector(free.astype(float)), self.config.vector(self.bodies.stiffness)
         mean = own.sum() / own.getSize()
         self._scale = float(mean)
         self._G_all = self._constraints(equations)
@@ -152,10 +156,10 @@ class LagrangeSystem(BodySystem):
             for key in self._options:
                 del database[self._prefix + key]
 
-    def solve(self, rhs: PETSc.Vec, accuracy: float, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
-        """Unknowns q, by which the loop judges its steps, and the number of linear iterations."""
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Unknowns q, by which the loop judges its steps, and the increment with the prescribed displacements."""
         b, x = self.saddle.createVecs()
-        n = rhs.getLocalSize()
+        n = problem.rhs.getLocalSize()
         b.array[:n] = self._load.array_r
         b.array[n:] = self._short.array_r
         with timed("linear solve"):
@@ -169,10 +173,11 @@ class LagrangeSystem(BodySystem):
         b.axpy(-1.0, self.saddle * x)
         if reason < 0 or not np.isfinite(x.norm()) or b.norm() > 1e-3 * max(self._load.norm(), self._short.norm()):
             raise LinearSolveError(f"the saddle point is singular, or its solve failed with KSP reason {reason}")
-        self._x = self.config.vector(x.array_r[:n])
-        return self._restriction.reduce(self._x), int(self._ksp.getIterationNumber())
+        found = self.config.vector(x.array_r[:n])
+        free = self.bodies.free[: self.config.n_owned].ravel()
+        du = self.config.vector(np.where(free, found.array_r, self._c.array_r))
+        return Increment(problem.state.test.reduce(found), du, problem.rhs, int(self._ksp.getIterationNumber()), 0.0)
 
-    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
-        """The increment with the prescribed displacements."""
-        free = self.forces.free[: self.config.n_owned].ravel()
-        return self.config.vector(np.where(free, self._x.array_r, self._c.array_r))
+    def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
+        """Every solve is of all unknowns."""
+        return step

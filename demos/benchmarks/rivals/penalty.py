@@ -19,19 +19,18 @@ from benchmarks.rivals.line_search import flat_length
 from benchmarks.rivals.pushed import PushedSystem
 from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
-from uem_dolfinx import forms
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import IterationState, InEquilibrium
+from uem_dolfinx.solve.newton import InEquilibrium, IterationState
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
-from uem_dolfinx.solve.body_forces import FORCE_ROUNDING
+from uem_dolfinx.solve.bodies import FORCE_ROUNDING
 from uem_dolfinx.solve.tangent import contact_curvature
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.body_forces import BodyForces
+    from uem_dolfinx.solve.bodies import Bodies
     from uem_dolfinx.geometry.gmsh import Tag
     from uem_dolfinx.contact.interface import Interface
 
@@ -151,7 +150,7 @@ class PenaltySystem(PushedSystem):
 
     def __init__(
         self,
-        forces: BodyForces,
+        bodies: Bodies,
         pairs: list[Interface],
         solver: UnitedSolver,
         *,
@@ -168,7 +167,7 @@ class PenaltySystem(PushedSystem):
         for pair in pairs:
             # springs know nothing of control gaps
             pair.discretisation = NodeToSurface.like(pair.discretisation)
-        super().__init__(forces, pairs, solver, **options)
+        super().__init__(bodies, pairs, solver, **options)
         self._points = [points(pair, tag) for pair, tag in zip(pairs, tags)]
         self._none = [np.zeros(len(p.area)) for p in self._points]
         self._multipliers = self._committed = self._none
@@ -256,9 +255,9 @@ class PenaltySystem(PushedSystem):
 
     # -- the loop's questions ----------------------------------------------------------------------------------------------
 
-    def unite(self, settled: InEquilibrium) -> IterationState:
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Forces of the springs; Uzawa's update of the multipliers where the bodies have come to rest."""
-        F = self.forces.residual
+        F = self.bodies.residual
         P = self.restriction()
         with timed("springs"):
             forces, overlap = self._stretch()
@@ -277,12 +276,13 @@ class PenaltySystem(PushedSystem):
             norm=R.norm(),
             scale=F.norm(),
             rounding=rounding,
-            strain_rounding=self.forces.strain_rounding(),
+            strain_rounding=self.bodies.strain_rounding(),
             gap=overlap,
             active=sum(pair.n_active for pair in self.pairs),
             changed=changed,
             right=True,
-            closed=self.forces.dirichlet_met() and not deep,
+            closed=self.bodies.dirichlet_met() and not deep,
+            in_contact=bool(self.pairs),
         )
 
     def _rounding_of_springs(self) -> float:
@@ -295,31 +295,30 @@ class PenaltySystem(PushedSystem):
             rounding += FORCE_ROUNDING * max(self.comm.allgather(float(x * stiffest)))
         return rounding
 
-    def linearise(self, state: IterationState) -> PETSc.Vec:
-        """Tangent of bodies and springs; returns the right-hand side."""
-        forms.free_petsc_garbage(self.comm)
-        if self.first or self.newton == "full":
-            self.forces.update_tangent()
-        self._solves = 1 if self.first else self._solves + 1
+    def tangent(self, state: IterationState, first: bool) -> PETSc.Mat:
+        """Tangent of bodies and springs."""
+        if first or self.newton == "full":
+            self.bodies.update_tangent()
+        self._solves = 1 if first else self._solves + 1
         if self._solves == AVERAGED_AFTER:
             for pair in self.pairs:
                 if isinstance(pair.target, MeshTarget):
                     pair.target.averaged = True
         sliding = any(pair.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
-        made_of = self.comm.allgather((self.forces.tangent.number, on))
+        made_of = self.comm.allgather((self.bodies.tangent.number, on))
         if self._A is None or sliding or self._frictional or made_of != self.made_of:
             with timed("springs"):
                 A = self._with_springs()
             self.solver.set_operator(state.trial, A, None)
             self._A = A
         self.made_of = made_of
-        return self.right_hand_side(state, self._A)
+        return self._A
 
     def _with_springs(self) -> PETSc.Mat:
         """``K + sum stiffness area grad g grad g' - t grad^2 g`` over the springs that push (collective)."""
         blocks = [self._blocks(s, mu) for s, mu in zip(self._springs, self._mu)]
-        A = self.forces.tangent.K.copy()
+        A = self.bodies.tangent.K.copy()
         if self.comm.allreduce(sum(len(nodes) for nodes, _ in blocks)):
             A.axpy(1.0, contact_curvature(blocks, self.config.vector()), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return A
@@ -362,9 +361,8 @@ class PenaltySystem(PushedSystem):
         H = H.reshape(len(i), 1 + nn, g, 1 + nn, g)
         return np.einsum("kpa,kpgqh,kqb->kagbh", spread, H, spread, optimize=True).reshape(len(i), (nb + nn) * g, (nb + nn) * g)
 
-    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
-        """The increment; after some full steps, only as much of it as the potential falls."""
-        du = super().move(state, dq)
+    def longest(self, state: IterationState, dq: PETSc.Vec, du: PETSc.Vec) -> float:
+        """Part of the increment along which the potential falls, after some full steps."""
         slope = dq.dot(state.residual)
         # friction has no potential
         if (
@@ -374,22 +372,22 @@ class PenaltySystem(PushedSystem):
             or state.trial.c.norm() > 0.0
             or slope >= 0.0
         ):
-            return du
-        start = self.displacement()
+            return 1.0
+        start = self.bodies.displacement()
 
         def look(length: float) -> tuple[float, float]:
-            self.displace(start, du, length)
-            if self.inverted() is not None or not self.assemble_residual():
+            self.bodies.displace(start, du, length)
+            if self.bodies.inverted() is not None or not self.bodies.assemble():
                 return np.inf, np.inf
             residual = self.reduced_residual(state)
             return float(dq.dot(residual)), residual.norm()
 
-        du.scale(flat_length(look, (slope, state.norm)))
-        self.displace(start, du, 0.0)
-        return du
+        length = flat_length(look, (slope, state.norm))
+        self.bodies.displace(start, du, 0.0)
+        return length
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """Out-of-balance forces at the present displacement (collective)."""
         self.place(returning=False)
         forces, _ = self._stretch()
-        return state.test.reduce(self.forces.residual - forces)
+        return state.test.reduce(self.bodies.residual - forces)

@@ -23,17 +23,17 @@ from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.solve.tangent import Inversions, Tangent
 
 #: Multiple of the rounding of K u that the residual may be left with.
-#: [derived; rounding of K u; test_body_forces.py::test_rounding_of_forces]
+#: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]
 FORCE_ROUNDING = 4.0 * np.finfo(float).eps
 #: A force is told from rounding where it is larger by this factor.
-#: [convention; rounding of K u; test_body_forces.py::test_forces_told_from_rounding]
+#: [convention; rounding of K u; test_bodies.py::test_forces_told_from_rounding]
 ABOVE_ROUNDING = 100.0
 #: Dirichlet values are met if they are to this part of the largest.
-#: [derived; the largest prescribed value; test_body_forces.py::test_dirichlet_values_are_met]
+#: [derived; the largest prescribed value; test_bodies.py::test_dirichlet_values_are_met]
 VALUE_ROUNDING = 4.0 * np.finfo(float).eps
 
 
-class BodyForces:
+class Bodies:
     """Bodies in statics and dynamics, before contact.
 
     Args:
