@@ -102,7 +102,7 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     Least distance programming by bounded least squares (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
     Rows that contradict each other are asked for no more than the origin fulfils.
     """
-    from scipy.optimize import lsq_linear
+    from scipy.optimize import nnls
 
     size = np.linalg.norm(G, axis=1)
     scale = float(np.linalg.norm(p)) + float(np.abs(h / size).max(initial=0.0))
@@ -111,10 +111,7 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     for bound in (h, np.minimum(h, 0.0)):
         d = (bound - G @ p) / size / scale
         E = np.vstack([(G / size[:, None]).T, d])
-        # which keeps its bounds to rounding
-        lam = np.maximum(
-            lsq_linear(E, np.append(np.zeros(len(p)), 1.0), (0.0, np.inf), "bvls", 1e-15, max_iter=30 * E.shape[1]).x, 0.0
-        )
+        lam, _ = nnls(E, np.append(np.zeros(len(p)), 1.0), maxiter=30 * E.shape[1])
         left = 1.0 - float(d @ lam)
         if left > KEPT:
             break
