@@ -184,7 +184,7 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     residual(smooth)
     facets = pair.projection.facet.copy()
     A = problem.bodies.update_tangent().copy()
-    curvature = curvature_of(system.pairs, system.config.vector(), system._apart, False)
+    curvature = curvature_of(system.pairs, system.config.vector(), system._petrov_galerkin, False)
     assert curvature is not None
     du = A.createVecRight()
     du.array[:] = direction[: problem.config.n_owned].ravel()

@@ -1,4 +1,4 @@
-"""Room that MUMPS had not foreseen to need: it gets more, to an end, and nobody sees more of it than the answer."""
+"""Workspace that MUMPS had not estimated to need: it gets more, to an end, and nobody sees more of it than the answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from uem_dolfinx.algebra.options import has_mumps
 pytestmark = pytest.mark.skipif(not has_mumps(), reason="this PETSc has no MUMPS")
 
 DIRECT = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
-#: Per cent of what MUMPS foresees: less than it needs.
+#: Per cent of what MUMPS estimates: less than it needs.
 TOO_LITTLE = {"mat_mumps_icntl_14": -60}
 
 
@@ -34,26 +34,26 @@ def pressed(comm, options, friction=0.0):
 
 
 @pytest.mark.parametrize("kind, friction", [("cholesky", 0.0), ("lu", 0.0), ("lu", 0.02)])
-def test_mumps_gets_the_room_it_asks_for(comm, kind, friction, caplog):
-    """With too little room at first the state is that of a run with enough; with friction the sign of the determinant is told."""
+def test_mumps_gets_the_workspace_it_asks_for(comm, kind, friction, caplog):
+    """With too little workspace at first the state is that of a run with enough; with friction the sign of the determinant is told."""
     states = []
-    for room in ({}, TOO_LITTLE):
+    for workspace in ({}, TOO_LITTLE):
         caplog.clear()
-        b, problem = pressed(comm, {"pc_type": kind} | room, friction)
+        b, problem = pressed(comm, {"pc_type": kind} | workspace, friction)
         with caplog.at_level(logging.DEBUG, logger="uem_dolfinx"):
             problem.solve()
-        assert comm.bcast("MUMPS lacked room" in caplog.text) == bool(room)
+        assert comm.bcast("MUMPS lacked workspace" in caplog.text) == bool(workspace)
         states.append(b.scene.gather(b.u))
     assert np.abs(states[1] - states[0]).max() <= 1e-12 * np.abs(states[0]).max()
 
 
-@pytest.mark.parametrize("room, gets", [(900, {"mat_mumps_icntl_14": 1900}), (1000, {})])
-def test_room_has_an_end(comm, room, gets, monkeypatch):
-    """A factorisation that lacked room gets twice as much as it had, up to the most; then the error tells what MUMPS says."""
+@pytest.mark.parametrize("workspace, gets", [(900, {"mat_mumps_icntl_14": 1900}), (1000, {})])
+def test_workspace_has_an_end(comm, workspace, gets, monkeypatch):
+    """A factorisation that lacked workspace gets twice as much as it had, up to the most; then the error tells what MUMPS says."""
     _, problem = pressed(comm, {"pc_type": "cholesky"} | TOO_LITTLE)
     with monkeypatch.context() as m:
         m.setattr(mumps, "MOST_WORKSPACE", -100)
         raised(uem.LinearSolveError, r"MUMPS: INFOG\(1\) = -\d", problem.solve)
     pc = problem.system.solver.pc
-    pc.getFactorMatrix().setMumpsIcntl(14, room)
+    pc.getFactorMatrix().setMumpsIcntl(14, workspace)
     assert mumps.more_workspace(pc) == gets

@@ -146,7 +146,7 @@ def test_what_slides_away():
     [*product(("quadrilateral", "tetrahedron"), ("node_to_surface", "mortar")), ("hexahedron", "node_to_surface")],
 )
 def test_slip_converges_quadratically(cell, coupling):
-    """Finite sliding and finite strains over a base that bends: the tangent of the tilted rows is exact."""
+    """Finite sliding and finite strains over a base that bends: the tangent of the rotated rows is exact."""
     scene = driven(cell, 0.4, law=st_venant, n=(2, 3), how={"coupling": coupling}, options={"rtol": 1e-11})
     g = scene.problem.config.gdim
     side = [0.03] * (g - 2)
@@ -160,7 +160,7 @@ def test_slip_converges_quadratically(cell, coupling):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_tangent_by_differences(cell):
-    """K and the curvature of tilted rows are the derivative of ``F - sum lambda (n - mu s)``, all contactors slipping."""
+    """K and the curvature of rotated rows are the derivative of ``F - sum lambda (n - mu s)``, all contactors slipping."""
     mu = 0.4
     scene = driven(cell, mu)
     problem, pair = scene.problem, scene.contact.pair
@@ -183,10 +183,10 @@ def test_tangent_by_differences(cell):
     residual(smooth, np.tile([1.0, *[0.5] * (g - 1)], (n, 1)))
     s = pair.friction.directions(pair.trial)
     residual(smooth, s)
-    problem.system._apart = True
+    problem.system._petrov_galerkin = True
     du = problem.config.vector(way[: problem.config.n_owned])
     plain = problem.bodies.update_tangent() * du
-    full = plain + curvature_of([pair], du, problem.system._apart, False) * du
+    full = plain + curvature_of([pair], du, problem.system._petrov_galerkin, False) * du
     difference = residual(smooth + 1e-5 * way, s) - residual(smooth - 1e-5 * way, s)
     difference.scale(0.5e5)
     assert (difference - full).norm() <= 1e-7 * (difference - plain).norm()

@@ -40,8 +40,8 @@ def test_gaps_that_count_as_closed(length):
 
 
 @pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
-def test_what_a_solve_foretells(length):
-    """Contactors that the increment lets sink by 3e-9 of it stay open, since a solve foretells no more; by 3e-8 of it they close."""
+def test_what_a_solve_predicts(length):
+    """Contactors that the increment lets sink by 3e-9 of it stay open, since a solve predicts no more; by 3e-8 of it they close."""
     b = blocks(COMM, "quadrilateral", 2, 4, gap=0.5, pose=lambda x: length * x)
     contact = uem.Contact(b.high, b.low)
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=[contact])
@@ -60,7 +60,7 @@ def test_what_a_solve_foretells(length):
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_the_united_matrix_follows_q(coupling):
-    """Where limits of friction are held Q is P, which is what it was with tilted rows: the matrix is made anew, and back again."""
+    """Where limits of friction are held Q is P, which is what it was with rotated rows: the matrix is made anew, and back again."""
     d = driven(mu=0.3, how={"coupling": coupling, "sliding": "small"}, options={"consistent_tangent": False})
     for place in ((0.0, -0.01), (0.1, -0.01)):
         d.to(*place)

@@ -29,7 +29,7 @@ from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: A dense matrix of more components takes as long as factorisations of the whole, and too much room on one rank.
+#: A dense matrix of more components takes as long as factorisations of the whole, and too much memory on one rank.
 #: [convention; components; test_condensed.py::test_most_components]
 MOST_COMPONENTS = 3_000
 

@@ -26,7 +26,7 @@ from uem_dolfinx.parallel import Exchange, reduced
 
 #: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
 #: do so only to the first order of their strain.
-#: [heuristic; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
+#: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
 DEPENDENT = 0.05
 
 
@@ -45,7 +45,7 @@ class Group:
     redundant: Bools
     nodes: Ints
 
-    def tilted(self, rows: UnitingEquations) -> Group:
+    def rotated(self, rows: UnitingEquations) -> Group:
         """The group of the conflicting equations in other directions, which eliminate the same components.
 
         With the given rows ``A`` and the shares ``S`` the independent ones are ``S'A``, here as there; they are solved for what those
@@ -86,7 +86,7 @@ class IndependentEquations:
     Attributes:
         equations: the independent ones.
         redundant: which of the given equations were left out because they depend on others ``(m,)``, known after ``forces``.
-        undetermined: which of them no longer tell the components that they eliminate, being tilted ``(m,)``.
+        undetermined: which of them no longer tell the components that they eliminate, being rotated ``(m,)``.
         found: whether any equations on any rank conflict.
     """
 
@@ -104,7 +104,7 @@ class IndependentEquations:
         self._groups = _solve(space, self._gather(equations), free)
         self._scatter(equations)
 
-    def tilted(self, equations: UnitingEquations) -> IndependentEquations:
+    def rotated(self, equations: UnitingEquations) -> IndependentEquations:
         """The same equations in other directions, which eliminate the same components (collective).
 
         Where these no longer follow from the equations, the equations stay as they were and are told of by ``undetermined``.
@@ -116,7 +116,7 @@ class IndependentEquations:
         other.redundant, other._groups, singular = self.redundant.copy(), [], np.zeros(len(rows), dtype=bool)
         for group in self._groups:
             try:
-                other._groups.append(group.tilted(rows))
+                other._groups.append(group.rotated(rows))
             except np.linalg.LinAlgError:
                 other._groups.append(group)
                 singular[group.given] = True

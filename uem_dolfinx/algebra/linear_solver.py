@@ -73,7 +73,7 @@ class UnitedSolver:
         #: Iterations per digit that the preconditioner took at first and takes now.
         self._first_pace = self._pace = 0.0
         #: Whether Q is not P, and whether a step begins.
-        self._apart = self._begins = False
+        self._petrov_galerkin = self._begins = False
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.space.comm)
@@ -113,7 +113,7 @@ class UnitedSolver:
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
     def begin_step(self) -> None:
-        """Let what the united matrix has room for, and how it is solved, depend on this step alone."""
+        """Let what the united matrix has places for, and how it is solved, depend on this step alone."""
         self._begins, self._of = True, None
         self._kept.drop()
         for part in (self._condensed, self._united, self._unsymmetric):
@@ -156,11 +156,11 @@ class UnitedSolver:
             self._begins, self._of = False, (K, K.stateGet())
             return
         test = test or restriction
-        self._apart = test is not restriction
+        self._petrov_galerkin = test is not restriction
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
-        if self._apart and self._instead and self.iterative:
+        if self._petrov_galerkin and self._instead and self.iterative:
             # it tells the sign of the determinant as well
             self._use(self._instead)
         self._served = None
@@ -169,7 +169,7 @@ class UnitedSolver:
             return
         self._factor_of = None
         self._kept.drop()
-        if self._apart:
+        if self._petrov_galerkin:
             # direct solvers need no P'KP; for others it makes the preconditioner
             if self.iterative:
                 self._set_symmetric(restriction, K, G)
@@ -222,9 +222,9 @@ class UnitedSolver:
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
         pays = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
-        pays = pays and (self.lasting or self._apart or again)
+        pays = pays and (self.lasting or self._petrov_galerkin or again)
         serves = pays and self._condensed.serves(P, Q, K, G)
-        if not (serves or self.lasting or self._apart) and self._kept.serves(P, K):
+        if not (serves or self.lasting or self._petrov_galerkin) and self._kept.serves(P, K):
             self._served = P, K, G
             return False
         if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
@@ -242,7 +242,7 @@ class UnitedSolver:
             if self._condensed.factorise(P, Q, K, G, pc, symmetric):
                 return True
         if more := mumps.more_workspace(pc):
-            logger.debug("MUMPS lacked room, and gets more: %s", more)
+            logger.debug("MUMPS lacked workspace, and gets more: %s", more)
             return self._factorise_inside(P, Q, K, G, **options | more)
         return False
 
@@ -307,13 +307,13 @@ class UnitedSolver:
     @property
     def _tells_sign(self) -> bool:
         """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
-        return self._apart and mumps.solves(self.pc)
+        return self._petrov_galerkin and mumps.solves(self.pc)
 
     @property
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
         if self._on_condensed:
-            return self._apart and self._condensed.negative
+            return self._petrov_galerkin and self._condensed.negative
         return self._tells_sign and mumps.is_negative(self.pc)
 
     @property
@@ -336,7 +336,7 @@ class UnitedSolver:
             self.ksp.setUp()
             self.ksp.setUpOnBlocks()
         if more := mumps.more_workspace(self.pc):
-            logger.debug("MUMPS lacked room, and gets more: %s", more)
+            logger.debug("MUMPS lacked workspace, and gets more: %s", more)
             operators = self.ksp.getOperators()
             self.pc.reset()
             self.ksp.setOperators(*operators)

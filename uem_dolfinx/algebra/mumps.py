@@ -1,6 +1,6 @@
-"""What is asked of MUMPS beside solving: whether it needs more room, and the sign of the determinant.
+"""What is asked of MUMPS beside solving: whether it needs more workspace, and the sign of the determinant.
 
-Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the room it has beyond what the analysis foresees,
+Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the workspace beyond what the analysis estimates,
 INFOG(12) the number of negative pivots of a symmetric one, ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa. With a
 Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are solves. petsc4py has no Schur complements: PETSc's
 own library is called.
@@ -21,10 +21,10 @@ from uem_dolfinx.arrays import Array, Ints
 
 #: Types of PC that solve exactly.
 FACTORISATIONS = ("cholesky", "lu")
-#: MUMPS has at most so much room beyond what it foresees; a matrix that needs more is better not factorised.
-#: [convention; per cent; test_mumps.py::test_room_has_an_end]
+#: MUMPS has at most so much workspace beyond its estimate; a matrix that needs more is better not factorised.
+#: [convention; per cent; test_mumps.py::test_workspace_has_an_end]
 MOST_WORKSPACE = 2000
-#: Ends of a factorisation that lacked room: for integers, for entries, for messages that were sent and received.
+#: Ends of a factorisation that lacked workspace: for integers, for entries, for messages that were sent and received.
 SHORT_OF_WORKSPACE = (-8, -9, -17, -20)
 #: The option by which the determinant is told.
 TELLS_SIGN = {"mat_mumps_icntl_33": 1}
@@ -36,17 +36,17 @@ def solves(pc: PETSc.PC) -> bool:
 
 
 def more_workspace(pc: PETSc.PC) -> dict[str, Any]:
-    """PETSc's options by which a factorisation that lacked room gets twice as much; none if it did not, or has had enough.
+    """PETSc's options by which a factorisation that lacked workspace gets twice as much; none if it did not, or has had enough.
 
-    On several ranks MUMPS works in the order in which messages come: what it had foreseen does not always do, for the same matrix.
+    On several ranks MUMPS works in the order in which messages come: its estimate does not always do, for the same matrix.
     """
     if not solves(pc):
         return {}
     factors = pc.getFactorMatrix()
-    # what is foreseen is 100 per cent
-    room = 2 * factors.getMumpsIcntl(14) + 100
-    short = factors.getMumpsInfog(1) in SHORT_OF_WORKSPACE and room <= MOST_WORKSPACE
-    return {"mat_mumps_icntl_14": room} if short else {}
+    # the estimate is 100 per cent
+    workspace = 2 * factors.getMumpsIcntl(14) + 100
+    short = factors.getMumpsInfog(1) in SHORT_OF_WORKSPACE and workspace <= MOST_WORKSPACE
+    return {"mat_mumps_icntl_14": workspace} if short else {}
 
 
 def is_negative(pc: PETSc.PC) -> bool:

@@ -1,7 +1,7 @@
 """Which contactors are active: who is released, who is activated. Pure functions of arrays, without mesh and without communication.
 
 The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are settled on the linearised problem, before anything
-moves: its solution foretells gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again
+moves: its solution predicts gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again
 (block pivoting; Judice and Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` and
 ``Violations.worst`` over them between ``find_violations`` and ``exchange``.
 """
@@ -117,8 +117,8 @@ def find_violations(
 
     Args:
         state: of the contactors.
-        gap: that decides on contact, here or foreseen ``(n,)``.
-        lam: contact force along the normal, here or foreseen ``(n,)``.
+        gap: that decides on contact, here or predicted ``(n,)``.
+        lam: contact force along the normal, here or predicted ``(n,)``.
         off: contactors past the target's end, or that may not enter for another reason ``(n,)``.
         movable: contactors whose gap can be closed ``(n,)``.
         stiffness: of the contactors along the normal, a force per length ``(n,)``.

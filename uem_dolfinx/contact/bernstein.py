@@ -29,11 +29,8 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
 
-#: Nodes share a quadratic gap if their normals agree up to this cosine,
-#: [heuristic; cosine; -]
-SAME_SIDE = 0.9
-#: and if the gap rises no steeper than this from one to the other.
-#: [heuristic; slope; -]
+#: Nodes on the same side of a target share a quadratic gap if it rises no steeper than this from one to the other.
+#: [convention; slope; test_bernstein.py::test_pressed_on_an_arch]
 STEEPEST = 0.2
 
 
@@ -74,7 +71,7 @@ class Family:
         gap, normal, i = seen[:, 0], seen[:, 2 : 2 + g], self.child
         length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
         smooth = np.abs(gap - p.gap[i]) <= STEEPEST * length
-        smooth &= np.einsum("kg,kg->k", normal, p.normal[i]) > SAME_SIDE
+        smooth &= np.einsum("kg,kg->k", normal, p.normal[i]) > 0.0
         smooth &= usable[i] & (seen[:, 1] > 0)
         alone = np.zeros(len(self.nodes), dtype=bool)
         alone[i[~smooth]] = True

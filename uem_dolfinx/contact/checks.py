@@ -27,7 +27,7 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, reduced
 
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
-#: [heuristic; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
+#: [convention; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
 LEFT_OUT = 1e-6
 #: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
 #: [convention; slope; test_warnings.py::test_corners_are_no_curves]

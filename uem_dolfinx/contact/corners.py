@@ -23,7 +23,7 @@ from uem_dolfinx.parallel import reduced
 #: [convention; slope; test_corners.py::test_facets_in_one_plane]
 ON_PLANE = 1e-9
 #: Facets hold what is in their corner by friction up to this part of what would hold it against any pull.
-#: [heuristic; coefficient of friction; -]
+#: [heuristic; coefficient of friction; test_concave_corners.py::test_a_block_driven_into_a_leaning_wall]
 WEDGED = 0.99
 
 
@@ -91,7 +91,7 @@ class Corners:
     def pulls(self, force: Array, mu: Array | float = 0.0) -> Array:
         """What each facet contributes to the contact forces, along its own outward normal.
 
-        With friction it is along the force on one that leaves the corner over this facet: tilted against that way.
+        With friction it is along the force on one that leaves the corner over this facet: rotated against that way.
 
         Args:
             force: on the contactors ``(k, gdim)``.

@@ -2,7 +2,7 @@
 
 A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
 the direction s moves as without friction. Where its limit is ``b + mu lambda``, b hands on a force along -s that is known, and the rest
-goes along ``n - mu s``: its test row is tilted,
+goes along ``n - mu s``: its test row is rotated,
 
     trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
 
@@ -26,10 +26,10 @@ from uem_dolfinx.contact.state import FrictionState
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
 #: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
-#: [heuristic; the diagonal of K; -]
+#: [heuristic; the diagonal of K; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
 SLIP_STIFFNESS = 0.2
 #: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
-#: [heuristic; the force q; -]
+#: [heuristic; the force q; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
 LEAST_TURN = 0.999
 
 

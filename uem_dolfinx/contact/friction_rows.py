@@ -1,4 +1,4 @@
-"""Equations of an interface with friction: those along the target of contactors that stick, and tilted test rows of those that slip."""
+"""Equations of an interface with friction: those along the target of contactors that stick, and rotated test rows of those that slip."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def with_friction(
     pointwise: bool,
     keeps_ties: bool,
 ) -> Constraints:
-    """Equations with those along the target, and tilted test rows where contactors slip (collective).
+    """Equations with those along the target, and rotated test rows where contactors slip (collective).
 
     Args:
         own: equations across the target.
@@ -59,7 +59,7 @@ def with_friction(
     def with_those_along(rows: UnitingEquations, ties: Ties) -> UnitingEquations:
         return UnitingEquations.join([rows, *(along(T[:, r], away[:, r], resisted[r] & stick, ties) for r in range(g - 1))], g)
 
-    frictionless = tilted = trial = with_those_along(test, frame.ties)
+    frictionless = rotated = trial = with_those_along(test, frame.ties)
     slipping = of_friction & ~stick
     tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
     slips = reduced(comm, bool(tilt.any()), op=MPI.LOR)
@@ -67,14 +67,14 @@ def with_friction(
     if own.trial is not test or not (pointwise or (keeps_ties and not slips)):
         trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)
     if slips:
-        tilted = _tilted(frictionless, across, tilt, place, frame.ties)
+        rotated = _rotated(frictionless, across, tilt, place, frame.ties)
     stopping = trial
     if g == 3:
         beside = along(cross_products(normal[who], directions[who]), np.zeros(len(who)), slipping, frame.ties)
         stopping = UnitingEquations.join([trial, beside], g)
     return Constraints(
         trial,
-        tilted,
+        rotated,
         frictionless,
         replace(trial, active=np.concatenate([own.trial.active, *resisted])),
         stopping,
@@ -84,7 +84,7 @@ def with_friction(
     )
 
 
-def _tilted(equations: UnitingEquations, which: Ints, tilt: Array, place: Ints, ties: Ties) -> UnitingEquations:
+def _rotated(equations: UnitingEquations, which: Ints, tilt: Array, place: Ints, ties: Ties) -> UnitingEquations:
     """Equations ``which (k,)`` of which have ``tilt (k, gdim)`` added; ``place (n,)`` of contactors among these, -1 for none."""
     there = place[ties.row] >= 0
     row, direction = place[ties.row[there]], equations.direction.copy()

@@ -19,10 +19,6 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.parallel import Exchange, reduced
 
-#: The derivative of a gap that has less than this part of the plain row's component along its direction is left alone with that row:
-#: little is covered there, far from the target, and the end of what covers it moves faster than the contactor.
-#: [heuristic; part of the component; -]
-MOSTLY_OWN = 0.5
 #: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
 #: [bound; bits; -]
 MOST_BITS = 52
@@ -119,8 +115,8 @@ class Elimination:
     def beside(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
         """What the derivatives of the gaps have beside the ``plain`` rows, over ``scale (n,)`` (collective).
 
-        Nothing for contactors whose derivative is not mostly their own, or that follow others in circles which do not fade: all others
-        can be eliminated whoever is active.
+        Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
+        they do, or that follow others in circles which do not fade: all others can be eliminated whoever is active.
 
         Returns:
             Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.
@@ -129,7 +125,7 @@ class Elimination:
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
         beside = row, term, value = self.at_owners(terms, scale)
         own = np.einsum("ng,ng->n", self.of_themselves(plain, beside), plain.direction)
-        lone = own < MOSTLY_OWN
+        lone = own <= 0.0
         while True:
             kept = ~lone[beside[0]]
             row, term, value = beside = row[kept], term[kept], value[kept]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.corners import Corners
 
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
-#: [heuristic; length of the facet; test_large_sliding.py::test_an_end_holds_what_was_drawn_there]
+#: [convention; length of the facet; test_large_sliding.py::test_an_end_holds_what_was_drawn_there]
 END_HOLDS = 0.1
 
 

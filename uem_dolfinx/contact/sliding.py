@@ -1,4 +1,4 @@
-"""What an interface with friction adds along the target: equations of contactors that stick, tilted rows and forces of those that slip.
+"""What an interface with friction adds along the target: equations of contactors that stick, rotated rows and forces of those that slip.
 
 ``friction`` says, as functions of arrays, who sticks and who slips, and a law how much force that takes.
 """
@@ -309,7 +309,7 @@ class Sliding:
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
-        """Equations with those along the target, and tilted test rows where contactors slip (collective)."""
+        """Equations with those along the target, and rotated test rows where contactors slip (collective)."""
         return with_friction(
             own,
             self.frame,

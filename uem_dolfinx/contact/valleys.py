@@ -20,13 +20,13 @@ from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import reduced
 
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
-#: [heuristic; changes in a step; -]
+#: [heuristic; changes in a step; test_polygons.py::test_sliding_along_a_polygon]
 HOLD_AFTER = 2
 #: A concave bend whose facets rise above each other by more holds a contactor at once: nothing slides on across it.
 #: [heuristic; slope; test_concave_corners.py::test_a_block_pressed_into_a_corner]
 SHARP = 0.5
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
-#: [heuristic; changes in a step; -]
+#: [heuristic; changes in a step; test_polygons.py::test_sliding_along_a_polygon]
 MOST_CHANGES = 8
 
 

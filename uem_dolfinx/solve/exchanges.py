@@ -4,7 +4,7 @@ A state that comes again is noticed when it does. Another rule takes over then; 
 change sides for ever.
 
 Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
-are: the united matrix is singular, and what it foresees is far beyond the bodies. From the state before, limits of friction are then held
+are: the united matrix is singular, and what it predicts is far beyond the bodies. From the state before, limits of friction are then held
 at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric; without the curvature of contact the problem
 is convex. The forces that follow make the next limits, until these settle, and Coulomb's law goes on from there. So they are once in every
 linearised problem where contactors would go one by one.
@@ -182,7 +182,7 @@ class Exchanges:
             raise self._circle(self._lately)
 
     def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
-        """States of the pairs with friction, with the forces along the normal that are foreseen."""
+        """States of the pairs with friction, with the forces along the normal that are predicted."""
         here: list[tuple[PairState, Pivot] | None] = []
         for pair, w in zip(self._pairs, violated):
             if pair.friction is None or not isinstance(w, FrictionViolations):

@@ -62,7 +62,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
     if progress.factor != 0.0:
         problem.set_load(progress.factor)
     #: the last load factor at which an equilibrium was found that is unstable
-    unstable = -np.inf
+    unstable: float | None = None
     while progress.factor < 1.0:
         done = progress.factor
         if progress.control.number >= way.most * steps:
@@ -80,7 +80,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
                 problem.set_load(done)
             # the targets that the load moves are back, too
             problem.restore()
-            if unstable > -np.inf:
+            if unstable is not None:
                 error.amend(
                     f"at the load factor {unstable:.4g} the equilibrium was unstable, as the united matrix had negative eigenvalues: the "
                     "bodies buckle or snap there, and no static path may go on; give them a mass and take time steps"

@@ -18,7 +18,7 @@ from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies import Bodies
 
 #: A residual that keeps this part of its norm twice has met its rounding.
-#: [heuristic; norm of the residual; -]
+#: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
 STALLED = 0.5
 #: Shortest step of the line search.
 #: [bound; halvings of a step; -]
@@ -36,11 +36,8 @@ FORCING = 1e-3
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 #: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
 ACCURACY_AT_THE_END = 0.1
-#: A residual below this part of the forces at work is an equilibrium in which contact forces can be read from the bodies.
-#: [heuristic; norm of the forces; -]
-IN_EQUILIBRIUM = 1e-6
 #: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
-#: [heuristic; norm of the forces; -]
+#: [convention; norm of the forces; test_trust.py::test_converged_means_converged]
 LARGEST_ROUNDING = 1e-4
 
 
@@ -241,7 +238,7 @@ def solve_united(
     start, length, norm, stalled, left = 0.0, 1.0, 0.0, 0, 0.0
 
     def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
-        return norm <= max(max(IN_EQUILIBRIUM, rtol) * max(scale, start), rounding, left)
+        return norm <= max(rtol * max(scale, start), rounding, left)
 
     method.place(returning=False)
     if not bodies.assemble():

@@ -23,7 +23,7 @@ from uem_dolfinx.parallel import agree
 from uem_dolfinx.solve.newton import IterationState
 
 
-class Meetings:
+class OverConstraints:
     """How equations of several contacts can meet (collective).
 
     Args:
@@ -107,7 +107,7 @@ class BodyState(IterationState):
 
 
 def make_rows(
-    meetings: Meetings,
+    over_constraints: OverConstraints,
     pairs: Sequence[Interface],
     hold: Callable[[UnitingEquations, UnitingEquations], Bools],
     prescribed: Array,
@@ -115,7 +115,7 @@ def make_rows(
     """Equations of all pairs in their present states, and Q (collective).
 
     Args:
-        meetings: of the pairs.
+        over_constraints: of the pairs.
         pairs: of all contacts.
         hold: free components ``(n_owned, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
         prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
@@ -124,7 +124,7 @@ def make_rows(
         FrictionError: if contactors wedge where several equations meet.
     """
     rigid = [pair for pair in pairs if not pair.target.n_nodes]
-    for pair in rigid if meetings.shared else ():
+    for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
     frictionless = trial = UnitingEquations.join([e.frictionless for e in equations], g)
@@ -136,30 +136,30 @@ def make_rows(
         stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
-    Q, independent = meetings.restrict(equations, frictionless, free, prescribed)
-    tilted = Q
+    Q, independent = over_constraints.restrict(equations, frictionless, free, prescribed)
+    rotated = Q
     if any(e.test is not e.frictionless for e in equations):
         test = UnitingEquations.join([e.test for e in equations], g)
         if independent is not None and independent.found:
-            independent = _tilted(pairs, independent, test)
+            independent = _rotated(pairs, independent, test)
             test = independent.equations
-        tilted = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
-    return Rows(equations, None if trial is frictionless else trial, independent, tilted, Q)
+        rotated = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
+    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q)
 
 
-def _tilted(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
-    """Equations that got in each other's way, tilted where contactors slip (collective).
+def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
+    """Equations that got in each other's way, rotated where contactors slip (collective).
 
     Args:
         pairs: of all contacts.
-        independent: how they were resolved upright.
-        test: tilted equations of all pairs.
+        independent: how they were resolved without friction.
+        test: rotated equations of all pairs.
 
     Raises:
         FrictionError: naming the first contactor, of the first rank that has one, whose equations no longer tell its motion.
     """
-    tilted = independent.tilted(test)
-    bad, error = np.flatnonzero(tilted.undetermined), None
+    rotated = independent.rotated(test)
+    bad, error = np.flatnonzero(rotated.undetermined), None
     if len(bad):
         node = int(test.node[bad[0]])
         names = ", ".join(pair.name for pair in pairs if node in pair.nodes)
@@ -168,7 +168,7 @@ def _tilted(pairs: Sequence[Interface], independent: IndependentEquations, test:
             "equations meet and it wedges: take less friction there, or drop one of the contacts"
         )
     agree(pairs[0].config.comm, error)
-    return tilted
+    return rotated
 
 
 def unbalanced(pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction]) -> tuple[Array, Array]:

@@ -144,7 +144,7 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
 
     Args:
         comm: communicator of the problem.
-        progress: of the problem, by which it heeds signals within a step, too.
+        progress: of the problem, by which it checks signals within a step, too.
         steps: each brings the problem from one committed state to the next; where it raises, the last one is restored.
         checkpoint: which has begun; None writes none.
 

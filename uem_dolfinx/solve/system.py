@@ -30,11 +30,11 @@ from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
-from uem_dolfinx.solve.rows import BodyState, Meetings, Rows, make_rows, unbalanced
+from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
-#: A direct solve foretells gaps to this part of the increment, and forces to what moves a contactor that far.
-#: [convention; the increment; test_system.py::test_what_a_solve_foretells]
+#: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
+#: [convention; the increment; test_system.py::test_what_a_solve_predicts]
 PREDICTED = 1e-8
 #: Part of the model's size that an active contactor's gap may be left with.
 #: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
@@ -69,7 +69,7 @@ class BodySystem:
         self._curvature: PETSc.Mat | None = None
         self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
-        self._apart = False
+        self._petrov_galerkin = False
         #: The state that was settled last, if its united matrix has a negative determinant.
         self._not_unique: BodyState | None = None
         #: Whether the bodies have moved in this step.
@@ -79,7 +79,7 @@ class BodySystem:
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
         self._swept = False
         #: How equations of several contacts can meet.
-        self.meetings = Meetings(self.config, self.pairs)
+        self.over_constraints = OverConstraints(self.config, self.pairs)
         self.floating = FloatingBodies(bodies, self.pairs)
         self.place(returning=False)
         for pair in self.pairs:
@@ -100,13 +100,13 @@ class BodySystem:
             if not returning or stiffness is None:
                 return
             for k, pair in enumerate(self.pairs):
-                if self.meetings.shared and k > 0:
+                if self.over_constraints.shared and k > 0:
                     # what another pair has returned is returned
                     pair.project()
                 # surfaces that follow each other would both make up for the same gap
-                if not self.meetings.mutual[k]:
+                if not self.over_constraints.mutual[k]:
                     pair.return_to_target(stiffness)
-            if self.meetings.shared:
+            if self.over_constraints.shared:
                 for pair in self.pairs:
                     pair.project()
             self.bodies.u.x.scatter_forward()
@@ -150,7 +150,7 @@ class BodySystem:
         """Where the contactors belong at the present displacement, and the equations that follow.
 
         1. Take Q'F with the present equations.
-        2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem foretold.
+        2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem predicted.
         3. Let go of contactors past an end, and follow the others across bends, into corners and out of them.
         4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
         5. Take the equations that follow, Q'F with them, and who breaks the conditions of contact.
@@ -195,17 +195,17 @@ class BodySystem:
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         hold = partial(self.floating.hold, self.bodies.free[: self.config.n_owned])
-        return make_rows(self.meetings, self.pairs, hold, self.bodies.prescribed)
+        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed)
 
     def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
         """What the loop sees of these rows, with P (collective)."""
         # where equations get in each other's way, those of P might eliminate other components than those of Q
-        contested = self.meetings.shared or (rows.independent is not None and rows.independent.found)
+        contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
-        self._apart = apart is not None or rows.test is not rows.frictionless
+        self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
         trial = rows.frictionless
         if apart is not None:
-            trial, _ = self.meetings.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
+            trial, _ = self.over_constraints.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
         added, held = slip_terms(self.pairs, self.config.vector())
         gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
         return BodyState(
@@ -280,7 +280,7 @@ class BodySystem:
         return F
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
-        """How bodies slide without end under foreseen forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
+        """How bodies slide without end under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
         if self.floating.motions is None or not self.frictional:
             return None
         # known forces are among those of the contact
@@ -356,7 +356,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.bodies.update_tangent()
         with timed("contact curvature"):
-            how = self.config.vector(), self._apart, self.exchanges.convex
+            how = self.config.vector(), self._petrov_galerkin, self.exchanges.convex
             self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
@@ -393,7 +393,7 @@ class BodySystem:
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
         """Unknowns dq, and ``du = P dq + c``; bodies stay where they are along neutral motions (collective)."""
-        # held limits follow what a solve foretells: it is as good as a direct one
+        # held limits follow what a solve predicts: it is as good as a direct one
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
         left = 0.0 if self.solver.exact else accuracy

@@ -1,7 +1,7 @@
 """What a law of friction says, and how a law in one file is handed to a contact.
 
 A contactor that sticks bears any force along the target up to a limit; one that slips bears the limit against its way. The law is this
-limit and its derivative with the force along the normal, from which test rows are tilted. ``coulomb`` and ``tresca`` are examples of a
+limit and its derivative with the force along the normal, from which test rows are rotated. ``coulomb`` and ``tresca`` are examples of a
 file each: a law of the user's own is a class with the same attributes, and is given to ``Contact`` as ``friction``.
 """
 
