@@ -53,6 +53,22 @@ def test_solves_on_the_way_are_as_accurate_as_newton_needs():
     assert loose[0] <= 1.25 * tight[0] and loose[1] <= 0.79 * tight[1]
 
 
+@pytest.mark.parametrize("contact", [False, True])
+@pytest.mark.parametrize("load", [3e-8, 1e-9, 1e-10])
+def test_loads_that_rounding_of_the_deformation_gradient_hides(load, contact):
+    """Where ``1 + grad(u)`` leaves the residual few digits, it has converged when it no longer falls."""
+    b = blocks(COMM, "triangle", 6, 4, gap=0.5, overhang=0.5)
+    F = st_venant(b.u, modulus(b.scene, 1.0, 2.0)) + load * ufl.TestFunction(b.V)[1] * ufl.dx
+    contacts = [uem.Contact(b.high, b.low)] if contact else []
+    history = uem.UnitedProblem(F, b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=contacts).solve()
+    assert len(history) <= 5 and 1e-8 < history[-1].residual <= 1e-15 / load
+    exact = blocks(COMM, "triangle", 6, 4, gap=0.5, overhang=0.5)
+    F = linear(exact.u, modulus(exact.scene, 1.0, 2.0)) + load * ufl.TestFunction(exact.V)[1] * ufl.dx
+    uem.UnitedProblem(F, exact.u, bcs=[*clamp(exact.V, exact.bottom), *clamp(exact.V, exact.top)]).solve()
+    found, expected = b.scene.gather(b.u), exact.scene.gather(exact.u)
+    assert np.abs(found - expected).max() <= 1e-15 / load * np.abs(expected).max()
+
+
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 def test_the_last_solve_is_as_accurate_as_convergence_asks(rtol):
     """A linear problem takes one solve, which leaves neither more than a twentieth of what converges nor less than a 250th."""

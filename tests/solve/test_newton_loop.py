@@ -49,12 +49,15 @@ class OneUnknown:
     def above_rounding(self, in_contact):
         return 0.0
 
+    def strain_rounding(self):
+        return 0.0
+
     def place(self, returning):
         pass
 
     def assemble_constraints(self, in_equilibrium):
         R, rows = vector(self.F()), SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))
-        return IterationState(rows, rows, R, R.norm(), 1.0, 0.0, 0.0, 0.0, 0, False, True, True, self.in_contact)
+        return IterationState(rows, rows, R, R.norm(), 1.0, 0.0, 0.0, 0, False, True, True, self.in_contact)
 
     def linearise(self, state, iteration):
         self.solves += 1

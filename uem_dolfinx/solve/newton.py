@@ -79,7 +79,6 @@ class IterationState:
         norm: its norm.
         scale: norm of the forces at work.
         rounding: norm below which a force is rounding of the displacement.
-        strain_rounding: norm that rounding of the deformation gradient alone can make, in laws that start from it.
         gap: largest gap of an active contactor, a length.
         active: number of active contactors over all ranks.
         changed: whether contactors have changed what they are united to because of where they are.
@@ -94,7 +93,6 @@ class IterationState:
     norm: float
     scale: float
     rounding: float
-    strain_rounding: float
     gap: float
     active: int
     changed: bool
@@ -237,8 +235,12 @@ def solve_united(
     history: list[Iteration] = []
     start, length, norm, stalled, left = 0.0, 1.0, 0.0, 0, 0.0
 
+    def rounding_of_all(rounding: float, times: int) -> float:
+        # a residual that has not fallen so often has met the rounding of laws that start from the deformation gradient
+        return max(rounding, left, bodies.strain_rounding() if stalled >= times else 0.0)
+
     def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
-        return norm <= max(rtol * max(scale, start), rounding, left)
+        return norm <= max(rtol * max(scale, start), rounding_of_all(rounding, 1))
 
     method.place(returning=False)
     if not bodies.assemble():
@@ -254,16 +256,14 @@ def solve_united(
             start, left = state.norm, min(state.rounding, rtol * forces_before)
         forces = max(state.scale, start)
         steady = state.right and not state.changed
-        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and steady else 0
-        norm = state.norm
-        rounding = max(state.rounding if stalled < 2 else max(state.rounding, state.strain_rounding), left)
-        small = rtol * forces
+        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
+        norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
         if small < norm <= rounding:
             # rounding excuses a residual that is small beside real forces, or where there are none
             real = max(bodies.above_rounding(state.in_contact), forces_before)
             small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
         converged = steady and state.closed and norm <= small
-        hidden = stalled >= 2 and small < norm <= rounding
+        hidden = steady and stalled >= 2 and small < norm <= rounding
         if converged or hidden or k == max_iterations:
             history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)

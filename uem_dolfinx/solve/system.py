@@ -215,7 +215,6 @@ class BodySystem:
             norm=residual.norm(),
             scale=self.bodies.residual.norm(),
             rounding=rounding,
-            strain_rounding=self.bodies.strain_rounding(),
             gap=gap,
             active=sum(pair.n_active for pair in self.pairs),
             changed=changed,

@@ -205,7 +205,6 @@ class BarrierSystem(PushedSystem):
             norm=R.norm(),
             scale=self.bodies.residual.norm(),
             rounding=self.rounding(),
-            strain_rounding=self.bodies.strain_rounding(),
             gap=0.0,
             active=sum(pair.n_active for pair in self.pairs),
             changed=False,

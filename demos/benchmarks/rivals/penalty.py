@@ -276,7 +276,6 @@ class PenaltySystem(PushedSystem):
             norm=R.norm(),
             scale=F.norm(),
             rounding=rounding,
-            strain_rounding=self.bodies.strain_rounding(),
             gap=overlap,
             active=sum(pair.n_active for pair in self.pairs),
             changed=changed,
