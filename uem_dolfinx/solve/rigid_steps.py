@@ -102,25 +102,36 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     Least distance programming by bounded least squares (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
     Rows that contradict each other are asked for no more than the origin fulfils.
     """
-    from scipy.optimize import nnls
+    from scipy.optimize import lsq_linear, nnls
 
     size = np.linalg.norm(G, axis=1)
     scale = float(np.linalg.norm(p)) + float(np.abs(h / size).max(initial=0.0))
     if scale == 0:
         return p, np.zeros(len(h))
-    for bound in (h, np.minimum(h, 0.0)):
+    unit, most = np.append(np.zeros(len(p)), 1.0), 30 * len(h)
+    # the first is quick, but not in every SciPy accurate to rounding; the second keeps its bounds to rounding
+    for quick, bound in ((True, h), (False, h), (False, np.minimum(h, 0.0))):
         d = (bound - G @ p) / size / scale
         E = np.vstack([(G / size[:, None]).T, d])
-        lam, _ = nnls(E, np.append(np.zeros(len(p)), 1.0), maxiter=30 * E.shape[1])
+        try:
+            lam = nnls(E, unit, maxiter=most)[0] if quick else lsq_linear(E, unit, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x
+        except RuntimeError:
+            # too many iterations
+            continue
+        lam = np.maximum(lam, 0.0)
         left = 1.0 - float(d @ lam)
-        if left > KEPT:
+        if left <= KEPT:
+            continue
+        lam *= scale / left / size
+        # to rounding, with the rows that bear; one more than there are unknowns, by rounding, would make them contradict each other
+        i = np.flatnonzero(lam * size > KEPT * (lam * size).max(initial=0.0))
+        exact = np.zeros(len(lam))
+        exact[i] = np.linalg.lstsq(G[i] @ G[i].T, bound[i] - G[i] @ p, rcond=None)[0]
+        x = p + G.T @ exact
+        slack = (G @ x - bound) / size
+        tight = not quick or (slack[i] <= KEPT * scale).all()
+        if tight and (exact >= 0).all() and (slack >= -KEPT * scale).all():
+            return x, exact
+        if not quick:
             break
-    lam *= scale / left / size
-    # to rounding, with the rows that bear; one more than there are unknowns, by rounding, would make them contradict each other
-    i = np.flatnonzero(lam * size > KEPT * (lam * size).max(initial=0.0))
-    exact = np.zeros(len(lam))
-    exact[i] = np.linalg.lstsq(G[i] @ G[i].T, bound[i] - G[i] @ p, rcond=None)[0]
-    x = p + G.T @ exact
-    if (exact >= 0).all() and (G @ x - bound >= -KEPT * scale * size).all():
-        return x, exact
     return p + G.T @ lam, lam
