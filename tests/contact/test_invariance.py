@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from dolfinx import fem
 from helpers import arch, blocks, clamp, linear, modulus, run, st_venant
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import uem_dolfinx as uem
@@ -101,7 +101,9 @@ def test_rotation(reference, case, angle):
 
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.floats(-3.1, 3.1), st.floats(-5, 5), st.integers(0, 1000))
+@example(0.2680489901632064, 0.0, 8)
 def test_any_pose_and_numbering(reference, angle, shift, seed):
+    """The last one finds another equilibrium where the first solve leaves a thousandth of its right-hand side."""
     same(press("triangle", turn=turn_of(2, angle), shift=shift, shuffle=seed), reference["triangle", "facet"], 1e-9)
 
 

@@ -41,7 +41,7 @@ def test_linear_body_assembles_its_tangent_once():
 
 
 def test_solves_on_the_way_are_as_accurate_as_newton_needs():
-    """Looser solves take less than four fifths of the linear iterations of solves to 1e-8, and at most a quarter more Newton iterations."""
+    """Looser solves take less than nine tenths of the linear iterations of solves to 1e-8, and at most 15 % more Newton iterations."""
 
     def iterations(cell, law, fine, **accuracy):
         _, _, problem = pressed(cell, law=law, fine=fine, petsc_options={"ksp_type": "cg", "pc_type": "jacobi", **accuracy})
@@ -50,7 +50,7 @@ def test_solves_on_the_way_are_as_accurate_as_newton_needs():
 
     scenes = [("triangle", st_venant, 4), ("quadrilateral", linear, 4), ("hexahedron", linear, 1)]
     loose, tight = (np.sum([iterations(*scene, **how) for scene in scenes], axis=0) for how in ({}, {"ksp_rtol": 1e-8}))
-    assert loose[0] <= 1.25 * tight[0] and loose[1] <= 0.79 * tight[1]
+    assert loose[0] <= 1.15 * tight[0] and loose[1] <= 0.9 * tight[1]
 
 
 @pytest.mark.parametrize("contact", [False, True])
