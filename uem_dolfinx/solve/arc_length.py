@@ -100,7 +100,7 @@ class ArcLength:
             self._differentiate()
         problem = self._system.linearise(state, iteration)
         # the load increment is as accurate as the unknowns, and near limit points little is left by solutions that are far off
-        return replace(problem, exact=not problem.iterative, iterative=False, passing=True, convex=False)
+        return problem._replace(exact=not problem.iterative, iterative=False, passing=True, convex=False)
 
     def _differentiate(self) -> None:
         """Derivative of the residual with respect to the load factor (collective)."""
@@ -119,7 +119,7 @@ class ArcLength:
         system, state = self._system, problem.state
         load = state.test.transpose(self._slope)
         load.scale(-1.0)
-        free, by_load = (system.solve(replace(problem, rhs=rhs), accuracy, None) for rhs in (problem.rhs, load))
+        free, by_load = (system.solve(problem._replace(rhs=rhs), accuracy, None) for rhs in (problem.rhs, load))
         still = load.duplicate()
         still.set(0.0)
         along = self._along((by_load.du - system.move(state, still)).array_r)
@@ -135,7 +135,7 @@ class ArcLength:
         held = self._change * self._slope
         if problem.state.held is not None:
             held.axpy(1.0, problem.state.held)
-        return self._system.exchange(replace(problem, state=replace(problem.state, held=held)), step)
+        return self._system.exchange(problem._replace(state=replace(problem.state, held=held)), step)
 
 
 class AlongArc:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from petsc4py import PETSc
 
@@ -101,8 +101,7 @@ class IterationState:
     in_contact: bool
 
 
-@dataclass(frozen=True)
-class LinearisedProblem:
+class LinearisedProblem(NamedTuple):
     """``Q'KP dq = rhs`` in one active set, and how it is to be solved.
 
     Attributes:
@@ -124,8 +123,7 @@ class LinearisedProblem:
     convex: bool
 
 
-@dataclass(frozen=True)
-class Increment:
+class Increment(NamedTuple):
     """Solution of a linearised problem.
 
     Attributes:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 from mpi4py import MPI
@@ -401,7 +400,7 @@ class BodySystem:
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
         """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
         dq = self.solver.complete(step.dq)
-        return step if dq is step.dq else replace(step, dq=dq, du=self.move(problem.state, dq))
+        return step if dq is step.dq else step._replace(dq=dq, du=self.move(problem.state, dq))
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
