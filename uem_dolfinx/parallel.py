@@ -196,6 +196,16 @@ def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
     return total
 
 
+def gathered(comm: MPI.Comm, value: Any) -> AnyArray:
+    """A number, or an array ``(...)`` of the same shape on all ranks, of every rank ``(n_ranks, ...)``, in one call (collective)."""
+    own = np.ascontiguousarray(value)
+    if comm.size == 1:
+        return own.reshape(1, *np.shape(value))
+    every = np.empty((comm.size, *np.shape(value)), own.dtype)
+    comm.Allgather(own, every)
+    return every
+
+
 def reduced(comm: MPI.Comm, value: Any, op: MPI.Op = MPI.SUM) -> Any:
     """Sum, or another reduction, of a number or an array ``(...)`` over all ranks, in one call and as what it came (collective)."""
     if comm.size == 1:

@@ -66,11 +66,12 @@ def test_the_united_matrix_follows_q(coupling):
     assert d.states[1] > 0
     system.place(returning=False)
     d.problem.bodies.assemble()
-    system.linearise(system.assemble_constraints(lambda *norms: False), 0)
+    before = system.assemble_constraints(lambda *norms: False)
+    system.linearise(before, 0)
     for lam in (None, pair.trial.lam, None):
         pair.friction.hold_limits(lam)
         rows = system._rows()
-        state = system._state(rows, rows.test.transpose(system._residual()), 0.0, False, False)
+        state = system._with_rows(before, rows)
         assert (state.test is state.trial) == (lam is not None)
         linearised = system.linearise(state, None)
         loads = d.problem.bodies.residual.duplicate()

@@ -25,7 +25,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import gathered, reduced
 
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
 #: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
@@ -89,11 +89,14 @@ class Deflation:
 
 
 def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
-    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)`` (collective)."""
+    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)``."""
     followed = np.zeros(space.n_owned, dtype=bool)
-    followed[space.gather_owned(P.followed(P.equations.active))] = True
+    followed[P.followed_here] = True
     followed[P.nodes] = False
-    stiffness, own = (M.getDiagonal().array_r.reshape(-1, space.block) for M in (A, K))
+    both = space.vector(), space.vector()
+    for M, diagonal in zip((A, K), both):
+        M.getDiagonal(diagonal)
+    stiffness, own = (diagonal.array_r.reshape(-1, space.block) for diagonal in both)
     return followed & (P.used & (stiffness > MUCH_STIFFER * own)).any(axis=1)
 
 
@@ -116,7 +119,7 @@ def deflated(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETS
     near = np.zeros((n, 1), dtype=bool)
     near[space.gather_owned(np.unique(touched.getIndices() // g).astype(np.int64))] = True
     alone = np.flatnonzero(P.used & near)
-    counts = np.cumsum([0, *comm.allgather(len(alone))])
+    counts = np.append(0, np.cumsum(gathered(comm, len(alone))))
     mode, row, value = _rigid_modes(space, P, pressed, ~near & P.used)
     n_modes = reduced(comm, int(mode.max(initial=-1)) + 1, op=MPI.MAX)
     rows, values = np.append(alone, row), np.append(np.ones(len(alone)), value)

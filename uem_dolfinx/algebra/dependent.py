@@ -22,7 +22,7 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
-from uem_dolfinx.parallel import Exchange, reduced
+from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
 #: do so only to the first order of their strain.
@@ -94,8 +94,8 @@ class IndependentEquations:
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
         self.undetermined: Bools = self.redundant
         conflicting = equations.active & (mutual | _cannot_eliminate(equations, free))
-        counts = space.comm.allgather(int(conflicting.sum()))
-        self.found = any(counts)
+        counts = gathered(space.comm, int(conflicting.sum()))
+        self.found = bool(counts.any())
         self.equations = equations
         if not self.found:
             return

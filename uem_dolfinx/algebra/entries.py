@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.parallel import reduced
 
 #: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
 #: [convention; entries; test_linear_solver.py::test_what_counts_as_symmetric]
@@ -106,16 +109,18 @@ def stiffen(A: PETSc.Mat, K: PETSc.Mat, idle: Bools) -> None:
     A.setDiagonal(diagonal)
 
 
-def is_symmetric(A: PETSc.Mat) -> bool:
-    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective)."""
-    scale, size = A.getDiagonal(), A.createVecLeft()
-    scale.sqrtabs()
-    if scale.min()[1] == 0.0:
-        return False
-    scale.reciprocal()
-    size.array[:] = scale.array_r * np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], size.local_size)
-    difference, across = A * size, size.duplicate()
-    A.multTranspose(size, across)
-    difference.axpy(-1.0, across)
-    difference.pointwiseMult(difference, scale)
-    return bool(difference.norm(PETSc.NormType.INFINITY) <= SYMMETRIC)
+def is_symmetric(A: PETSc.Mat, like: PETSc.Vec) -> bool:
+    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective).
+
+    ``like`` is a vector of its layout.
+    """
+    size, one, other = (like.duplicate() for _ in range(3))
+    A.getDiagonal(size)
+    root = np.sqrt(np.abs(size.array_r))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size.array[:] = np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], len(root)) / root
+        A.mult(size, one)
+        A.multTranspose(size, other)
+        # a diagonal that is zero leaves what is no number
+        alike = bool((np.abs(one.array_r - other.array_r) <= SYMMETRIC * root).all() and root.all())
+    return bool(reduced(A.comm.tompi4py(), alike, op=MPI.LAND))

@@ -192,7 +192,7 @@ class UnitedSolver:
                 stiffen(self._A, K, ~restriction.used.ravel())
         else:
             self._A = self._united.update(restriction, restriction, K, G)
-        if not (symmetric := is_symmetric(self._A)) and self._instead and self.iterative:
+        if not (symmetric := is_symmetric(self._A, self.space.vector())) and self._instead and self.iterative:
             self._use(self._instead)
         self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
@@ -235,7 +235,7 @@ class UnitedSolver:
 
     def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
         """Factorise K without the components of the contact; whether that can be done, and pays (collective)."""
-        pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K)
+        pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K, self.space.vector())
         pc.setOptionsPrefix(self._prefix)
         pc.setType((self.pc.getType() if self._symmetric else self._types[1]) if symmetric else "lu")
         with timed("factorisation or preconditioner set-up"), self._in_database(**options):
@@ -409,7 +409,8 @@ class UnitedSolver:
             self.ksp.setOperators(matrix)
             dq, more = self.solve(rhs)
             return dq, iterations + more
-        if reason < 0 or not np.isfinite(dq.norm()):
+        # iterative solvers tell by their reason
+        if reason < 0 or not (self.iterative or np.isfinite(dq.norm())):
             raise LinearSolveError(
                 f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "
                 f"{iterations} iterations{mumps.how_it_ended(self.pc)}: a body may be free to move as a rigid body, the tangent may be "

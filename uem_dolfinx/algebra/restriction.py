@@ -29,7 +29,7 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, Uniting
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Halo, Nodes
-from uem_dolfinx.parallel import agree, reduced
+from uem_dolfinx.parallel import agree, gathered, reduced
 
 #: Equations may follow each other in circles if what has gone through so many of them is rounding.
 #: [convention; number of equations; test_restriction.py::test_circles_that_fade]
@@ -68,11 +68,14 @@ class Restriction:
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.index_map.size_global),) * 2
         self._first = g * space.first
-        self.n_equations, self._n_rows = (int(k) for k in reduced(self.comm, np.array([equations.active.sum(), len(equations)])))
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
-        self.frames, self.lift = self._eliminate() if like is None else self._eliminate_like(like)
+        self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
+        told = np.array([equations.active.sum(), len(equations), error is not None], dtype=np.int64)
+        self.n_equations, self._n_rows, wrong = (int(k) for k in reduced(self.comm, told))
+        if wrong:
+            agree(self.comm, error)
         #: Columns of P that are in use ``(n_owned, block)``.
         self.used: Bools = free.copy()
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
@@ -95,8 +98,8 @@ class Restriction:
 
     # -- elimination in each node's frame ------------------------------------------------------------------------------
 
-    def _eliminate(self) -> tuple[Array, Array]:
-        """Blocks of T at ``nodes (k, g, g)``, and how each equation acts on its node ``(m, g)``."""
+    def _eliminate(self) -> tuple[Array, Array, ConflictError | None]:
+        """Blocks of T at ``nodes (k, g, g)``, how each equation acts on its node ``(m, g)``, and what forbids it."""
         g, eq = self.space.block, self.equations
         frames = self.free[self.nodes, None, :] * np.eye(g)
         lift = np.zeros_like(eq.direction)
@@ -110,10 +113,9 @@ class Restriction:
             pinv: Array = np.asarray(np.linalg.pinv(A))
             lift[rows] = pinv.transpose(0, 2, 1)
             frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
-        agree(self.comm, error)
-        return frames, lift
+        return frames, lift, error
 
-    def _eliminate_like(self, like: Restriction) -> tuple[Array, Array]:
+    def _eliminate_like(self, like: Restriction) -> tuple[Array, Array, None]:
         """What ``_eliminate`` returns, from the frames and the lift of other equations ``like``.
 
         With ``A`` the directions here, and ``T`` and ``L`` the frame and the lift there, these are ``L (A L)^-1`` and
@@ -127,7 +129,7 @@ class Restriction:
             lift[rows] = own.transpose(0, 2, 1)
             place = np.searchsorted(self.nodes, at)
             frames[place] -= own @ (A @ frames[place])
-        return frames, lift
+        return frames, lift, None
 
     def _conflict(self, node: int, n_equations: int) -> ConflictError:
         fixed = [c for c, f in zip("xyz", self.free[node]) if not f]
@@ -154,7 +156,7 @@ class Restriction:
         """
         g, eq = self.space.block, self.equations
         m, k = len(eq), np.arange(g)
-        counts = np.array(self.comm.allgather(m))
+        counts = gathered(self.comm, m)
         first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
         # terms at nodes of which nothing is eliminated lead nowhere
         eliminated = np.zeros((self.space.n_owned, 1))
@@ -231,6 +233,11 @@ class Restriction:
         """Places of ``rows``, and those that all equations would take if they held and followed no others."""
         return together(self._turned(self.nodes), self._couplings(np.ones_like(self.equations.active)))
 
+    @property
+    def followed_here(self) -> Ints:
+        """Local numbers of the owned nodes that equations of any rank follow that hold, repeated or not."""
+        return np.zeros(0, np.int64) if self._halo is None else self._halo.asked
+
     def followed(self, which: Bools) -> Ints:
         """Global nodes that some of the equations follow, each once."""
         eq = self.equations
@@ -272,9 +279,9 @@ class Restriction:
 
     # -- P as a map ----------------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def c(self) -> PETSc.Vec:
-        """Increment that closes the gaps and carries the prescribed displacements."""
+        """Increment that closes the gaps and carries the prescribed displacements; not to be changed (first time: collective)."""
         return self._series(self.d)
 
     def expand(self, dq: PETSc.Vec) -> PETSc.Vec:

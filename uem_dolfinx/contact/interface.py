@@ -175,12 +175,14 @@ class Interface:
         told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
         return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
 
-    def largest_gap(self) -> float:
-        """Largest gap of an active contactor, or distance from the anchor that it sticks to, over all ranks, a length (collective)."""
+    def largest_gap_here(self) -> float:
+        """Largest gap of an active contactor of this rank, or distance from the anchor that it sticks to, a length."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
-        if self.friction is not None:
-            here = max(here, self.friction.largest_distance(self.trial, self.redundant))
-        return float(reduced(self.config.comm, here, op=MPI.MAX))
+        return here if self.friction is None else max(here, self.friction.largest_distance(self.trial, self.redundant))
+
+    def largest_gap(self) -> float:
+        """``largest_gap_here`` over all ranks, a length (collective)."""
+        return float(reduced(self.config.comm, self.largest_gap_here(), op=MPI.MAX))
 
     # -- activation and release ------------------------------------------------------------------------------------------
 
@@ -223,12 +225,12 @@ class Interface:
         return self.kinematics.at_end(state) & (not self.mutual)
 
     def follow(self) -> bool:
-        """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes."""
+        """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
         off = self.off
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
         self._set_active(state)
-        return bool(reduced(self.config.comm, gone or moved, op=MPI.LOR))
+        return gone or moved
 
     def predicted(self, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment; see ``Kinematics.predicted`` (collective)."""

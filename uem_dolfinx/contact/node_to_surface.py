@@ -21,6 +21,7 @@ from uem_dolfinx.contact.on_target import OnTarget
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.parallel import reduced
@@ -144,6 +145,11 @@ class NodalKinematics:
         of = self.of
         return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, of.at_feet)
 
+    @cached_property
+    def halo(self) -> Halo:
+        """The nodes of the facets at the feet, the first in place of those that there are not (first time: collective)."""
+        return Halo(self.of.config, np.maximum(self.projection.nodes, 0).ravel())
+
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Places of contactors, global nodes that they follow and weights, ``(k,)`` each."""
         p = self.projection
@@ -202,10 +208,9 @@ class NodalKinematics:
 
     def predicted(self, du: Array) -> Array:
         """Nodal gaps after an increment (collective)."""
-        p, config = self.projection, self.of.config
-        move = du[self.of.nodes]
+        p, move = self.projection, du[self.of.nodes]
         if p.nodes.shape[1]:
-            followed = config.ask_owners(np.maximum(p.nodes, 0).ravel(), du).reshape(*p.nodes.shape, config.gdim)
+            followed = self.halo.take(du.__getitem__).reshape(*p.nodes.shape, du.shape[1])
             move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
         return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
 

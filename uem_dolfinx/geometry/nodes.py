@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Ints, sums_of_rows
-from uem_dolfinx.parallel import Exchange
+from uem_dolfinx.parallel import Exchange, gathered
 
 
 class Nodes:
@@ -96,7 +96,7 @@ class Nodes:
     @cached_property
     def _first_nodes(self) -> Ints:
         """First global node of every rank, and one past the last."""
-        return np.array([*self.comm.allgather(self.index_map.local_range[0]), self.index_map.size_global], dtype=np.int64)
+        return np.append(gathered(self.comm, self.first), self.index_map.size_global)
 
     def owner_of(self, nodes: npt.NDArray[np.integer]) -> Ints:
         """Ranks that own global nodes."""
@@ -133,12 +133,12 @@ class Halo:
         self._space, self._size = space, len(nodes)
         self._exchange = Exchange.to(space.comm, space.owner_of(nodes))
         (asked,) = self._exchange.send(nodes)
-        #: Local numbers of the owned nodes that ranks look at.
-        self._asked: Ints = asked - space.first
+        #: Local numbers of the owned nodes that ranks look at, each as often as it is.
+        self.asked: Ints = asked - space.first
 
     def take(self, values: Callable[[Ints], Array]) -> Array:
         """What owners have there ``(m, ...)``: ``values`` of their local nodes ``(k,)``, in rows of any shape (collective)."""
-        (told,) = self._exchange.back(values(self._asked))
+        (told,) = self._exchange.back(values(self.asked))
         out = np.empty((self._size, *told.shape[1:]), told.dtype)
         out[self._exchange.rows] = told
         return out
@@ -146,4 +146,4 @@ class Halo:
     def add(self, values: Array) -> Array:
         """Sums of ``values (m, k)`` that ranks have there, at their owners ``(n_owned, k)`` (collective)."""
         (arrived,) = self._exchange.send(values)
-        return sums_of_rows(self._asked, arrived, self._space.n_owned)
+        return sums_of_rows(self.asked, arrived, self._space.n_owned)

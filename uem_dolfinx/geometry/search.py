@@ -18,7 +18,7 @@ from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import Exchange, reduced
+from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: An averaged normal that leans further from the facet's no longer tells where the facet is.
 #: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
@@ -78,7 +78,7 @@ class MeshTarget:
         # half of what the thinnest body of one cell, or its shortest facet, measures
         shortest = min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))
         self.stride = 0.5 * reduced(self.comm, float(shortest), op=MPI.MIN)
-        self.first: Ints = np.cumsum([0, *self.comm.allgather(len(facets.dofs))])
+        self.first: Ints = np.append(0, np.cumsum(gathered(self.comm, len(facets.dofs))))
 
     def project(self, points: Array) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""

@@ -119,10 +119,9 @@ class Bodies:
         return self._diagonal()
 
     def _diagonal(self) -> Array:
-        diagonal = self.tangent.K.getDiagonal()
-        values = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
-        diagonal.destroy()
-        return values
+        diagonal = self.config.vector()
+        self.tangent.K.getDiagonal(diagonal)
+        return np.array(diagonal.array_r).reshape(-1, self.config.gdim)
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> float:
         """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).

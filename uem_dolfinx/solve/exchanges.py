@@ -27,7 +27,7 @@ from uem_dolfinx.contact.friction import FrictionViolations
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.state import PairState, Pivot
 from uem_dolfinx.errors import ConvergenceError, FrictionError
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.first_touch import deepest_of
 from uem_dolfinx.solve.floating import FAR
 
@@ -124,8 +124,8 @@ class Exchanges:
         """See ``Pivoting``."""
         self._pivoting.start_again()
 
-    def choose(self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Violations]:
-        """Which of the wrong contactors are exchanged now; none if no contactor is to.
+    def choose(self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Violations] | None:
+        """Which of the wrong contactors are exchanged now; None if the linearised problem is solved.
 
         Args:
             violated: of every pair.
@@ -139,16 +139,20 @@ class Exchanges:
         comm = self._pairs[0].config.comm
         if self.frozen:
             violated = [w.of_contact() for w in violated]
-        self.again, number = False, count(self._pairs, violated)
+        own = (sum(w.count for w in violated), sum(int(w.enter.sum()) for w in violated), active_here(self._pairs))
+        told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
+        (number, entering, active), state = told[:, :3].sum(axis=0), tuple(told[:, 3])
+        self.again = False
         if not number:
-            if self.held:
-                self._let_limits_follow(violated)
+            if not self.held:
+                return None
+            self._let_limits_follow(violated)
             return violated
         free = self._frictional and not self.held
         far = free and way > FAR * self._pairs[0].config.size and self._known is not None
         if free and not far:
             self._known = self._here(violated)
-        chosen, rule = violated, self._rule if far else self._pivoting.choose(number, self._state())
+        chosen, rule = violated, self._rule if far else self._pivoting.choose(int(number), state)
         if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
             if curved:
                 # without curvature the problem with held limits is a convex one
@@ -168,7 +172,7 @@ class Exchanges:
                 raise self._circle(self._lately)
             self._pivoting, self.frozen = Pivoting(), True
             return self.choose(violated, gaps, curved)
-        elif reduced(comm, sum(int(w.enter.sum()) for w in violated)) > sum(pair.n_active for pair in self._pairs):
+        elif entering > active:
             chosen = deepest_of(self._pairs, gaps, violated)
         if rule != self._rule:
             self._rule, self._lately = rule, self._none()
@@ -270,8 +274,11 @@ class Exchanges:
 
     def _state(self) -> tuple[int, ...]:
         """What tells the present states of all contactors from others."""
-        here = zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
-        return tuple(self._pairs[0].config.comm.allgather(here))
+        return tuple(gathered(self._pairs[0].config.comm, self._pattern()))
+
+    def _pattern(self) -> int:
+        """What tells the present states of this rank's contactors from others."""
+        return zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
 
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
         """The error that names contactors ``(n,)`` of every pair."""
@@ -293,3 +300,8 @@ class Exchanges:
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
     """Number of wrong contactors over all pairs and ranks (collective)."""
     return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0
+
+
+def active_here(pairs: Sequence[Interface]) -> int:
+    """Number of active contactors of this rank."""
+    return sum(int(pair.trial.active.sum()) for pair in pairs)

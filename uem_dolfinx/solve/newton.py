@@ -179,7 +179,7 @@ class ContactMethod(Protocol):
     def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
         """The state in which contactors that ``step`` shows on the wrong side have changed sides; None if none is to change.
 
-        A ConvergenceError bounds the number of states.
+        Bodies and residual are those that the iteration began with. A ConvergenceError bounds the number of states.
         """
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:

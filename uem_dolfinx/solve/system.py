@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from mpi4py import MPI
@@ -23,9 +24,9 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import Bodies
-from uem_dolfinx.solve.exchanges import Exchanges, count
+from uem_dolfinx.solve.exchanges import Exchanges, active_here, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
@@ -168,7 +169,7 @@ class BodySystem:
             if at_rest:
                 self._take(self._read_forces(rows, y))
             self._swept = not at_rest
-            moved = any([pair.follow() for pair in pairs])
+            moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
             if moved:
                 for pair in pairs:
                     pair.place_again()
@@ -189,24 +190,7 @@ class BodySystem:
             if moved or fallen:
                 rows = self._rows()
                 residual = rows.test.transpose(self._residual())
-        return self._state(rows, residual, rounding, moved or fallen, at_rest and violated == 0)
-
-    def _rows(self) -> Rows:
-        """Equations of all pairs in their present states, and Q (collective)."""
-        hold = partial(self.floating.hold, self.bodies.free[: self.config.n_owned])
-        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed)
-
-    def _state(self, rows: Rows, residual: PETSc.Vec, rounding: float, changed: bool, right: bool) -> BodyState:
-        """What the loop sees of these rows, with P (collective)."""
-        # where equations get in each other's way, those of P might eliminate other components than those of Q
-        contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
-        apart = None if contested else rows.trial
-        self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
-        trial = rows.frictionless
-        if apart is not None:
-            trial, _ = self.over_constraints.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
-        added, held = slip_terms(self.pairs, self.config.vector())
-        gap = max((pair.largest_gap() for pair in self.pairs), default=0.0)
+        trial, added, held, active, gap = self._trial_of(rows)
         return BodyState(
             trial=trial,
             test=rows.test,
@@ -215,15 +199,33 @@ class BodySystem:
             scale=self.bodies.residual.norm(),
             rounding=rounding,
             gap=gap,
-            active=sum(pair.n_active for pair in self.pairs),
-            changed=changed,
-            right=right,
+            active=active,
+            changed=moved or fallen,
+            right=at_rest and violated == 0,
             closed=gap <= CLOSED * self.config.size and self.bodies.dirichlet_met(),
-            in_contact=bool(self.pairs),
+            in_contact=bool(pairs),
             rows=rows,
             added=added,
             held=held,
         )
+
+    def _rows(self) -> Rows:
+        """Equations of all pairs in their present states, and Q (collective)."""
+        hold = partial(self.floating.hold, self.bodies.free[: self.config.n_owned])
+        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed)
+
+    def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
+        """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
+        # where equations get in each other's way, those of P might eliminate other components than those of Q
+        contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
+        apart = None if contested else rows.trial
+        self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
+        trial = rows.frictionless
+        if apart is not None:
+            trial, _ = self.over_constraints.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
+        largest = max((pair.largest_gap_here() for pair in self.pairs), default=0.0)
+        told = gathered(self.comm, np.array([active_here(self.pairs), largest])) if self.pairs else np.zeros((1, 2))
+        return trial, *slip_terms(self.pairs, self.config.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
@@ -246,14 +248,16 @@ class BodySystem:
                 along = self._along(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
-            chosen = violated if self._adrift else self.exchanges.choose(violated, predicted, self._curvature is not None, way)
-            in_equilibrium = not (self.exchanges.again or count(self.pairs, chosen))
-            if in_equilibrium and sliding is not None and not self.exchanges.frozen:
+            if self._adrift:
+                chosen = violated if count(self.pairs, violated) else None
+            else:
+                chosen = self.exchanges.choose(violated, predicted, self._curvature is not None, way)
+            if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise FrictionError(
                     "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
                     "Dirichlet condition, give it inertia, or take less load"
                 )
-            if in_equilibrium or self._adrift:
+            if chosen is None or self._adrift:
                 self._not_unique = state if self.solver.negative else None
                 self._take(forces)
                 return None
@@ -264,8 +268,12 @@ class BodySystem:
             rows = self._rows()
             # a body that is let go has to fall first
             self._adrift = self.floating.adrift
-            residual = rows.test.transpose(self._residual())
-        return self._state(rows, residual, state.rounding, state.changed, False)
+            return self._with_rows(state, rows)
+
+    def _with_rows(self, state: BodyState, rows: Rows) -> BodyState:
+        """The same bodies and residual with other rows (collective)."""
+        trial, added, held, active, _ = self._trial_of(rows)
+        return replace(state, trial=trial, test=rows.test, rows=rows, added=added, held=held, active=active, right=False)
 
     def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
         """What contact, friction and present forces add to ``F = K du`` (collective)."""
@@ -369,7 +377,7 @@ class BodySystem:
         # what the united matrix was made of; a modified Newton loop lets small changes of P pass
         exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
         parts = self.bodies.tangent.number, exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
-        made_of = self.comm.allgather(parts)
+        made_of = gathered(self.comm, np.array(parts, dtype=np.int64)).tolist()
         moving = (curvature is not None or Q is not P) and self.newton == "full"
         same = made_of == self._factored and not moving
         if not same or self.solver.begins:
