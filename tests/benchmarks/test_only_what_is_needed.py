@@ -130,8 +130,9 @@ def test_linear_bodies_in_small_sliding(comm, sliding):
     assert len(steps) == 4 and sum(step.newton_iterations for step in steps) >= 4
     assert calls[TANGENT] == 1
     assert calls[P] == calls[PRODUCT] + calls[CONDENSED] == calls[FACTORISATION] == 1
+    # the first step's feet are known, and none are found for a step that may never come;
     # ranks search twice, the second time for what others may have nearer
-    searches = 4 * min(comm.size, 2)
+    searches = 3 * min(comm.size, 2)
     assert calls[SEARCH] == (searches if sliding == "small" else 0) < calls[PROJECTION]
 
 

@@ -409,7 +409,6 @@ class UnitedSolver:
             self.ksp.setOperators(matrix)
             dq, more = self.solve(rhs)
             return dq, iterations + more
-        # iterative solvers tell by their reason
         if reason < 0 or not (self.iterative or np.isfinite(dq.norm())):
             raise LinearSolveError(
                 f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "

@@ -84,7 +84,7 @@ class Mortar(Contactors):
                 self._united = nearest, known, self._unite(placed, points, self.remembered.shares(state.cover))
             rows = self._united[2]
         elif self._kept is None:
-            nearest = self.anchor = self.target.project(points)
+            nearest = self.take_feet(points)
             rows = self._kept = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
             self._kept_at = self.target.motion
         else:
@@ -278,8 +278,7 @@ class Mortar(Contactors):
         super().begin_step()
         self._united = None
 
-    def commit(self) -> None:
-        """Small sliding finds its segments anew in every step."""
-        super().commit()
-        if self.sliding == "small":
-            self._kept = None
+    def let_go(self) -> None:
+        """Keep no feet and no segments."""
+        super().let_go()
+        self._kept = None

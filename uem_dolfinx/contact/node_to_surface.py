@@ -72,7 +72,7 @@ class NodeToSurface(OnTarget):
                 projection, corners = self.valleys.place(nearest, points, state)
         else:
             if self.anchor is None:
-                nearest = projection = self.anchor = self.target.project(points)
+                nearest = projection = self.take_feet(points)
             else:
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.prescribed else None

@@ -38,6 +38,8 @@ class OnTarget:
         self.free, self.free_of_owned, self.frictional = free[nodes], free, False
         self.prescribed = bool(reduced(config.comm, int(not self.free.all())))
         self.anchor: Projection | None = None
+        #: Whether the next step finds feet of small sliding anew.
+        self._renewing = False
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
 
@@ -61,10 +63,24 @@ class OnTarget:
             self._projected = last = points, x, anchor, found
         return last[3]
 
+    def take_feet(self, points: Array) -> Projection:
+        """The contactors on the nearest places of the target, whose feet are kept from now on (collective)."""
+        self.anchor = found = self.target.project(points)
+        self._projected = points, self.config.x[self.target.dofs], found, found
+        return found
+
     def begin_step(self) -> None:
-        """Nothing is kept within a step."""
+        """Small sliding finds its feet anew in every step that follows one that was kept."""
+        if self._renewing:
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Keep no feet: the next placement finds them."""
+        self.anchor, self._renewing = None, False
 
     def commit(self) -> None:
-        """Small sliding finds its feet anew in every step."""
+        """The next step is to find the feet anew; a rigid target that it moves is asked for them before."""
         if self.sliding == "small":
-            self.anchor = None
+            self._renewing = True
+            if not self.target.n_nodes:
+                self.let_go()

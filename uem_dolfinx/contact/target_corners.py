@@ -113,6 +113,8 @@ class TargetCorners:
         inside = (part > ON_FACET) & (p.from_end > 0.0) & (p.beyond == 0.0).all(axis=1)
         # deeper than the cell behind the facet it may as well be behind the body
         inside &= depth < self.surface.of_facets(p.facet, self.surface.facets.depth)
+        if not reduced(comm, int(inside.sum())):
+            return None
         stiffness = np.abs(stiffness)
         of_facet = config.ask_owners(p.nodes.ravel(), stiffness).reshape(*p.nodes.shape, config.gdim)
         theirs, own = (

@@ -124,7 +124,9 @@ class Exchanges:
         """See ``Pivoting``."""
         self._pivoting.start_again()
 
-    def choose(self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0) -> list[Violations] | None:
+    def choose(
+        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0
+    ) -> list[Violations] | None:
         """Which of the wrong contactors are exchanged now; None if the linearised problem is solved.
 
         Args:

@@ -9,6 +9,7 @@ and ``M v = f + R' lam`` with the contact forces ``lam >= 0``. Where contact for
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from mpi4py import MPI
@@ -102,36 +103,40 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     Least distance programming by bounded least squares (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
     Rows that contradict each other are asked for no more than the origin fulfils.
     """
-    from scipy.optimize import lsq_linear, nnls
-
     size = np.linalg.norm(G, axis=1)
     scale = float(np.linalg.norm(p)) + float(np.abs(h / size).max(initial=0.0))
     if scale == 0:
         return p, np.zeros(len(h))
-    unit, most = np.append(np.zeros(len(p)), 1.0), 30 * len(h)
+    unit = G / size[:, None]
     # the first is quick, but not in every SciPy accurate to rounding; the second keeps its bounds to rounding
     for quick, bound in ((True, h), (False, h), (False, np.minimum(h, 0.0))):
-        d = (bound - G @ p) / size / scale
-        E = np.vstack([(G / size[:, None]).T, d])
-        try:
-            lam = nnls(E, unit, maxiter=most)[0] if quick else lsq_linear(E, unit, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x
-        except RuntimeError:
-            # too many iterations
-            continue
-        lam = np.maximum(lam, 0.0)
+        d = (bound / size - unit @ p) / scale
+        lam = _nonnegative(np.vstack([unit.T, d]), quick)
         left = 1.0 - float(d @ lam)
         if left <= KEPT:
             continue
-        lam *= scale / left / size
+        lam *= scale / left
         # to rounding, with the rows that bear; one more than there are unknowns, by rounding, would make them contradict each other
-        i = np.flatnonzero(lam * size > KEPT * (lam * size).max(initial=0.0))
+        i = np.flatnonzero(lam > KEPT * lam.max(initial=0.0))
         exact = np.zeros(len(lam))
-        exact[i] = np.linalg.lstsq(G[i] @ G[i].T, bound[i] - G[i] @ p, rcond=None)[0]
-        x = p + G.T @ exact
-        slack = (G @ x - bound) / size
+        exact[i] = scale * np.linalg.lstsq(unit[i] @ unit[i].T, d[i], rcond=None)[0]
+        x = p + unit.T @ exact
+        slack = unit @ x - bound / size
         tight = not quick or (slack[i] <= KEPT * scale).all()
         if tight and (exact >= 0).all() and (slack >= -KEPT * scale).all():
-            return x, exact
+            return x, exact / size
         if not quick:
             break
-    return p + G.T @ lam, lam
+    return p + unit.T @ lam, lam / size
+
+
+def _nonnegative(E: Array, quick: bool) -> Array:
+    """``lam >= 0 (m,)`` that minimises ``|E lam - e|``, ``E (k + 1, m)``, where e is the last unit vector."""
+    from scipy.optimize import lsq_linear, nnls
+
+    e, most = np.append(np.zeros(len(E) - 1), 1.0), 30 * E.shape[1]
+    if quick:
+        # it gives up after too many iterations
+        with suppress(RuntimeError):
+            return np.asarray(nnls(E, e, maxiter=most)[0])
+    return np.maximum(lsq_linear(E, e, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x, 0.0)

@@ -117,6 +117,8 @@ class BodySystem:
         self.exchanges.begin_step()
         for pair in self.pairs:
             pair.discretisation.begin_step()
+            if pair.sliding == "small":
+                pair.project()
         self.floating.begin_step(place)
         if self.bodies.dynamics is None and self.floating.motions is None:
             touch_ahead(self.bodies, self.pairs, self.floating.rigid, place)
