@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -12,16 +12,23 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import FADED, MOST_ROUND
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.parallel import Exchange, reduced
 
 #: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
 #: [bound; bits; -]
 MOST_BITS = 52
+#: A contactor of which less than this part of the largest rest is left is led along by circles rather than in one.
+#: [convention; what circles leave; test_mortar_rows.py::test_circles_are_broken_where_they_are]
+LED_ALONG = 0.5
+#: Ranks tell each other what is left of circles after so many rounds, which decides nothing.
+#: [bound; rounds; -]
+ROUNDS_TOGETHER = 8
 
 
 #: Rows that terms belong to, the nodes they follow and the coefficients.
@@ -125,37 +132,12 @@ class Elimination:
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
         beside = row, term, value = self.at_owners(terms, scale)
         own = np.einsum("ng,ng->n", self.of_themselves(plain, beside), plain.direction)
-        lone = own <= 0.0
-        while True:
-            kept = ~lone[beside[0]]
-            row, term, value = beside = row[kept], term[kept], value[kept]
-            left = self._left_of_circles(plain, beside)
-            # the plain rows' own circles are not theirs to break
-            left[np.bincount(row, minlength=len(left)) == 0] = 0.0
-            most = reduced(self.config.comm, float(left.max(initial=0.0)), op=MPI.MAX)
-            if most <= FADED:
-                return beside, np.einsum("mjjg->mjg", on_facet)
-            lone = left > 0.5 * most
-
-    def _left_of_circles(self, plain: UnitingEquations, beside: Terms) -> Array:
-        """How much is left of a unit displacement after as many rounds as circles may take, if all were active ``(n,)`` (collective)."""
-        made, _ = self.derivatives(plain, beside)
-        follows = np.zeros(len(made.row))
-        for direction in (made.direction, plain.direction):
-            left, at_nodes = direction * self.free, np.zeros((self.config.n_owned, self.config.gdim))
-            size = np.einsum("ng,ng->n", left, left)
-            at_nodes[self.nodes] = left / np.where(size > 0, size, np.inf)[:, None]
-            part = np.einsum("kg,kg->k", made.coefficients, self.config.ask_owners(made.followed, at_nodes))
-            follows = np.maximum(follows, np.abs(part))
-        on = follows > 0
-        row, term, follows = made.row[on], made.followed[on], follows[on]
-        at = np.zeros((self.config.n_owned, 1))
-        at[self.nodes] = 1.0
-        for _ in range(MOST_ROUND):
-            at[self.nodes, 0] = np.bincount(row, follows * self.config.ask_owners(term, at)[:, 0], minlength=len(self.nodes))
-            if reduced(self.config.comm, float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
-                break
-        return at[self.nodes, 0]
+        kept = own[row] > 0.0
+        beside = row, term, value = row[kept], term[kept], value[kept]
+        circles = Circles(self.config, self.nodes, self.free, plain, self.derivatives(plain, beside)[0])
+        turned = np.bincount(row, minlength=len(own)) > 0
+        kept = without_circles(circles.left, turned, self.config.comm)[row]
+        return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
 
     def of_themselves(self, plain: UnitingEquations, beside: Terms) -> Array:
         """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
@@ -176,6 +158,74 @@ class Elimination:
         made = with_terms(plain, (row[other], term[other], value[other]))
         gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]
         return replace(made, direction=direction / by[:, None], gap=gap, coefficients=coefficients), by
+
+
+class Circles:
+    """How contactors follow each other, some by their turned rows, the others by their plain ones, if all were active (collective).
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        free: components without Dirichlet condition ``(n, gdim)``.
+        plain: a row of each contactor.
+        turned: the same rows with other directions and terms.
+    """
+
+    def __init__(self, config: Configuration, nodes: Indices, free: Bools, plain: UnitingEquations, turned: UnitingEquations):
+        self._comm, self._n, g = config.comm, len(nodes), config.gdim
+        at_nodes = np.zeros((config.n_owned, 2 * g))
+        for k, rows in enumerate((plain, turned)):
+            left = rows.direction * free
+            size = np.einsum("ng,ng->n", left, left)
+            at_nodes[nodes, k * g : (k + 1) * g] = left / np.where(size > 0, size, np.inf)[:, None]
+        row, followed, coefficients = (
+            np.concatenate([getattr(plain, what), getattr(turned, what)]) for what in ("row", "followed", "coefficients")
+        )
+        there = config.ask_owners(followed, at_nodes).reshape(-1, 2, g)
+        parts = np.abs(np.einsum("kg,ksg->ks", coefficients, there))
+        on = parts.any(axis=1)
+        #: Terms of plain and of turned rows, which rows they are of, and by how much they follow a plain row and a turned one.
+        self._row, self._parts, self._turned = row[on], parts[on], np.arange(len(row))[on] >= len(plain.row)
+        followed, self._place = np.unique(followed[on], return_inverse=True)
+        self._halo = Halo(config, followed)
+        self._contactor = np.zeros(config.n_owned, dtype=np.int64)
+        self._contactor[nodes] = np.arange(self._n)
+
+    def _there(self, values: AnyArray) -> AnyArray:
+        """Contactors' values ``(n,)`` where terms follow them ``(k,)`` (collective)."""
+        return np.asarray(self._halo.take(lambda nodes: values[self._contactor[nodes]])[self._place])
+
+    def left(self, turned: Bools) -> Array:
+        """What is left of a unit displacement after as many rounds as circles may take, or rounding at most ``(n,)`` (collective).
+
+        ``turned (n,)`` are the contactors with turned rows.
+        """
+        follows = np.where(self._there(turned), self._parts.max(axis=1), self._parts[:, 0])
+        follows = np.where(turned[self._row] == self._turned, follows, 0.0)
+        at: Array = np.ones(self._n)
+        for number in range(1, MOST_ROUND + 1):
+            at = np.asarray(np.bincount(self._row, follows * self._there(at), minlength=self._n), float)
+            looks = number % ROUNDS_TOGETHER == 0
+            if looks and reduced(self._comm, float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
+                break
+        return at
+
+
+def without_circles(left: Callable[[Bools], Array], turned: Bools, comm: MPI.Comm) -> Bools:
+    """The contactors of ``turned (n,)`` that may keep their turned rows: what circles leave fades (collective).
+
+    Args:
+        left: what is left where contactors have turned rows ``(n,)``, as ``Circles`` finds it.
+        turned: contactors that would have them.
+        comm: of the ranks that have the contactors.
+    """
+    while True:
+        # the plain rows' own circles are not theirs to break
+        still = np.where(turned, left(turned), 0.0)
+        most = reduced(comm, float(still.max(initial=0.0)), op=MPI.MAX)
+        if most <= FADED:
+            return turned
+        turned = turned & (still <= LED_ALONG * most)
 
 
 class Remembered:
