@@ -11,7 +11,7 @@ python3 demos/bar_impact.py --plot bar_impact.png
 # it came, without any vibration: contact from 0.5 to 1.166667.
 #
 # Dropped from a height of 5 under a gravity of 10 it touches at 1, 11/3, 19/3 and leaves at 5/3, 13/3, 7. As it goes on falling
-# during contact, the pressure rises from 300 to 500 in the first contact. The bar leaves trembling, so that it falls from 500 to
+# during contact, the pressure rises from 300 to 500 in the first contact. The bar leaves vibrating, so that it falls from 500 to
 # 300 in the second; then all begins anew.
 #
 # Contactors with mass collide with the wall: the trapezoidal rule throws them to and fro and feeds energy into the bar at every

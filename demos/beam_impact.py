@@ -11,7 +11,7 @@ python3 demos/beam_impact.py --plot beam_impact.png
 # a yield stress of 800 and no hardening. There is no gravity.
 #
 # The contactors are massless, so that impact itself takes no energy: the elastic column leaves almost as fast as it came, what it
-# lacks is its own trembling. What the plastic one loses stays in it as plastic work.
+# lacks is its own vibration. What the plastic one loses stays in it as plastic work.
 
 # %%
 import common

@@ -6,7 +6,7 @@ python3 demos/bouncing_ring.py --plot bouncing_ring.png
 # %% [markdown]
 # # Bouncing ring
 #
-# A ring of St Venant-Kirchhoff material flies along a rigid floor, falls, is flattened by the impact, leaves again, and trembles.
+# A ring of St Venant-Kirchhoff material flies along a rigid floor, falls, is flattened by the impact, leaves again, and vibrates.
 # Nothing in the scene takes energy away, and nothing pushes along the floor: at every time the sum of kinetic energy, strain
 # energy and height must be what it was, and the momentum along the floor too.
 #

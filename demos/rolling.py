@@ -95,7 +95,7 @@ def run(alpha: float):
 
 # %% [markdown]
 # ## The figures
-# After the tilt friction grows with the shear of the disc first, and the disc trembles. Accelerations are those of the parabola and the
+# After the tilt friction grows with the shear of the disc first, and the disc vibrates. Accelerations are those of the parabola and the
 # line that come nearest to what was measured in the later three quarters.
 
 # %%
@@ -135,6 +135,6 @@ if args.plot:
             right.legend(frameon=False)
 
 # %%
-# a polygon rolls over its corners: it trembles less the more of them there are, and the mean is the better the longer it rolls
+# a polygon rolls over its corners: it vibrates less the more of them there are, and the mean is the better the longer it rolls
 bound = 0.02 * (64 / args.n) * (3.0 / args.end)
 assert results["rolling_error"] < bound and results["sliding_error"] < bound, results

@@ -34,7 +34,7 @@ near = 1e-6  # pushes so near to the threshold are to hold below it, and to be r
 
 # %% [markdown]
 # ## The scene
-# Gravity turns with the incline. The bodies are linear, so the deformable base keeps the normals with which it was drawn.
+# Gravity turns with the incline. The bodies are linear, so the deformable base keeps its reference normals.
 
 
 # %%
@@ -105,7 +105,7 @@ def push(mu: float, rigid: bool, incline: bool):
 
 # %% [markdown]
 # ## Thrown
-# The block starts in the shape that it has while it slides, which is the one at the threshold, and is damped, or it would tremble more
+# The block starts in the shape that it has while it slides, which is the one at the threshold, and is damped, or it would oscillate more
 # and more. It is 50 times as stiff as before, for it leans forward while it slides, which is the error of the way that it stops after.
 
 

@@ -44,7 +44,7 @@ ERRORS = ("error_energy", "error_l2", "error_pressure", "error_force", "overlap"
 LEVELS = (2e-2, 1e-2, 1e-3, 1e-4)
 #: A parameter that takes so many times as long as the best is not tried again.
 SLOW = 5.0
-#: What decides which method is first; the energy of a bar after impact is mostly in the trembling that its mesh leaves, and friction has
+#: What decides which method is first; the energy of a bar after impact is mostly in the oscillations that its mesh leaves, and friction has
 #: none.
 DECISIVE = {"bar_impact": "error_l2", "cattaneo": "error_pressure"}
 

@@ -76,7 +76,7 @@ def test_partly_covered_facets(contactor, degree, width):
 
 @pytest.mark.parametrize(("cell", "degree"), [*product(CELLS, (1,)), ("triangle", 2), ("tetrahedron", 2)])
 def test_forces_balance_across_open_gaps(cell, degree):
-    """Whatever the multipliers, rows hand on forces without resultant and without moment, wherever the bodies are."""
+    """Whatever the multipliers, nodal forces have no resultant and no moment, wherever the bodies are."""
     b = Blocks(cell, (3, 2), degree, gap=0.03)
     problem = b.pressed()
     disturbed(b, 1, 0.01)

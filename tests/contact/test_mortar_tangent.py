@@ -104,7 +104,7 @@ def test_rows_are_derivatives_of_the_gaps(cell, target):
 @pytest.mark.parametrize("target", ["mesh", "ball", "end"])
 @pytest.mark.parametrize("cell", CELLS)
 def test_curvature_against_differences(cell, target):
-    """Blocks of the curvature against central differences of what the rows hand on at constant multipliers."""
+    """Blocks of the curvature against central differences of the nodal forces at constant multipliers."""
     phi = weighted_gap(cell, target)
     rows = phi.leave_out(target)
     parts = curvature(rows.points, phi.pressure)

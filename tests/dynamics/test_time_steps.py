@@ -338,7 +338,7 @@ def test_statics_has_no_mass():
     )  # fmt: skip
     with pytest.raises(uem.SpaceError, match="time steps need inertia"):
         next(uem.time_steps(static, 0.1, 1.0))
-    with pytest.raises(uem.SpaceError, match="energy book needs inertia"):
+    with pytest.raises(uem.SpaceError, match="EnergyBook needs inertia"):
         uem.EnergyBook(static)
 
 

@@ -159,7 +159,7 @@ def test_release_when_pulled_apart():
 
 
 def test_big_step_is_cut():
-    """A step that fails in the iterations it is given is halved, and grown again; the end is the same."""
+    """A step that fails in the iterations it is given is halved, and increased again; the end is the same."""
     b, contact, problem = pressed(d=0.3, rtol=1e-10, max_iterations=4)
     steps = run(problem)
     assert sum(s.cuts for s in steps) > 0 and steps[-1].factor == 1.0

@@ -109,7 +109,7 @@ class UnitedMatrix:
         own = np.unique(trial.row)
         eliminated = np.zeros(last - first, dtype=bool)
         eliminated[own - first] = True
-        # K and G have blocks on both sides: who has a column in an eliminated node's row has the node in a row of his own
+        # K and G have blocks on both sides: a node with a column in an eliminated node's row has that node in a row of its own
         rows = together(self._inside(own - first), self._outside(np.isin(self._beyond.row, own)))
         coupled = rows if G is None else together(rows, G.some(eliminated[G.row - first]))
         trial = self._handed_on(trial, coupled)

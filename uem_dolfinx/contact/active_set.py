@@ -1,4 +1,4 @@
-"""Which contactors are active: who is released, who is activated. Pure functions of arrays, without mesh and without communication.
+"""Which contactors are active: which are released, which activated. Pure functions of arrays, without mesh and without communication.
 
 The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are settled on the linearised problem, before anything
 moves: its solution predicts gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again

@@ -63,7 +63,7 @@ class Family:
         Args:
             projection: of the contactors.
             usable: whose gap counts: those over the target that no corner holds ``(n,)``.
-            active: who is active ``(n,)``.
+            active: active contactors ``(n,)``.
         """
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
         rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
@@ -125,7 +125,7 @@ class ControlGaps:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
         dropped, of_facet = self.shared & self.closed, self.family.of_facet
-        # the middle of a facet hands on to edges, then both to vertices
+        # from the middle of a facet to edges, then from both to vertices
         control = control + active * self._handed_on(control, dropped & of_facet)
         control = control + active * self._handed_on(control, dropped & ~of_facet)
         nodal = control - self._handed_on(control, self.shared)
@@ -146,7 +146,7 @@ class ControlGaps:
         Args:
             equations: of some contactors.
             united: their places ``(m,)``.
-            active: who is united ``(n,)``.
+            active: active contactors ``(n,)``.
         """
         f = self.family
         place = np.full(len(f.nodes), -1, dtype=np.int64)

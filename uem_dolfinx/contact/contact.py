@@ -65,7 +65,7 @@ class Contact:
             configuration and returns ``(n,)``; or a law of friction, such as ``Tresca``. With 0 the contact is the one without friction.
             It may be set anew between steps, of a contact that was made with friction, by the same law; all else is settled once a
             problem has been made.
-        measure: what pressures and tractions are forces per area of: ``"reference"``, the surface as it was drawn, the only one that
+        measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
             small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
@@ -317,7 +317,7 @@ class Contact:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
         The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
-        whether of the surface as it was drawn or as it is now.
+        whether of the reference or of the current surface.
         """
         areas = self._measured()
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)

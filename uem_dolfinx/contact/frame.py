@@ -23,7 +23,7 @@ class Frame:
         away: how far contactors are from their anchors, or have moved relative to what they follow since the last step ``(n, gdim)``.
         tangents: directions along the target ``(n, gdim - 1, gdim)``.
         free_tangents: those in which nothing prescribes the relative motion ``(n, gdim - 1, gdim)``.
-        beside: normals of other rigid surfaces that hold the contactors, zero where none does ``(n, k, gdim)``.
+        other_normals: normals of other rigid surfaces that hold the contactors, zero where none does ``(n, k, gdim)``.
         prescribed: whether any contactor has a Dirichlet condition.
         cornered: contactors that a corner holds, along whose edge alone friction acts ``(n,)``.
     """
@@ -33,12 +33,12 @@ class Frame:
     away: Array
     tangents: Array
     free_tangents: Array
-    beside: Array
+    other_normals: Array
     prescribed: bool
     cornered: Bools
 
     @classmethod
-    def of(cls, kinematics: Kinematics, away: Array, way: Ties | None, beside: Array, prescribed: bool) -> Frame:
+    def of(cls, kinematics: Kinematics, away: Array, way: Ties | None, other_normals: Array, prescribed: bool) -> Frame:
         """The frame of contactors that are this far ``away (n, gdim)``, by what others than now; other arguments as the attributes."""
         normals, ties, c = kinematics.normal[:, None], kinematics.ties, kinematics.corners
         n, g = away.shape
@@ -48,17 +48,17 @@ class Frame:
             cornered[c.which] = True
         free = np.ones((n, g), dtype=bool)
         every = told = friction.tangents(normals, free)
-        if prescribed or beside.shape[1]:
+        if prescribed or other_normals.shape[1]:
             moves = ties.moves if prescribed else free
-            told = friction.tangents(np.concatenate([normals, beside], axis=1), moves)
-        return cls(ties, way or ties, away, every, told, beside, prescribed, cornered)
+            told = friction.tangents(np.concatenate([normals, other_normals], axis=1), moves)
+        return cls(ties, way or ties, away, every, told, other_normals, prescribed, cornered)
 
     def along(self, way: Array) -> Array:
         """Parts of relative motions ``(n, gdim)`` along the target; of what is prescribed, only of the motion itself."""
         if not self.prescribed:
             return friction.along(self.tangents, way)
         told = friction.along(self.free_tangents, way) + friction.along(self.tangents, np.where(self.ties.moves, 0.0, way))
-        return np.where(np.abs(self.beside).sum(axis=(1, 2))[:, None] > 0, friction.along(self.tangents, way), told)
+        return np.where(np.abs(self.other_normals).sum(axis=(1, 2))[:, None] > 0, friction.along(self.tangents, way), told)
 
     @cached_property
     def slip(self) -> Array:
@@ -84,7 +84,7 @@ class Frame:
                 ``(n, gdim - 1)``.
         """
         along = friction.along(self.tangents, away) - friction.along(self.free_tangents, away)
-        told = np.where(self.beside.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
+        told = np.where(self.other_normals.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
         if not self.prescribed:
             return told
         lost = np.where(left_out[:, :, None], self.free_tangents, 0.0)

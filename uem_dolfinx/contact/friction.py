@@ -1,7 +1,7 @@
-"""Friction by elimination: who sticks, who slips and where to. Pure functions of arrays, without mesh and without communication.
+"""Friction by elimination: which contactors stick, which slip and where to. Pure functions of arrays, without mesh or communication.
 
 A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
-the direction s moves as without friction. Where its limit is ``b + mu lambda``, b hands on a force along -s that is known, and the rest
+the direction s moves as without friction. Where its limit is ``b + mu lambda``, b is a known force along -s, and the rest
 goes along ``n - mu s``: its test row is rotated,
 
     trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
@@ -156,7 +156,7 @@ def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> 
 
 
 def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:
-    """The state in another active set: who comes sticks, who goes forgets.
+    """The state in another active set: new contactors stick, released ones forget.
 
     Args:
         state: of the contactors.

@@ -43,17 +43,17 @@ def with_friction(
     """
     comm, g = frame.ties.config.comm, normal.shape[1]
     across = np.flatnonzero(own.kind == NORMAL)
-    who, test = own.contactor[across], own.test
+    contactor, test = own.contactor[across], own.test
     place = np.full(len(normal), -1, dtype=np.int64)
-    place[who] = np.arange(len(who))
+    place[contactor] = np.arange(len(contactor))
 
     def along(t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
         there = place[ties.row] >= 0
         row, weight = place[ties.row[there]], ties.weight[there, None]
         return UnitingEquations(test.node[across], t, gap, active, row, ties.followed[there], weight * t[row])
 
-    T, of_friction, stick = frame.free_tangents[who], of_friction[who], stick[who]
-    away = np.einsum("nrg,ng->nr", T, frame.away[who])
+    T, of_friction, stick = frame.free_tangents[contactor], of_friction[contactor], stick[contactor]
+    away = np.einsum("nrg,ng->nr", T, frame.away[contactor])
     resisted = [of_friction & T[:, r].any(axis=1) for r in range(g - 1)]
 
     def with_those_along(rows: UnitingEquations, ties: Ties) -> UnitingEquations:
@@ -61,7 +61,7 @@ def with_friction(
 
     frictionless = rotated = trial = with_those_along(test, frame.ties)
     slipping = of_friction & ~stick
-    tilt = np.where(slipping[:, None], -slope[who, None] * directions[who], 0.0)
+    tilt = np.where(slipping[:, None], -slope[contactor, None] * directions[contactor], 0.0)
     slips = reduced(comm, bool(tilt.any()), op=MPI.LOR)
     # rows of contactors that stick are symmetric where they follow by the weights of now
     if own.trial is not test or not (pointwise or (keeps_ties and not slips)):
@@ -70,17 +70,19 @@ def with_friction(
         rotated = _rotated(frictionless, across, tilt, place, frame.ties)
     stopping = trial
     if g == 3:
-        beside = along(cross_products(normal[who], directions[who]), np.zeros(len(who)), slipping, frame.ties)
-        stopping = UnitingEquations.join([trial, beside], g)
+        crosswise = along(
+            cross_products(normal[contactor], directions[contactor]), np.zeros(len(contactor)), slipping, frame.ties
+        )
+        stopping = UnitingEquations.join([trial, crosswise], g)
     return Constraints(
         trial,
         rotated,
         frictionless,
         replace(trial, active=np.concatenate([own.trial.active, *resisted])),
         stopping,
-        np.concatenate([own.contactor, *[who] * (g - 1)]),
-        np.concatenate([own.kind, *[np.full(len(who), NORMAL)] * (g - 1)]),
-        np.concatenate([own.tangent, *(np.full(len(who), r) for r in range(g - 1))]),
+        np.concatenate([own.contactor, *[contactor] * (g - 1)]),
+        np.concatenate([own.kind, *[np.full(len(contactor), NORMAL)] * (g - 1)]),
+        np.concatenate([own.tangent, *(np.full(len(contactor), r) for r in range(g - 1))]),
     )
 
 

@@ -53,7 +53,7 @@ class Interface:
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
-        barred: contactors that came back into the target from beside it with a blow; they are left out until they are in front of it
+        barred: contactors that came back into the target from past its end with a blow; they are left out until they are in front of it
             again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
     """

@@ -187,7 +187,7 @@ class Kinematics(Protocol):
         """
 
     def areas(self, areas: Array, current: bool) -> Array:
-        """What ``lam`` is an integral of the pressure over, as drawn or where it is now (collective).
+        """What ``lam`` is an integral of the pressure over, in the reference or the current configuration (collective).
 
         Args:
             areas: integrals of the shape functions over the one or the other ``(n,)``.

@@ -2,7 +2,7 @@
 
 Where a node's part of the contactor is covered by the target, its equation says that the gap vanishes in the mean, weighted with the
 node's dual function. The equations eliminate one component of the node each, like those of ``node_to_surface``; their multipliers
-are pressures, and what they hand on balances in force and moment. Nodes that are farther from the target than a facet, until they come
+are pressures, and the nodal forces balance in force and moment. Nodes that are farther from the target than a facet, until they come
 nearer, and corners whose facets do not face it, have the equation of a node against the surface.
 """
 
@@ -242,22 +242,22 @@ class Mortar(Contactors):
         row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
         value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
         gap = np.where(is_covered, gap / scale, nearest.gap)
-        beside: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
+        variation: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
         length, parts = np.ones(n), np.einsum("mii,mg->mig", coefficients, normal)
         plain_parts = parts
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
-            beside, more = self.elimination.beside(at, scale, plain)
+            variation, more = self.elimination.variation(at, scale, plain)
             parts = parts + more
-            equations, length = self.elimination.derivatives(plain, beside)
+            equations, length = self.elimination.derivatives(plain, variation)
         share = np.where(is_covered, size / scale, 1.0)
         weights = frictionless = slope = push = whole = None
         if self.frictional:
-            along = self.elimination.of_themselves(plain, beside)
+            along = self.elimination.of_themselves(plain, variation)
             slope = np.linalg.norm(along, axis=1)
             pushed = np.linalg.norm([plain_parts[f, i], parts[f, i]], axis=2).T
             pushed = config.add_at_owners(own[f, i], pushed)[self.nodes]
-            taken = np.bincount(beside[0], minlength=n) > 0
+            taken = np.bincount(variation[0], minlength=n) > 0
             push = np.where(is_covered, np.where(taken, pushed[:, 1], pushed[:, 0]) / scale, 1.0)
             frictionless = along / slope[:, None]
             whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]

@@ -64,7 +64,7 @@ class WeightedRows:
         facets: numbers of the contactor's facets near the target ``(m,)``.
         ratio: part of the contactor's share of its facets that is covered ``(n,)``.
         area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
-        stretch: areas of the facets around the contactor over those they were drawn with ``(n,)``.
+        stretch: areas of the facets around the contactor over their reference areas ``(n,)``.
         share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
         weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
         normal: directions of the gaps' derivatives with the contactors' own displacements, across which friction acts ``(n, gdim)``;
@@ -119,8 +119,8 @@ class Elimination:
         row = self._place[node - int(self.config.index_map.local_range[0])]
         return add_up_terms((row, term, value / scale[row, None]))
 
-    def beside(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
-        """What the derivatives of the gaps have beside the ``plain`` rows, over ``scale (n,)`` (collective).
+    def variation(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
+        """What the derivatives of the gaps add to the ``plain`` rows, since normals and weights vary, over ``scale (n,)`` (collective).
 
         Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
         they do, or that follow others in circles which do not fade: all others can be eliminated whoever is active.
@@ -130,30 +130,30 @@ class Elimination:
         """
         on_facet, on_target = at.gap_derivatives()
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
-        beside = row, term, value = self.at_owners(terms, scale)
-        own = np.einsum("ng,ng->n", self.of_themselves(plain, beside), plain.direction)
+        variation = row, term, value = self.at_owners(terms, scale)
+        own = np.einsum("ng,ng->n", self.of_themselves(plain, variation), plain.direction)
         kept = own[row] > 0.0
-        beside = row, term, value = row[kept], term[kept], value[kept]
-        circles = Circles(self.config, self.nodes, self.free, plain, self.derivatives(plain, beside)[0])
+        variation = row, term, value = row[kept], term[kept], value[kept]
+        circles = Circles(self.config, self.nodes, self.free, plain, self.derivatives(plain, variation)[0])
         turned = np.bincount(row, minlength=len(own)) > 0
         kept = without_circles(circles.left, turned, self.config.comm)[row]
         return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
 
-    def of_themselves(self, plain: UnitingEquations, beside: Terms) -> Array:
+    def of_themselves(self, plain: UnitingEquations, variation: Terms) -> Array:
         """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
-        row, term, value = beside
+        row, term, value = variation
         itself, direction = term == self._own[row], plain.direction.copy()
         # each row has at most one such term
         direction[row[itself]] -= value[itself]
         return direction
 
-    def derivatives(self, plain: UnitingEquations, beside: Terms) -> tuple[UnitingEquations, Array]:
+    def derivatives(self, plain: UnitingEquations, variation: Terms) -> tuple[UnitingEquations, Array]:
         """Equations whose left sides are the derivatives of the gaps, and what each was divided by ``(n,)``.
 
         They follow other contactors, and these them, by parts of second order in the angles between facets.
         """
-        row, term, value = beside
-        other, direction = term != self._own[row], self.of_themselves(plain, beside)
+        row, term, value = variation
+        other, direction = term != self._own[row], self.of_themselves(plain, variation)
         by = np.linalg.norm(direction, axis=1)
         made = with_terms(plain, (row[other], term[other], value[other]))
         gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]

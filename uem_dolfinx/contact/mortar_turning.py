@@ -186,11 +186,11 @@ def turning(
     values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + 2 * g))
     values[: len(row), 1:] = value
     values[len(row) :, 0] = np.concatenate([-weights[2], np.ones(len(which))])
-    who, terms = (
+    rows_of_terms, terms = (
         np.concatenate(part)
         for part in ((row, weights[0], which), (term, weights[1], config.to_global(elimination.nodes[which])))
     )
-    nodes, values = _table(add_up_terms((who, terms, values)), which, n)
+    nodes, values = _table(add_up_terms((rows_of_terms, terms, values)), which, n)
     k, c = nodes.shape
     gradient, longer, of_whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
     along = longer * (frictional.slips / rows.push[which])[:, None, None]

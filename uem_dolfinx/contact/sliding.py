@@ -1,6 +1,6 @@
 """What an interface with friction adds along the target: equations of contactors that stick, rotated rows and forces of those that slip.
 
-``friction`` says, as functions of arrays, who sticks and who slips, and a law how much force that takes.
+``friction`` says, as functions of arrays, which contactors stick and which slip, and a law how much force that takes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Sliding:
         discretisation: what ties them to their target.
         law: of friction.
         value: of its parameter at the contactors ``(n,)``.
-        areas: of the contactors' surface as drawn ``(n,)``, asked for by laws that need them (collective).
+        areas: of the contactors' reference surface ``(n,)``, asked for by laws that need them (collective).
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
         keeps_feet: whether feet stay where they were at the start of the step.
 
@@ -74,7 +74,7 @@ class Sliding:
         self._held: Array | None = None
         self.set(value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
-        self._beside: Array = np.zeros((n, 0, g))
+        self._other_normals: Array = np.zeros((n, 0, g))
         self._anchors: Array = np.zeros((n, g))
         self._held_by: tuple[Ints, Ints, Array] | None = None
         self._last: LastStep | None = None
@@ -108,15 +108,15 @@ class Sliding:
             assert self._last is not None
             way = self._last.ties
             away = way.relative(self._way_since(self._last))
-        self.frame = Frame.of(kinematics, away, way, self._beside, self.discretisation.prescribed)
+        self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.prescribed)
 
     def _way_since(self, last: LastStep) -> Array:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
 
     def meet(self, kinematics: Kinematics, normals: Array) -> None:
         """Take the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which they do not slip (collective)."""
-        if reduced(self.config.comm, not np.array_equal(normals, self._beside), op=MPI.LOR):
-            self._beside = normals
+        if reduced(self.config.comm, not np.array_equal(normals, self._other_normals), op=MPI.LOR):
+            self._other_normals = normals
             self.replace(kinematics)
 
     def active(self, state: PairState) -> Bools:
@@ -175,7 +175,7 @@ class Sliding:
         rest, slope = self._cone(state)
         return rest + slope * lam
 
-    # -- who sticks and who slips ----------------------------------------------------------------------------------------
+    # -- stick and slip --------------------------------------------------------------------------------------------------
 
     def come_and_go(self, state: PairState, before: Bools) -> PairState:
         """The state in which contactors that were not active ``before (n,)`` stick, and those that are no longer forget."""
@@ -214,8 +214,8 @@ class Sliding:
         by = friction.Seen(lam, self.frame.tangential(tau), self.bound(lam), self.frame.along(away), forced)
         turned = replace(_of(state), direction=self.directions(state))
         forces, lengths = rounding
-        who = self.active(state)
-        return friction.find_violations(violated, turned, who, by, stiffness, force_rounding=forces, gap_rounding=lengths)
+        active = self.active(state)
+        return friction.find_violations(violated, turned, active, by, stiffness, force_rounding=forces, gap_rounding=lengths)
 
     @property
     def _lost(self) -> Bools:

@@ -37,7 +37,7 @@ class FrictionState:
         tau: force of friction that belongs to ``lam`` ``(n, gdim)``.
         facet: facet that the anchor is on ``(n,)``; -1 on a rigid target.
         xi: the anchor's reference coordinates on it ``(n, gdim - 1)``.
-        anchor: what is to be added to that place; on a rigid target the anchor where the target was drawn ``(n, gdim)``.
+        anchor: what is to be added to that place; on a rigid target the anchor at the target's reference position ``(n, gdim)``.
         slipped: relative motion along the target while slipping, summed over all steps ``(n, gdim)``.
         work: that friction has taken from the bodies ``(n,)``.
     """

@@ -66,7 +66,7 @@ class Contactors(OnTarget):
         return Planes.of(self.surface.shape, x, self.surface.sign).size
 
     def stretch(self, facets: Ints, size: Array) -> Array:
-        """Areas that facets around contactors have grown to, ``size (k,)``, over those they were drawn with ``(n,)`` (collective)."""
+        """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
         dofs, mean = self.surface.dofs[facets], self.basis.mean
         drawn = self.sizes(self.config.X[self.surface.dofs])[facets]
         now, then = (self.config.to_owners(dofs.ravel(), (a[:, None] * mean).ravel())[self.nodes] for a in (size, drawn))
@@ -223,7 +223,7 @@ class MortarKinematics:
         return there, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
-        """What the equations hand on of the state's multipliers."""
+        """Nodal forces of the state's multipliers, by the equations."""
         nodes, forces = self._handed_on(state.lam / self.rows.share * self.rows.length)
         if state.friction is None:
             return nodes, forces

@@ -281,7 +281,7 @@ class Mass:
 
     @property
     def _X(self) -> Array:
-        """Owned nodes as drawn ``(n_owned, gdim)``."""
+        """Owned nodes in the reference configuration ``(n_owned, gdim)``."""
         return self.config.X[: self.config.n_owned]
 
     @property
@@ -313,7 +313,7 @@ class Mass:
 
 
 def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
-    """``rho u . v`` integrated over the bodies as drawn (collective).
+    """``rho u . v`` integrated over the reference configuration (collective).
 
     Args:
         V: space of the displacement.

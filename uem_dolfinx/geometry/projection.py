@@ -67,7 +67,7 @@ class Target(Protocol):
         n_nodes: that a contactor follows; 0 if the target is rigid.
         stride: how far a contactor may move past it unseen, a length.
         averaged: whether normals are averaged at nodes and interpolated, so that they lean from the facets'.
-        motion: that a rigid target has made from where it was drawn, a ``rigid.Motion``; None without any, and of a mesh.
+        motion: of a rigid target from its reference position, a ``rigid.Motion``; None without any, and of a mesh.
     """
 
     n_nodes: int

@@ -46,7 +46,7 @@ class Motion:
 
     @classmethod
     def none(cls, gdim: int) -> Motion:
-        """Everything stays where it was drawn."""
+        """No motion: everything is at its reference position."""
         return cls(np.zeros(gdim), np.eye(gdim), np.zeros(gdim))
 
 
@@ -57,7 +57,7 @@ class RigidProjection:
     Attributes:
         points: where it was taken ``(n, gdim)``.
         shape_operator: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
-        motion: of the surface when it was taken; None where it was drawn.
+        motion: of the surface when it was taken; None at its reference position.
     """
 
     gap: Array

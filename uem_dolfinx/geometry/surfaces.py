@@ -51,7 +51,7 @@ class Areas:
 
     @cached_property
     def reference(self) -> Array:
-        """Over the surface as it was drawn, per local node ``(n_local,)`` (first call: collective)."""
+        """Over the reference surface, per local node ``(n_local,)`` (first call: collective)."""
         if self._tag.dim == 0:
             return np.zeros(self._config.n_local)
         return self._assembled(self._integrals(1.0))

@@ -1,4 +1,4 @@
-"""Energy book: where the energy of a run is after every step, what work was done, and the momentum beside."""
+"""Energy log: where the energy of a run is after every step, what work was done, and the momentum beside."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class EnergyBook(Closing):
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         if problem.dynamics is None:
-            raise SpaceError("an energy book needs inertia: give the problem dynamics=Dynamics(mass)")
+            raise SpaceError("EnergyBook needs inertia: give the problem dynamics=Dynamics(mass)")
         self.problem, self.dynamics = problem, problem.dynamics
         with agreed(problem.comm):
             if external is not None:

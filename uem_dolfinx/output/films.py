@@ -32,7 +32,7 @@ def animate(
     size: tuple[float, float] = (6.4, 4.8),
     **how: Any,
 ) -> Iterator[T]:
-    """Hand on the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
+    """Yield the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
 
     All frames have the same window, colours and lengths of arrows::
 

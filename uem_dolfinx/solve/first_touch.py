@@ -20,7 +20,7 @@ from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
-    It saves the solve that would find them; who is wrong among them is released before anything moves. Contactors with friction are left
+    It saves the solve that would find them; those that are wrong are released before anything moves. Contactors with friction are left
     to that solve, which tells the way that they slip.
 
     Args:
@@ -53,7 +53,7 @@ def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequ
     Args:
         pairs: of all contacts.
         gaps: that decide on contact, of every pair ``(n,)``.
-        violated: who is to change sides, of every pair; some contactor enters.
+        violated: contactors that are to change sides, of every pair; some contactor enters.
     """
     config = pairs[0].config
     g, entering = config.gdim, [w.enter for w in violated]

@@ -23,7 +23,7 @@ from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 def load_steps(
     problem: UnitedProblem, steps: int = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
 ) -> Iterator[LoadStep]:
-    """Apply the load in steps, cut on failure and grown again on ease, up to the nominal length, behind a progress bar on a terminal.
+    """Apply the load in steps, cut on failure, increased again after easy ones to the nominal length at most, with a progress bar.
 
     Args:
         problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.

@@ -129,8 +129,8 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     return depth
 
 
-def _crossings(target: MeshTarget, who: Ints, p0: Array, p1: Array, moved: Array, reach: float) -> Crossings:
-    """Crossings of the points ``who (k,)`` from ``p0`` to ``p1 (k, gdim)`` with the whole target, on their own rank (collective)."""
+def _crossings(target: MeshTarget, which: Ints, p0: Array, p1: Array, moved: Array, reach: float) -> Crossings:
+    """Crossings of the points ``which (k,)`` from ``p0`` to ``p1 (k, gdim)`` with the whole target, on their own rank (collective)."""
     comm, g = target.comm, p0.shape[1]
     pieces = target.shape.pieces
     x1 = target.facets.x
@@ -140,7 +140,7 @@ def _crossings(target: MeshTarget, who: Ints, p0: Array, p1: Array, moved: Array
     low, high = np.minimum(p0, p1), np.maximum(p0, p1)
     rows = [np.flatnonzero(((low <= b[1]) & (high >= b[0])).all(axis=1)) for b in comm.allgather(box)]
     there = Exchange(comm, rows)
-    q0, q1, number, home = there.send(p0, p1, who, np.full(len(who), comm.rank))
+    q0, q1, number, home = there.send(p0, p1, which, np.full(len(which), comm.rank))
     sign = np.repeat(target.facets.sign, len(pieces))
     found = find_crossings((q0, x0[:, pieces].reshape(-1, g, g)), (q1, x1[:, pieces].reshape(-1, g, g)), sign, reach)
     back = Exchange.to(comm, home[found.point])
@@ -160,11 +160,11 @@ def _entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
     return entry, leaving, np.setdiff1d(outs, leaving)
 
 
-def _normals_at_start(pair: Interface, start: Array, who: Ints) -> Array:
-    """Normals of the target at contactors ``who (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
+def _normals_at_start(pair: Interface, start: Array, which: Ints) -> Array:
+    """Normals of the target at contactors ``which (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
     with pair.config.at(start):
-        p = pair.target.project(pair.points[who])
-    began = pair.committed.active[who] | (p.gap < 0.0)
+        p = pair.target.project(pair.points[which])
+    began = pair.committed.active[which] | (p.gap < 0.0)
     return np.where(began[:, None], p.normal, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Uniting equations of all pairs brought together: how they can meet, Q, and how those in each other's way are resolved."""
+"""Uniting equations of all pairs brought together: where they can conflict, Q, and how conflicts are resolved."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class OverConstraints:
         shared: whether a node is a contactor of several pairs.
         mutual: pairs whose surfaces are contactor and target of each other (two-pass) ``(n_pairs,)``.
         stacked: whether a node that is followed may itself be eliminated.
-        contestable: whether equations can get in each other's way.
+        contestable: whether equations can conflict.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface]):
@@ -61,7 +61,7 @@ class OverConstraints:
     def restrict(
         self, labelled: list[Constraints], equations: UnitingEquations, free: Bools, prescribed: Array
     ) -> tuple[Restriction, IndependentEquations | None]:
-        """P or Q of equations, and how those in each other's way were resolved (collective).
+        """P or Q of equations, and how conflicts among them were resolved (collective).
 
         Args:
             labelled: equations of every pair, in the order of those to be joined.
@@ -85,7 +85,7 @@ class Rows:
     Attributes:
         equations: of every pair.
         trial: all that P is made of; None where it is ``frictionless``.
-        independent: how those that got in each other's way were resolved; None if none could.
+        independent: how conflicts were resolved; None if there could be none.
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
     """
@@ -148,7 +148,7 @@ def make_rows(
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
-    """Equations that got in each other's way, rotated where contactors slip (collective).
+    """Equations that conflicted, rotated where contactors slip (collective).
 
     Args:
         pairs: of all contacts.

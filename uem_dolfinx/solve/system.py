@@ -155,7 +155,7 @@ class BodySystem:
         2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem predicted.
         3. Let go of contactors past an end, and follow the others across bends, into corners and out of them.
         4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
-        5. Take the equations that follow, Q'F with them, and who breaks the conditions of contact.
+        5. Take the equations that follow, Q'F with them, and which contactors break the conditions of contact.
         """
         bodies, pairs = self.bodies, self.pairs
         if bodies.stiffness is None and pairs:
@@ -218,7 +218,7 @@ class BodySystem:
 
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
-        # where equations get in each other's way, those of P might eliminate other components than those of Q
+        # where equations conflict, those of P might eliminate other components than those of Q
         contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
         self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless

@@ -73,7 +73,7 @@ def time_steps(
     """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
 
     A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would
-    give the bodies energy within it, and grown again on ease.
+    give the bodies energy within it, and increased again after easy steps.
 
     Args:
         problem: with ``dynamics``; its ``load`` is called with the time.

@@ -177,6 +177,7 @@ class BarrierSystem(PushedSystem):
 
     def begin_step(self) -> None:
         """Begin a step; bodies that are too near for the barrier are lifted."""
+        super().begin_step()
         self._squeezes = 0
         for pair in self.pairs:
             self.place(returning=False)

@@ -180,6 +180,7 @@ class PenaltySystem(PushedSystem):
 
     def begin_step(self) -> None:
         """Begin a step with the multipliers of the last converged one."""
+        super().begin_step()
         committed = [pair.committed for pair in self.pairs]
         if any(now is not then for now, then in zip(committed, self._known)):
             self._committed = [s.force for s in self._springs]

@@ -61,7 +61,9 @@ class PushedSystem(ABC):
     # -- what all of them do alike -----------------------------------------------------------------------------------------
 
     def begin_step(self) -> None:
-        """Nothing holds what floats."""
+        """Contacts begin theirs; nothing holds what floats."""
+        for pair in self.pairs:
+            pair.discretisation.begin_step()
 
     def end_step(self) -> None:
         """Refuse contactors that are prescribed inside the target (collective)."""

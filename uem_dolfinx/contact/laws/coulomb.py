@@ -15,7 +15,7 @@ class Coulomb:
     """A contactor slips where the force along the target reaches ``mu lam``.
 
     Args:
-        field: the coefficient mu, a number, or a function of place that is given points ``(3, n)`` as drawn and returns ``(n,)``.
+        field: the coefficient mu, a number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
     """
 
     field: float | Callable[[Array], npt.ArrayLike]

@@ -20,7 +20,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
-#: A number, or a function of place that is given points ``(3, n)`` as drawn and returns ``(n,)``.
+#: A number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
 Field: TypeAlias = float | Callable[[Array], npt.ArrayLike]
 
 
@@ -41,7 +41,7 @@ class FrictionLaw(Protocol):
         Args:
             value: of ``field`` at the contactors ``(n,)``.
             lam: forces along the normal, 0 or positive ``(n,)``.
-            area: of the surface as drawn that these are integrals over ``(n,)``; zeros unless ``per_area``.
+            area: of the reference surface that these are integrals over ``(n,)``; zeros unless ``per_area``.
 
         Returns:
             A force and a number for each contactor ``(n,)``.

@@ -18,7 +18,7 @@ class Tresca:
     The united matrix is symmetric: test rows are those of P.
 
     Args:
-        field: the stress tau, a force per area as drawn: a number, or a function of place that is given points ``(3, n)`` as drawn and
+        field: the stress tau, a force per reference area: a number, or a function of place that is given reference points ``(3, n)`` and
             returns ``(n,)``.
     """
 
