@@ -174,7 +174,7 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
 
     def residual(u: Array) -> PETSc.Vec:
         problem.u.x.array[:] = u.ravel()
-        system.place(returning=False)
+        system.place()
         problem.bodies.assemble()
         pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
         r = problem.bodies.residual

@@ -171,7 +171,7 @@ def test_tangent_by_differences(cell):
         friction = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
         pair.trial = replace(pair.trial, active=np.ones(n, bool), lam=lam, nodal=lam, friction=friction)
         problem.u.x.array[:] = u.ravel()
-        problem.system.place(returning=False)
+        problem.system.place()
         problem.bodies.assemble()
         pair.trial = replace(
             pair.trial, force=lam[:, None] * (pair.projection.normal - mu * pair.friction.directions(pair.trial))

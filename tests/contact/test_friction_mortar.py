@@ -139,7 +139,7 @@ def test_friction_of_mortar_by_differences(cell, target, slips):
         state = replace(pair.trial.friction, stick=np.zeros(n, bool), direction=direction)
         pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=state)
         problem.u.x.array[:] = u.ravel()
-        problem.system.place(returning=False)
+        problem.system.place()
         lam = pressure * pair.kinematics.rows.area
         pair.trial = replace(pair.trial, lam=lam)
         size = mu * (lam if slips else held * pair.kinematics.force_per_multiplier)
@@ -210,7 +210,7 @@ def test_friction_of_degree_2_by_differences(cell, where, bound):
         problem.u.x.array[:] = u.ravel()
         state = replace(friction, stick=np.zeros(n, bool), direction=direction)
         pair.trial = replace(pair.trial, active=touching, friction=state)
-        problem.system.place(returning=False)
+        problem.system.place()
         lam = np.where(touching, pressure * pair.kinematics.rows.area, 0.0)
         pair.trial = replace(
             pair.trial, lam=lam, friction=replace(state, tau=-mu * lam[:, None] * pair.friction.directions(pair.trial))

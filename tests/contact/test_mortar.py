@@ -80,7 +80,7 @@ def test_forces_balance_across_open_gaps(cell, degree):
     b = Blocks(cell, (3, 2), degree, gap=0.03)
     problem = b.pressed()
     disturbed(b, 1, 0.01)
-    problem.system.place(returning=False)
+    problem.system.place()
     pair = b.contact.pair
     x = pair.config.X[pair.nodes]
     lam = 1e-3 * (2 + np.sin(11 * x[:, 0])) * pair.kinematics.rows.covered
@@ -262,7 +262,7 @@ def test_parallel_facets():
         b.u.x.array[1::2] += tilt * b.contact.pair.config.X[:, 0] * (b.contact.pair.config.X[:, 1] > -0.5 + 1e-6)
         high = np.isin(np.arange(len(b.u.x.array) // 2), b.contact.pair.nodes)
         b.u.x.array[1::2][high] += tilt * b.contact.pair.config.X[high, 0]
-        problem.system.place(returning=False)
+        problem.system.place()
         rows = b.contact.pair.kinematics.rows
         assert (rows.plain is rows.equations) == same
 

@@ -72,7 +72,7 @@ def test_rows_do_not_depend_on_who_is_active(cell):
     )
     problem = b.pressed()
     disturbed(b, 2, 0.01)
-    problem.system.place(returning=False)
+    problem.system.place()
     pair, rng = b.contact.pair, np.random.default_rng(5)
     every = np.arange(len(pair.nodes))
     first = pair.kinematics.approach(every)

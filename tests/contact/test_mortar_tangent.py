@@ -30,7 +30,7 @@ class WeightedGap:
 
     def points(self, displacement):
         self.b.u.x.array[:] = displacement
-        self.system.place(returning=False)
+        self.system.place()
         return self.pair.kinematics.rows
 
     def leave_out(self, target):

@@ -94,7 +94,7 @@ class Passing:
         self.problem = uem.UnitedProblem(law.residual(u, w) * ufl.dx, u, contacts=[contact])
         self.start = np.array(u.x.array)
         u.x.array.reshape(-1, 2)[:] = np.array(end) - x
-        self.problem.system.place(returning=False)
+        self.problem.system.place()
 
     def check(self):
         refuse_passages(self.problem.config, self.problem.pairs, self.start, [None], moving=True)

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import driven
-from helpers import blocks, clamp, linear, run
+from helpers import blocks, clamp, highest, linear, modulus, run
 
 import uem_dolfinx as uem
 from uem_dolfinx.solve.newton import Increment
@@ -31,10 +31,35 @@ def test_gaps_that_count_as_closed(length):
         b.u.x.array[:] = u
         config.displacement[nodes, 1] += part * config.size
         b.u.x.scatter_forward()
-        system.place(returning=False)
+        system.place()
         problem.bodies.assemble()
         state = system.assemble_constraints(equilibrium)
         assert state.closed == closed and not state.changed
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_normal_return_ends_a_step(held):
+    """Contactors that bear a force are put back onto the bent target to the last bit [UEM, 4.2], those that a condition holds are not."""
+    b = blocks(COMM, "quadrilateral", 2, 5)
+    high = clamp(b.V, b.high, 1, value=-0.01) if held else []
+    contact = uem.Contact(b.high, b.low)
+    problem = uem.UnitedProblem(
+        linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0), *clamp(b.V, b.top, 1, value=-0.01), *high],
+        contacts=[contact],
+    )  # fmt: skip
+    run(problem)
+    config, pair = problem.config, contact.pair
+    before = np.array(b.u.x.array)
+    config.displacement[pair.nodes, 1] += 1e-5
+    b.u.x.scatter_forward()
+    problem.system.place()
+    problem.system.end_step()
+    if held:
+        config.displacement[pair.nodes, 1] -= 1e-5
+        b.u.x.scatter_forward()
+        assert highest(COMM, np.abs(b.u.x.array - before)) < 1e-15
+    else:
+        assert contact.max_gap() < 1e-15 and highest(COMM, np.abs(b.u.x.array - before)) < 1e-8
 
 
 @pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
@@ -44,7 +69,7 @@ def test_what_a_solve_predicts(length):
     contact = uem.Contact(b.high, b.low)
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=[contact])
     system, config = problem.system, problem.config
-    system.place(returning=False)
+    system.place()
     problem.bodies.assemble()
     for part, closes in ((3e-9, False), (3e-8, True)):
         state = system.assemble_constraints(equilibrium)
@@ -64,7 +89,7 @@ def test_the_united_matrix_follows_q(coupling):
         d.to(*place)
     system, pair = d.problem.system, d.contact.pair
     assert d.states[1] > 0
-    system.place(returning=False)
+    system.place()
     d.problem.bodies.assemble()
     before = system.assemble_constraints(lambda *norms: False)
     system.linearise(before, 0)

@@ -28,10 +28,6 @@ from uem_dolfinx.parallel import agree, reduced
 if TYPE_CHECKING:
     from uem_dolfinx.contact.sliding import Sliding
 
-#: A normal return may change nodal forces by this part of the largest contact force.
-#: [heuristic; largest contact force; test_load_steps_resumed.py::test_scenes_have_what_they_are_made_for]
-GENTLE = 0.1
-
 
 class Interface:
     """Contactors against one target.
@@ -147,20 +143,12 @@ class Interface:
         """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
         return self.kinematics.movable
 
-    def return_to_target(self, stiffness: Array) -> None:
-        """Normal return [UEM, 4.2]: put the active contactors back onto the moved target (collective).
-
-        A return that would disturb the contact forces is left to the next linear solve, which moves the whole body with it.
-
-        Args:
-            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
-        """
+    def return_to_target(self) -> None:
+        """Normal return [UEM, 4.2]: put the contactors that bear a force back onto the moved target (collective)."""
         correction = self.kinematics.return_vectors(self.trial)
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
-        disturbance = np.abs(stiffness[self.nodes] * correction).max(axis=1)
-        largest = reduced(self.config.comm, float(self.trial.lam.max(initial=0.0)), op=MPI.MAX)
-        correction[disturbance > GENTLE * largest] = 0.0
+        correction[self.trial.lam <= 0.0] = 0.0
         self.config.displacement[self.nodes] += correction
         self._replace(self.kinematics.returned(self.points, self.trial))
 

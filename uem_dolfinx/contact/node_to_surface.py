@@ -345,7 +345,7 @@ def near_target(p: Projection, state: PairState, off: Bools) -> Bools:
 
 
 def _closing(normal: Array, gap: Array, free: Bools) -> Array:
-    """Displacement of the free components that closes a gap ``(k, gdim)``."""
+    """Displacement of the free components that closes a gap, zero where a condition holds the normal one ``(k, gdim)``."""
     n = normal * free
     nn = np.einsum("kg,kg->k", n, n)
-    return n * (-gap / np.where(nn > 0, nn, np.inf))[:, None]
+    return n * (-gap / np.where(nn > MOSTLY_PRESCRIBED**2, nn, np.inf))[:, None]

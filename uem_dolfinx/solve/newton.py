@@ -153,7 +153,7 @@ class ContactMethod(Protocol):
         """Begin a step, before the loop."""
 
     def place(self, returning: bool) -> None:
-        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+        """Project the contactors; when returning, put back onto their targets those whose rows are not the gradients of their gaps."""
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
@@ -186,10 +186,10 @@ class ContactMethod(Protocol):
         """The increment in all unknowns, if the last solve was of some."""
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
-        """``Q'F`` at the present displacement, with the active set of ``state``."""
+        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``."""
 
     def end_step(self) -> None:
-        """End a step in which the loop has converged; may refuse it."""
+        """End a step in which the loop has converged: put contactors back onto their targets [UEM, 4.2]; may refuse it."""
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with, in dynamics."""
@@ -357,47 +357,46 @@ def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relativ
 
 
 def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, step: Increment, line_search: bool) -> float:
-    """Take the step, shortened where it must be, and assemble the residual there: the length taken."""
+    """Take the step, shortened where it must be, to where the next iteration begins: the length taken."""
     start, state, dq = bodies.displacement(), problem.state, step.dq
     work, norm, length = abs(dq.dot(step.rhs)), step.rhs.norm(), step.longest
     while True:
         last = not line_search or length <= SHORTEST_SEARCH
-        bodies.displace(start, step.du, length)
-        where = bodies.inverted()
-        if where is not None:
-            if last:
-                raise InvertedElementError(
-                    f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there"
-                )
-        elif not line_search or problem.fits:
-            break
-        # the bodies are asked before the normal return, which has its own reasons to move a contactor
-        elif bodies.assemble():
+        if _moved(bodies, method, start, step, length):
+            if last or problem.fits:
+                return length
             residual = method.reduced_residual(state)
             less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
             downhill = problem.convex and dq.dot(residual) < 0.0
             if downhill and not less_work and length == 1.0:
-                length = _downhill(bodies, method, state, start, step)
-            if last or less_work or downhill or residual.norm() <= ENOUGH_DECREASE * norm:
-                break
+                return _downhill(bodies, method, state, start, step)
+            if less_work or downhill or residual.norm() <= ENOUGH_DECREASE * norm:
+                return length
         elif last:
-            break
+            where = bodies.inverted()
+            if where is None:
+                raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+            raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
         length *= 0.5
+
+
+def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increment, length: float) -> bool:
+    """Displace the bodies, project the contactors and assemble the residual: whether it is finite, and no cell turned inside out."""
+    bodies.displace(start, step.du, length)
+    if bodies.inverted() is not None:
+        return False
     method.place(returning=length == 1.0)
-    if not bodies.assemble():
-        raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
-    return length
+    return bodies.assemble()
 
 
 def _downhill(bodies: Bodies, method: ContactMethod, state: IterationState, start: PETSc.Vec, step: Increment) -> float:
-    """Go on as long as forces still drive the bodies that way, and displace them: the length taken, of 1, 2, 4 ... up to a bound."""
+    """Go on from a full step as long as forces still drive the bodies that way: the length taken, of 1, 2, 4 ... up to a bound."""
     length = 1.0
     while length < LONGEST_SEARCH:
-        bodies.displace(start, step.du, 2.0 * length)
-        if bodies.inverted() is not None or not bodies.assemble() or step.dq.dot(method.reduced_residual(state)) >= 0.0:
+        if not _moved(bodies, method, start, step, 2.0 * length) or step.dq.dot(method.reduced_residual(state)) >= 0.0:
             break
         length *= 2.0
-    bodies.displace(start, step.du, length)
+    _moved(bodies, method, start, step, length)
     return length
 
 

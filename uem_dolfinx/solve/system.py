@@ -6,7 +6,7 @@ It implements ``newton.ContactMethod`` by elimination, and leaves load steps and
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -78,42 +78,46 @@ class BodySystem:
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
         self._swept = False
+        #: Equations where the contactors were placed last, with the directions of slip there; None before they were asked for.
+        self._here: Rows | None = None
         #: How equations of several contacts can meet.
         self.over_constraints = OverConstraints(self.config, self.pairs)
         self.floating = FloatingBodies(bodies, self.pairs)
-        self.place(returning=False)
+        self.place()
         for pair in self.pairs:
             check_initial(pair)
             pair.activate_touching()
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
-    def place(self, returning: bool) -> None:
-        """Project the contactors; when returning, put the active ones back onto the moved target [UEM, 4.2]."""
+    def place(self, returning: bool = False) -> None:
+        """Project the contactors; when returning, put back those that follow averaged normals, whose rows are not gradients of gaps."""
         if not self.pairs:
             return
+        self._here = None
         self.bodies.check_displacement()
         with timed("search and projection"):
             for pair in self.pairs:
                 pair.project()
-            stiffness = self.bodies.stiffness
-            if not returning or stiffness is None:
-                return
-            for k, pair in enumerate(self.pairs):
-                if self.over_constraints.shared and k > 0:
-                    # what another pair has returned is returned
-                    pair.project()
-                # surfaces that follow each other would both make up for the same gap
-                if not self.over_constraints.mutual[k]:
-                    pair.return_to_target(stiffness)
-            if self.over_constraints.shared:
-                for pair in self.pairs:
-                    pair.project()
+            if returning:
+                self._return_to_targets(lambda pair: pair.target.averaged)
+
+    def _return_to_targets(self, which: Callable[[Interface], bool]) -> None:
+        """Normal return [UEM, 4.2]: put the active contactors of some pairs back onto the moved targets (collective)."""
+        returning = [(k, pair) for k, pair in enumerate(self.pairs) if which(pair)]
+        for k, pair in returning:
+            if self.over_constraints.shared and k > 0:
+                # what another pair has returned is returned
+                pair.project()
+            # surfaces that follow each other would both make up for the same gap
+            if not self.over_constraints.mutual[k]:
+                pair.return_to_target()
+        if returning:
             self.bodies.u.x.scatter_forward()
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
-        self._not_unique, self._led, place = None, False, partial(self.place, returning=False)
+        self._not_unique, self._led, place = None, False, self.place
         self.exchanges.begin_step()
         for pair in self.pairs:
             pair.discretisation.begin_step()
@@ -124,13 +128,16 @@ class BodySystem:
             touch_ahead(self.bodies, self.pairs, self.floating.rigid, place)
 
     def end_step(self) -> None:
-        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
+        """Refuse an equilibrium that contacts and conditions do not agree about, or one of several; return to the targets (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
         self.floating.end_step()
-        if (state := self._not_unique) is None:
-            return
-        # between this equilibrium and that without friction the united matrix was singular
+        if self._not_unique is not None:
+            self._refuse_one_of_several(self._not_unique)
+        self._return_to_targets(lambda pair: True)
+
+    def _refuse_one_of_several(self, state: BodyState) -> None:
+        """Refuse an equilibrium between which and that without friction the united matrix was singular (collective)."""
         self._factored = None
         added = together(self._curvature, state.added)
         if not self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
@@ -161,10 +168,9 @@ class BodySystem:
         if bodies.stiffness is None and pairs:
             # what tells tension from rounding
             bodies.update_tangent()
-        self._turn()
         F, rounding = self._residual(), self.rounding()
         with timed("uniting equations"):
-            rows = self._rows()
+            rows, self._here = self._rows_here(), None
             y = rows.test.pass_on(F)
             residual = rows.test.reduce(y)
             at_rest = in_equilibrium(residual.norm(), F.norm(), rounding)
@@ -188,7 +194,7 @@ class BodySystem:
                 for pair in pairs:
                     pair.place_again()
                 moved = True
-            fallen = self.floating.fall_again(lambda: self.place(returning=False), unsettled, at_rest)
+            fallen = self.floating.fall_again(lambda: self.place(), unsettled, at_rest)
             if moved or fallen:
                 rows = self._rows()
                 residual = rows.test.transpose(self._residual())
@@ -210,6 +216,15 @@ class BodySystem:
             added=added,
             held=held,
         )
+
+    def _rows_here(self) -> Rows:
+        """Equations where the contactors have been placed, with the directions of slip there (collective)."""
+        if self._here is None:
+            for pair in self.pairs:
+                assert self.bodies.stiffness is not None
+                pair.turn(self.bodies.stiffness)
+            self._here = self._rows()
+        return self._here
 
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
@@ -300,12 +315,6 @@ class BodySystem:
         assert self.bodies.stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
-    def _turn(self) -> None:
-        """Take the directions of friction from where the contactors are (collective)."""
-        for pair in self.pairs:
-            assert self.bodies.stiffness is not None
-            pair.turn(self.bodies.stiffness)
-
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
         return self._rows().test
@@ -336,19 +345,17 @@ class BodySystem:
         return self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
-        """``Q'F`` at the present displacement, with the active set of ``state``.
+        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``.
 
         Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
         """
-        self.place(returning=False)
-        self._turn()
-        return self.restriction().transpose(self._residual())
+        return self._rows_here().test.transpose(self._residual())
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
         dynamics = self.bodies.dynamics
         if dynamics is not None and not dynamics.accelerated:
-            self.place(returning=False)
+            self.place()
             self.bodies.assemble()
             self.floating.begin_motion()
             dynamics.accelerate(self.restriction(), self.bodies.residual)

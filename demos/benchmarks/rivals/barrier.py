@@ -180,14 +180,14 @@ class BarrierSystem(PushedSystem):
         super().begin_step()
         self._squeezes = 0
         for pair in self.pairs:
-            self.place(returning=False)
+            self.place()
             gap = np.where(pair.off, np.inf, pair.projection.gap)
             near = gap.min(initial=np.inf)
             if near < TOO_NEAR * self.distance:
                 body, _ = find_bodies(self.config)
                 normal = pair.projection.normal[gap.argmin()]
                 self.config.displacement[body == body[pair.nodes[0]]] += (0.5 * self.distance - near) * normal
-        self.place(returning=False)
+        self.place()
 
     def _out_of_balance(self, restriction: Restriction) -> PETSc.Vec:
         R = self.bodies.residual
@@ -238,7 +238,7 @@ class BarrierSystem(PushedSystem):
 
                 def look(length: float) -> tuple[float, float]:
                     self.bodies.u.x.array[:] = start + length * step
-                    self.place(returning=False)
+                    self.place()
                     if self.bodies.inverted() is not None or not self.bodies.assemble():
                         return np.inf, np.inf
                     residual = self._out_of_balance(state.trial)
@@ -246,7 +246,7 @@ class BarrierSystem(PushedSystem):
 
                 length = flat_length(look, (slope, state.norm), length)
         self.bodies.u.x.array[:] = start
-        self.place(returning=False)
+        self.place()
         return length
 
     def _free_way(self, start: Array, step: Array) -> float:

@@ -379,6 +379,7 @@ class PenaltySystem(PushedSystem):
             self.bodies.displace(start, du, length)
             if self.bodies.inverted() is not None or not self.bodies.assemble():
                 return np.inf, np.inf
+            self.place()
             residual = self.reduced_residual(state)
             return float(dq.dot(residual)), residual.norm()
 
@@ -388,6 +389,5 @@ class PenaltySystem(PushedSystem):
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """Out-of-balance forces at the present displacement (collective)."""
-        self.place(returning=False)
         forces, _ = self._stretch()
         return state.test.reduce(self.bodies.residual - forces)

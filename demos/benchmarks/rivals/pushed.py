@@ -36,7 +36,7 @@ class PushedSystem(ABC):
         self.config, self.comm = bodies.config, bodies.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self.made_of: object = None
-        self.place(returning=False)
+        self.place()
         for pair in self.pairs:
             check_initial(pair)
             pair.activate_touching()
@@ -74,7 +74,7 @@ class PushedSystem(ABC):
         """Find the acceleration that the bodies start with (collective)."""
         dynamics = self.bodies.dynamics
         if dynamics is not None and not dynamics.accelerated:
-            self.place(returning=False)
+            self.place()
             self.bodies.assemble()
             dynamics.accelerate(self.restriction(), self.bodies.residual)
 
@@ -83,8 +83,8 @@ class PushedSystem(ABC):
         self.made_of = None
         self.solver.forget()
 
-    def place(self, returning: bool) -> None:
-        """Project the contactors; none is put back."""
+    def place(self, returning: bool = False) -> None:
+        """Project the contactors."""
         if self.pairs:
             self.bodies.check_displacement()
             for pair in self.pairs:
@@ -127,5 +127,4 @@ class PushedSystem(ABC):
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """Out-of-balance forces of the bodies at the present displacement (collective)."""
-        self.place(returning=False)
         return state.test.reduce(self.bodies.residual)
