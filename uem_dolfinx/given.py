@@ -5,9 +5,8 @@ Every check names the thing, its value, what was expected and, where that is not
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,13 +102,20 @@ def flag(what: str, value: Any) -> bool:
     return bool(value)
 
 
+def did_you_mean(value: Any, known: Collection[str], otherwise: str = "") -> str:
+    """Asks for the word known here that resembles a value; ``otherwise`` if none does."""
+    import difflib
+
+    near = difflib.get_close_matches(str(value), known, n=1)
+    return f"did you mean {near[0]!r}?" if near else otherwise
+
+
 def word(what: str, value: Any, known: Sequence[str]) -> str:
     """One of the words known here; InputError for others, InputTypeError for what is no word."""
     if not isinstance(value, str) or value not in known:
-        near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
         some = " or ".join(filter(None, [", ".join(map(repr, known[:-1])), repr(known[-1])]))
         error = InputError if isinstance(value, str) else InputTypeError
-        raise error(sentence(what, value, f"one of {some}", f"did you mean {near[0]!r}?" if near else ""))
+        raise error(sentence(what, value, f"one of {some}", did_you_mean(value, known)))
     return value
 
 

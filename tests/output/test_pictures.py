@@ -134,7 +134,7 @@ def test_nothing_to_draw_with(monkeypatch, folder):
     monkeypatch.setitem(sys.modules, "pyvista", types.ModuleType("pyvista"))
     monkeypatch.delenv("DISPLAY", raising=False)
     if COMM.rank == 0:
-        monkeypatch.setattr(pictures3d, "find_library", lambda name: None)
+        monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     refused(
         uem.MissingBackendError, ("libEGL", "apt-get"), lambda: uem.plot_scene(pressed(COMM, "tetrahedron"), folder / "a.png")
     )

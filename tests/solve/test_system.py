@@ -41,12 +41,10 @@ def test_gaps_that_count_as_closed(length):
 def test_the_normal_return_ends_a_step(held):
     """Contactors that bear a force are put back onto the bent target to the last bit [UEM, 4.2], those that a condition holds are not."""
     b = blocks(COMM, "quadrilateral", 2, 5)
-    high = clamp(b.V, b.high, 1, value=-0.01) if held else []
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0), *clamp(b.V, b.top, 1, value=-0.01)]
+    bcs += clamp(b.V, b.high, 1, value=-0.01) if held else []
     contact = uem.Contact(b.high, b.low)
-    problem = uem.UnitedProblem(
-        linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0), *clamp(b.V, b.top, 1, value=-0.01), *high],
-        contacts=[contact],
-    )  # fmt: skip
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact])
     run(problem)
     config, pair = problem.config, contact.pair
     before = np.array(b.u.x.array)

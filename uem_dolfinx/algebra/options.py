@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -98,8 +97,7 @@ def check_options(options: Any, prefix: Any) -> None:
                 )
     for key, of, example in (("ksp_type", PETSc.KSP, "'cg' or 'gmres'"), ("pc_type", PETSc.PC, "'gamg' or 'lu'")):
         if key in options and not _knows(of, value := options[key]):
-            near = difflib.get_close_matches(str(value), _type_names(of), n=1)
-            remedy = f"did you mean {near[0]!r}?" if near else ""
+            remedy = given.did_you_mean(value, _type_names(of))
             raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
 
 
@@ -122,10 +120,10 @@ def _knows(of: Any, name: Any) -> bool:
 def tell_unused(names: Iterable[str], options: Mapping[str, Any], types: str) -> None:
     """Warn of options that PETSc with these types of KSP and PC has had no use for."""
     for key in sorted(names):
-        near = difflib.get_close_matches(key, OFTEN_USED, n=1)
+        remedy = given.did_you_mean(key, OFTEN_USED, "check its spelling, or leave it out")
         logger.warning(
             "petsc_options[%r] = %s was not used by PETSc with %s: %s",
-            key, given.shown(options[key]), types, f"did you mean {near[0]!r}?" if near else "check its spelling, or leave it out",
+            key, given.shown(options[key]), types, remedy,
         )  # fmt: skip
 
 

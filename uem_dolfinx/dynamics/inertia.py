@@ -20,7 +20,6 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
-from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import InputTypeError, LinearSolveError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -166,6 +165,8 @@ class Dynamics:
         Raises:
             MassError: if a body cannot do without the mass of its contactors.
         """
+        from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
+
         contactors = contactor_nodes(contacts)
         massy = int(reduced(self.config.comm, int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
         if self.contactors == "massless":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import SpaceError, TagError
-from uem_dolfinx.given import shown
+from uem_dolfinx.given import did_you_mean, shown
 from uem_dolfinx.parallel import agree, reduced
 
 Key: TypeAlias = "str | int | tuple[int, str | int]"
@@ -103,8 +102,8 @@ class Tags(Mapping[Key, Tag]):
         return f"Tags({self._listing()})"
 
     def _hint(self, label: object) -> str:
-        near = difflib.get_close_matches(str(label), [t.name for t in self._tags if t.name], n=1)
-        return f", did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(label, [t.name for t in self._tags if t.name])
+        return f", {hint}" if hint else ""
 
     def _listing(self) -> str:
         if not self._tags:

@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from ctypes.util import find_library
 from typing import Any
 
 from mpi4py import MPI
@@ -22,6 +21,8 @@ def require(comm: MPI.Comm) -> None:
     """Raise a MissingBackendError on all ranks where rank 0, which draws, has no PyVista, or VTK nothing to draw with (collective)."""
     error: Exception | None = None
     if comm.rank == 0:
+        from ctypes.util import find_library
+
         try:
             import pyvista  # noqa: F401
         except ImportError as missing:

@@ -22,7 +22,6 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
-from uem_dolfinx.solve.rigid_steps import least_motion, weighted
 
 #: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]
@@ -227,6 +226,8 @@ class FloatingBodies:
         ways = self._ways(R, gap, f / np.repeat(weight, n))
         shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
         M = ((weight / damping)[:, None] / np.where(np.arange(n) < config.gdim, shift[:, None], turn[:, None])).ravel()
+        from uem_dolfinx.solve.rigid_steps import least_motion, weighted
+
         B = weighted(basis, M)
         v, push = least_motion(comm, f, B, R, gap)
         took = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from uem_dolfinx.errors import ConvergenceError, UEMError, UserFunctionError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
-from uem_dolfinx.solve.arc_length import AlongArc
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+
+if TYPE_CHECKING:
+    from uem_dolfinx.solve.arc_length import AlongArc
 
 
 def load_steps(
@@ -50,7 +53,12 @@ def load_steps(
         steps, arc_length = given.count("steps", steps), given.flag("arc_length", arc_length)
     given.alike(problem.comm, "load_steps", steps=steps, arc_length=arc_length)
     begin_checkpoint(checkpoint, problem.state, problem.u)
-    made = _load_steps(problem, steps, AlongArc(problem) if arc_length else ByLoad(problem))
+    way: ByLoad | AlongArc = ByLoad(problem)
+    if arc_length:
+        from uem_dolfinx.solve.arc_length import AlongArc
+
+        way = AlongArc(problem)
+    made = _load_steps(problem, steps, way)
     return between_steps(problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint)
 
 

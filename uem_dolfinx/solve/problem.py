@@ -15,7 +15,6 @@ from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion
@@ -140,6 +139,8 @@ class UnitedProblem:
         free = self.bodies.free[: self.config.n_owned]
         pairs = [contact.attach(self.config, free) for contact in self.contacts]
         if dynamics is not None:
+            from uem_dolfinx.dynamics.massless import warn_of_soft_targets
+
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
