@@ -107,8 +107,7 @@ def report(args: argparse.Namespace, results: dict[str, Any]) -> None:
         else:
             print(f"{key:>20}: {show(value)}")
     if getattr(args, "verbose", False):
-        spent = sorted(uem.timings().items(), key=lambda item: -item[1][1])
-        print("\n".join(["seconds  times  stage, some within others"] + [f"{s:7.3f} {n:6d}  {stage}" for stage, (n, s) in spent]))
+        print(uem.timings())
     if args.json:
         Path(args.json).parent.mkdir(parents=True, exist_ok=True)
         Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

@@ -293,6 +293,55 @@ def test_interpolation_and_timing():
     after = uem.timing("compile forms")
     assert after[0] > before[0] and after[1] >= before[1] and uem.timing("no such stage") == (0, 0.0)
     assert uem.timings()["compile forms"] == after and "no such stage" not in uem.timings()
+    rows = [line.split() for line in str(uem.timings()).splitlines()]
+    seconds = [float(row[0]) for row in rows[1:]]
+    assert rows[0][:2] == ["seconds", "times"] and seconds == sorted(seconds, reverse=True) and len(seconds) == len(uem.timings())
+
+
+# -- what scripts and logs see -----------------------------------------------------------------------------------------
+
+
+def test_objects_tell_what_they_are():
+    """On any one rank: the size of the problem, how far it is, and what a contact is made of."""
+    b = blocks(COMM, "quadrilateral", 2, 5)
+    contact = uem.Contact(b.high, b.low, friction=uem.Tresca(0.1), coupling="mortar")
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)], contacts=[contact])
+    assert repr(contact) == "Contact('high on low', coupling='mortar', sliding='finite', friction=Tresca(0.1))"
+    problem.solve()
+    assert repr(problem) == "UnitedProblem(90 unknowns in 2D, statics, contacts: 'high on low', steps committed: 1)"
+    plane = uem.RigidPlane((0, 1), (0, 1))
+    assert repr(plane.move((0.0, 0.5))) == "RigidPlane('rigid plane' at (0, 1.5))"
+    assert repr(uem.RigidSurface(lambda x: x[:, 0], lambda x: x)) == "RigidSurface('rigid surface')"
+    assert repr(uem.Contact(b.high, plane, friction=0)).endswith("sliding='finite')")
+
+
+def test_a_line_a_step(caplog):
+    """At level INFO the log of a batch run has a line for each step, with the contacts' forces; at WARNING it has none."""
+    b = blocks(COMM, "quadrilateral", 2, 5)
+    contact = uem.Contact(b.high, b.low)
+    problem = uem.UnitedProblem(
+        linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=b.oedometer(0.02), contacts=[contact], verbose=False
+    )
+    forces = []
+    with caplog.at_level("INFO", logger="uem_dolfinx"):
+        for step in uem.load_steps(problem, 2):
+            forces.append(contact.resultant().force[1])
+            assert repr(step).startswith(f"LoadStep(number={step.number}, factor={step.factor}, cuts=0, newton_iterations=")
+    lines = [record.getMessage() for record in caplog.records if record.getMessage().startswith("load step")]
+    if COMM.rank == 0:
+        assert [line.partition(":")[0] for line in lines] == ["load step 1, factor 0.5", "load step 2, factor 1"]
+        assert all(line.endswith(f"{force:.6g})") and "high on low: 6 active" in line for line, force in zip(lines, forces))
+    caplog.clear()
+    with caplog.at_level("WARNING", logger="uem_dolfinx"):
+        list(uem.load_steps(problem, 1))
+    assert not caplog.records
+
+
+@serial
+def test_versions_agree():
+    import tomllib
+
+    assert vars(uem)["__version__"] == tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 
 # -- Dirichlet conditions ----------------------------------------------------------------------------------------------

@@ -1,5 +1,19 @@
 """Contact for FEniCSx by the United Elements Method: exact constraints by elimination, no multipliers, no penalty.
 
+    mesh, tags = uem.read_gmsh("meshes/hertz_cylinder.geo", MPI.COMM_WORLD, gdim=2)
+    V = uem.function_space(mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1e6, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["block_bottom"], 1)]
+    bcs += [uem.dirichlet(V, tags["disc_top"], 1, -0.006)]
+    contact = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"])
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    for step in uem.load_steps(problem, 5):
+        print(step, contact.resultant().force)
+
+``help(uem.Contact)`` and ``help(uem.UnitedProblem)`` say what a scene can have, ``help(uem.load_steps)`` and ``help(uem.time_steps)`` how
+it is solved, ``help(uem.ResultsWriter)`` and ``help(uem.plot_scene)`` what is written.
+
     du = P dq + c,    P'KP dq = P'(r - K c)
 
 The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
@@ -16,6 +30,8 @@ Mechanics and Engineering 191 (2001) 843-860.
 """
 
 from __future__ import annotations
+
+__version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",

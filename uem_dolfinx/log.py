@@ -54,9 +54,20 @@ def timed(stage: str) -> Iterator[None]:
         yield
 
 
-def timings() -> dict[str, tuple[int, float]]:
-    """How often each stage has been timed on this rank so far, and its wall time in seconds; some hold others."""
-    return {stage: timing(stage) for stage in _stages}
+class Timings(dict[str, tuple[int, float]]):
+    """How often each stage has been timed, and its wall time in seconds; printed as a table, the longest first."""
+
+    def __str__(self) -> str:
+        rows = sorted(self.items(), key=lambda item: -item[1][1])
+        return "\n".join(["seconds  times  stage, some within others", *(f"{s:7.3f} {n:6d}  {stage}" for stage, (n, s) in rows)])
+
+
+def timings() -> Timings:
+    """How often each stage has been timed on this rank so far, and its wall time in seconds; some hold others.
+
+    ``print(uem.timings())`` shows a table.
+    """
+    return Timings((stage, timing(stage)) for stage in _stages)
 
 
 def timing(stage: str) -> tuple[int, float]:
@@ -78,7 +89,7 @@ def compiling(what: str) -> Iterator[None]:
         nonlocal told
         if not told and str(message).startswith("Compiler stage"):
             told = True
-            logger.warning("compiling %s: later runs find it in the cache", what)
+            logger.info("compiling %s: later runs find it in the cache", what)
 
     # FFCx reports the stages of a compilation to its logger, whose level it sets itself; what it finds in its cache has none
     ffcx.info = info  # type: ignore[assignment]

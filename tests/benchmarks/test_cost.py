@@ -135,11 +135,13 @@ def test_nothing_is_searched_twice():
 # -- the first run ever --------------------------------------------------------------------------------------------------------
 
 FIRST = """
+import logging
 from mpi4py import MPI
 import ufl
 from dolfinx import fem, mesh
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+logging.getLogger("uem_dolfinx").setLevel(logging.INFO)
 V = compat.function_space(mesh.create_unit_square(MPI.COMM_WORLD, 2, 2), 1, (2,))
 u = fem.Function(V)
 uem.UnitedProblem(uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, ufl.TestFunction(V)) * ufl.dx, u)

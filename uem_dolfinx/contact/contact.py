@@ -136,6 +136,12 @@ class Contact:
                 )
         super().__setattr__(name, value)
 
+    def __repr__(self) -> str:
+        """Its name, coupling and sliding, and friction if there is any."""
+        law, coupling = as_law(self._friction), self.coupling if isinstance(self.coupling, str) else self.coupling.__name__
+        friction = "" if law.field == 0.0 else f", friction={type(law).__name__}({given.shown(law.field)})"
+        return f"Contact({self.name!r}, coupling={coupling!r}, sliding={self.sliding!r}{friction})"
+
     @property
     def friction(self) -> Field | FrictionLaw:
         """Coulomb's coefficient, or a law; set anew between steps it counts from the next step on (collective)."""

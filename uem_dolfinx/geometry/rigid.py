@@ -143,6 +143,13 @@ class RigidSurface:
         #: Dimension that it is given in, None if its functions alone know.
         self.gdim = None if self._reference is None else len(self._reference)
 
+    def __repr__(self) -> str:
+        """Its kind, and where its reference point is now."""
+        if self.motion is None and self._reference is None:
+            return f"{type(self).__name__}({self.name!r})"
+        at = self.reference(self.gdim or len(self.motion.about if self.motion is not None else ()))
+        return f"{type(self).__name__}({self.name!r} at ({', '.join(f'{x:.6g}' for x in at)}))"
+
     def move(
         self, translation: npt.ArrayLike, rotation: npt.ArrayLike | None = None, about: npt.ArrayLike | None = None
     ) -> RigidSurface:

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import ConvergenceError, InputError
+from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -164,6 +165,8 @@ class AlongArc:
         problem, progress, owned = self._problem, self._problem.progress, self._owned
         number = progress.control.number
         before, self.tried = np.array(problem.committed), progress.control.length
+        if problem.verbose:
+            say(f"load step {number + 1}, along the arc from load factor {done:.6g}")
         if number == 0:
             factor, iterations = self.tried, self._by_load(self.tried)
         else:

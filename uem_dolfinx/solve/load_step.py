@@ -8,7 +8,7 @@ from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.stepping import Step
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LoadStep(Step):
     """A converged load step.
 
@@ -23,3 +23,7 @@ class LoadStep(Step):
     factor: float
     iterations: list[Iteration]
     cuts: int
+
+    def __str__(self) -> str:
+        """Which step it is, and its load factor."""
+        return f"load step {self.number}, factor {self.factor:.6g}"

@@ -11,6 +11,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.errors import ConvergenceError, UEMError, UserFunctionError
 from uem_dolfinx.log import progress as progress_bar
+from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.load_step import LoadStep
@@ -59,7 +60,9 @@ def load_steps(
 
         way = AlongArc(problem)
     made = _load_steps(problem, steps, way)
-    return between_steps(problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint)
+    return between_steps(
+        problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint, problem.contacts
+    )
 
 
 def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> Iterator[LoadStep]:
@@ -126,6 +129,8 @@ class ByLoad:
         factor = _next_factor(done, progress.control)
         # it may be shorter than was meant
         self.tried = factor - done
+        if self._problem.verbose:
+            say(f"load step {progress.control.number + 1}, to load factor {factor:.6g}")
         self._problem.set_load(factor)
         return factor, self._problem.solve(start=progress.start, fraction=factor if self._ramped else 1.0)
 

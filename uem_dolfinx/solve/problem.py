@@ -166,6 +166,14 @@ class UnitedProblem:
 
         self._settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics)
 
+    def __repr__(self) -> str:
+        """Its size, contacts, and how far it is."""
+        config = self.config
+        size = f"{config.block * config.index_map.size_global} unknowns in {config.gdim}D"
+        kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
+        names = ", ".join(repr(contact.name) for contact in self.contacts) or "none"
+        return f"UnitedProblem({size}, {kind}, contacts: {names}, steps committed: {self.progress.steps})"
+
     # -- one step ----------------------------------------------------------------------------------------------------
 
     def set_load(self, at: float) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, TypeVar
@@ -12,19 +13,22 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.log import logger
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
 
-T = TypeVar("T")
+S = TypeVar("S", bound="Step")
 
 
 class Step:
     """What is told of every converged step, from its history of the Newton loop."""
 
     iterations: list[Iteration]
+    cuts: int
 
     @property
     def newton_iterations(self) -> int:
@@ -35,6 +39,21 @@ class Step:
     def exchanges(self) -> int:
         """Number of further linear solves with the same tangents, each with another active set."""
         return sum(i.exchanges for i in self.iterations)
+
+    def __repr__(self) -> str:
+        """All but the history, of which the numbers of iterations and exchanges."""
+        shown = {name: value for name, value in vars(self).items() if name != "iterations"}
+        shown |= {"newton_iterations": self.newton_iterations, "exchanges": self.exchanges}
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
+
+    def summary(self, contacts: Sequence[Contact]) -> str:
+        """A line for the log of a run, with the active contactors and the force of every contact (collective)."""
+        cut = f", cut {self.cuts} times" if self.cuts else ""
+        words = [f"{self}: {self.newton_iterations} iterations, {self.exchanges} exchanges{cut}"]
+        for contact in contacts:
+            force = ", ".join(f"{f:.6g}" for f in contact.resultant().force)
+            words.append(f"{contact.name}: {contact.n_active} active, force ({force})")
+        return "; ".join(words)
 
 
 @dataclass
@@ -139,12 +158,17 @@ def begin_checkpoint(checkpoint: Checkpoint | None, state: Callable[[], State], 
         checkpoint.begin(state())
 
 
-def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkpoint: Checkpoint | None) -> Iterator[T]:
+def between_steps(
+    comm: MPI.Comm, progress: Progress, steps: Iterable[S], checkpoint: Checkpoint | None, contacts: Sequence[Contact]
+) -> Iterator[S]:
     """Steps, between which the checkpoint is written when it is time, and on a signal to any rank, which ends the run on all.
+
+    Each is told of in a line of the log, where the application wants to hear what is of level INFO.
 
     Args:
         comm: communicator of the problem.
         progress: of the problem, by which it checks signals within a step, too.
+        contacts: of the problem.
         steps: each brings the problem from one committed state to the next; where it raises, the last one is restored.
         checkpoint: which has begun; None writes none.
 
@@ -156,6 +180,7 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
         SystemExit: likewise with status 143 after SIGTERM.
         CheckpointError: if the checkpoint cannot be written.
     """
+    told = comm.bcast(logger.isEnabledFor(logging.INFO))
     outer = progress.interruption, progress.end
     progress.interruption = Interruption() if checkpoint is None else checkpoint.interruption
     if checkpoint is not None:
@@ -164,6 +189,8 @@ def between_steps(comm: MPI.Comm, progress: Progress, steps: Iterable[T], checkp
         with progress.interruption:
             try:
                 for step in steps:
+                    if told:
+                        logger.info("%s", step.summary(contacts))
                     progress.inside = True
                     yield step
                     progress.inside = False

@@ -14,7 +14,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
-from uem_dolfinx.log import logger, progress
+from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
@@ -34,7 +34,7 @@ MOST_GIVEN = 2e-3
 SHORTEST_GIVEN = 1.0 / 128
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TimeStep(Step):
     """A converged time step.
 
@@ -55,6 +55,11 @@ class TimeStep(Step):
     cuts: int
     touched: tuple[str, ...]
     left: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Which step it is, its time, and which contacts have touched or come apart in it."""
+        events = [f"{word} {', '.join(names)}" for word, names in (("touched:", self.touched), ("left:", self.left)) if names]
+        return ", ".join([f"time step {self.number}, time {self.time:.6g}", *events])
 
     @property
     def start(self) -> float:
@@ -120,7 +125,7 @@ def time_steps(
     begin_checkpoint(checkpoint, problem.state, problem.u)
     steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
     shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
-    return between_steps(problem.comm, problem.progress, shown, checkpoint)
+    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.contacts)
 
 
 def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
@@ -188,6 +193,8 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
 def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     """Find the state at the end of a step of this length (collective)."""
     assert problem.dynamics is not None
+    if problem.verbose:
+        say(f"time step {problem.step_control.number + 1}, to time {problem.dynamics.time + length:.6g}")
     problem.set_load(problem.dynamics.time + length)
     problem.dynamics.begin(length)
     return problem.attempt()
