@@ -11,7 +11,7 @@ from helpers import box, lawful
 
 import uem_dolfinx as uem
 from uem_dolfinx import forms
-from uem_dolfinx.solve import floating
+from uem_dolfinx.solve import rigid_steps
 from uem_dolfinx.solve.rigid_steps import least_motion
 
 RADIUS, GAP, WEIGHT = 0.5, 0.05, 1e-4
@@ -52,7 +52,7 @@ def test_heap_comes_to_rest_in_few_steps(monkeypatch):
     n = 4
     f, problem, places, width, _ = heap(3, 3, n)
     counted, solved = [], []
-    monkeypatch.setattr(floating, "least_motion", lambda *programme: solved.append(None) or least_motion(*programme))
+    monkeypatch.setattr(rigid_steps, "least_motion", lambda *programme: solved.append(None) or least_motion(*programme))
     place = problem.system.place
     problem.system.floating.begin_step(lambda: counted.append(None) or place())
     assert len(counted) == len(solved) <= 20

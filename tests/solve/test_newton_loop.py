@@ -52,8 +52,11 @@ class OneUnknown:
     def strain_rounding(self):
         return 0.0
 
-    def place(self, returning):
+    def place(self):
         pass
+
+    def return_to_targets(self, bound):
+        return False
 
     def assemble_constraints(self, in_equilibrium):
         R, rows = vector(self.F()), SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))

@@ -28,6 +28,10 @@ from uem_dolfinx.parallel import agree, reduced
 if TYPE_CHECKING:
     from uem_dolfinx.contact.sliding import Sliding
 
+#: Contactors this part of the model's size from where they belong are there.
+#: [derived; the model's size; test_system.py::test_the_normal_return]
+POSITION_ROUNDING = 4.0 * np.finfo(float).eps
+
 
 class Interface:
     """Contactors against one target.
@@ -143,14 +147,17 @@ class Interface:
         """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
         return self.kinematics.movable
 
-    def return_to_target(self) -> None:
-        """Normal return [UEM, 4.2]: put the contactors that bear a force back onto the moved target (collective)."""
+    def return_vectors(self) -> Array:
+        """Displacements that put active contactors back onto the moved target, zero where they are there to rounding ``(n, gdim)``."""
         correction = self.kinematics.return_vectors(self.trial)
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
-        correction[self.trial.lam <= 0.0] = 0.0
-        self.config.displacement[self.nodes] += correction
-        self._replace(self.kinematics.returned(self.points, self.trial))
+        correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
+        return correction
+
+    def return_to_target(self) -> None:
+        """Normal return [UEM, 4.2], to be followed by ``project``."""
+        self.config.displacement[self.nodes] += self.return_vectors()
 
     @property
     def n_active(self) -> int:

@@ -133,9 +133,6 @@ class Kinematics(Protocol):
     def placed_again(self, state: PairState) -> Kinematics:
         """At the same points in another state (collective)."""
 
-    def returned(self, points: Array, state: PairState) -> Kinematics:
-        """After the normal return to ``points (n, gdim)`` (collective)."""
-
     def follow(self, state: PairState) -> tuple[Kinematics, PairState, bool]:
         """Follow contactors from facet to facet, into corners and out of them: whether equations change here (collective)."""
 

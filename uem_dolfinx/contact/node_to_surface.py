@@ -188,14 +188,6 @@ class NodalKinematics:
         there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
         return self.of.measured(there, state)
 
-    def returned(self, points: Array, state: PairState) -> NodalKinematics:
-        """After the normal return to ``points`` (collective)."""
-        if self.of.target.averaged:
-            # the foot moves when the way leans
-            return self.of.place(points, state)
-        gap = self.projection.gap + np.einsum("ng,ng->n", points - self.points, self.projection.normal)
-        return self.of.measured(replace(self, points=points, projection=self.projection.with_gap(gap), gap=gap), state)
-
     def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
         """Follow contactors across bends, into corners and out of them (collective)."""
         if self.of.valleys is None:

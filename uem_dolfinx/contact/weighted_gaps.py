@@ -135,10 +135,6 @@ class MortarKinematics:
         """No equation depends on the state."""
         return self
 
-    def returned(self, points: Array, state: PairState) -> MortarKinematics:
-        """Nothing is returned."""
-        return self
-
     def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
         """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
 

@@ -56,6 +56,7 @@ class ArcLength:
         self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
         self.accelerate, self.forget = self._system.accelerate, self._system.forget
         self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
+        self.return_to_targets = self._system.return_to_targets
 
     def begin(self, factor: float, direction: Array, length: float) -> None:
         """Begin a step.
@@ -83,11 +84,11 @@ class ArcLength:
         """How much further the displacement has to go (collective)."""
         return self._length - self._along(self._bodies.displacement().array_r - self._start.array_r)
 
-    def place(self, returning: bool) -> None:
+    def place(self) -> None:
         """Project the contactors of displaced bodies, whose load factor has changed with the displacement."""
         self._set(self.factor + self._change)
         self._change = 0.0
-        self._system.place(returning)
+        self._system.place()
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong; the state is closed if the arc has its length, too."""

@@ -152,8 +152,15 @@ class ContactMethod(Protocol):
     def begin_step(self) -> None:
         """Begin a step, before the loop."""
 
-    def place(self, returning: bool) -> None:
-        """Project the contactors; when returning, put back onto their targets those whose rows are not the gradients of their gaps."""
+    def place(self) -> None:
+        """Project the contactors where bodies and targets are now."""
+
+    def return_to_targets(self, bound: float) -> bool:
+        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets, unless that makes forces of a norm above ``bound``.
+
+        Returns:
+            Whether any has been moved, by more than rounding of positions; contactors are projected again then.
+        """
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
@@ -189,7 +196,7 @@ class ContactMethod(Protocol):
         """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``."""
 
     def end_step(self) -> None:
-        """End a step in which the loop has converged: put contactors back onto their targets [UEM, 4.2]; may refuse it."""
+        """End a step in which the loop has converged; may refuse it."""
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with, in dynamics."""
@@ -240,7 +247,7 @@ def solve_united(
     def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
         return norm <= max(rtol * max(scale, start), rounding_of_all(rounding, 1))
 
-    method.place(returning=False)
+    method.place()
     if not bodies.assemble():
         raise NotFiniteError(
             "the residual is not finite at the start of the step: "
@@ -253,6 +260,10 @@ def solve_united(
             # a displacement that comes back to nothing keeps the rounding of what it was
             start, left = state.norm, min(state.rounding, rtol * forces_before)
         forces = max(state.scale, start)
+        if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * forces):
+            bodies.assemble()
+            with _told(history):
+                state = method.assemble_constraints(in_equilibrium)
         steady = state.right and not state.changed
         stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
         norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
@@ -385,7 +396,7 @@ def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increm
     bodies.displace(start, step.du, length)
     if bodies.inverted() is not None:
         return False
-    method.place(returning=length == 1.0)
+    method.place()
     return bodies.assemble()
 
 

@@ -6,7 +6,7 @@ It implements ``newton.ContactMethod`` by elimination, and leaves load steps and
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -90,8 +90,8 @@ class BodySystem:
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
-    def place(self, returning: bool = False) -> None:
-        """Project the contactors; when returning, put back those that follow averaged normals, whose rows are not gradients of gaps."""
+    def place(self) -> None:
+        """Project the contactors where bodies and targets are now."""
         if not self.pairs:
             return
         self._here = None
@@ -99,21 +99,26 @@ class BodySystem:
         with timed("search and projection"):
             for pair in self.pairs:
                 pair.project()
-            if returning:
-                self._return_to_targets(lambda pair: pair.target.averaged)
 
-    def _return_to_targets(self, which: Callable[[Interface], bool]) -> None:
-        """Normal return [UEM, 4.2]: put the active contactors of some pairs back onto the moved targets (collective)."""
-        returning = [(k, pair) for k, pair in enumerate(self.pairs) if which(pair)]
-        for k, pair in returning:
+    def return_to_targets(self, bound: float) -> bool:
+        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets (collective); see ``ContactMethod``."""
+        # surfaces that follow each other would both make up for the same gap
+        pairs = [pair for pair, mutual in zip(self.pairs, self.over_constraints.mutual) if not mutual]
+        if not pairs:
+            return False
+        assert self.bodies.stiffness is not None
+        made = [self.bodies.stiffness[pair.nodes] * pair.return_vectors() for pair in pairs]
+        disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
+        if not 0.0 < disturbance <= bound:
+            return False
+        for k, pair in enumerate(pairs):
             if self.over_constraints.shared and k > 0:
                 # what another pair has returned is returned
                 pair.project()
-            # surfaces that follow each other would both make up for the same gap
-            if not self.over_constraints.mutual[k]:
-                pair.return_to_target()
-        if returning:
-            self.bodies.u.x.scatter_forward()
+            pair.return_to_target()
+        self.bodies.u.x.scatter_forward()
+        self.place()
+        return True
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
@@ -128,13 +133,12 @@ class BodySystem:
             touch_ahead(self.bodies, self.pairs, self.floating.rigid, place)
 
     def end_step(self) -> None:
-        """Refuse an equilibrium that contacts and conditions do not agree about, or one of several; return to the targets (collective)."""
+        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
         self.floating.end_step()
         if self._not_unique is not None:
             self._refuse_one_of_several(self._not_unique)
-        self._return_to_targets(lambda pair: True)
 
     def _refuse_one_of_several(self, state: BodyState) -> None:
         """Refuse an equilibrium between which and that without friction the united matrix was singular (collective)."""

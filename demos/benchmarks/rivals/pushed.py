@@ -83,12 +83,16 @@ class PushedSystem(ABC):
         self.made_of = None
         self.solver.forget()
 
-    def place(self, returning: bool = False) -> None:
+    def place(self) -> None:
         """Project the contactors."""
         if self.pairs:
             self.bodies.check_displacement()
             for pair in self.pairs:
                 pair.project()
+
+    def return_to_targets(self, bound: float) -> bool:
+        """None is put back."""
+        return False
 
     def restriction(self) -> Restriction:
         """P of the Dirichlet conditions alone."""
