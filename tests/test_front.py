@@ -319,9 +319,7 @@ def test_a_line_a_step(caplog):
     """At level INFO the log of a batch run has a line for each step, with the contacts' forces; at WARNING it has none."""
     b = blocks(COMM, "quadrilateral", 2, 5)
     contact = uem.Contact(b.high, b.low)
-    problem = uem.UnitedProblem(
-        linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=b.oedometer(0.02), contacts=[contact], verbose=False
-    )
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=b.oedometer(0.02), contacts=[contact])
     forces = []
     with caplog.at_level("INFO", logger="uem_dolfinx"):
         for step in uem.load_steps(problem, 2):

@@ -20,8 +20,8 @@ The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, a
 
 1. Unite: the normal displacement of each active contactor follows the target: ``contact.node_to_surface`` and
    ``contact.bernstein``, or ``contact.mortar``, write the equations, ``algebra.restriction`` builds P and c from them.
-2. Solve the united system (``algebra.linear_solver``); at the end of a step return each contactor along the normal onto the moved
-   target (``contact.interface``, with projections from ``geometry``).
+2. Solve the united system (``algebra.linear_solver``); once forces are in equilibrium, return each contactor along the normal onto the
+   moved target (``contact.interface``, with projections from ``geometry``).
 3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.system``.
 4. Activate contactors that have gone through, release those that pull (``contact.active_set``), iterate (``solve.newton``).
 

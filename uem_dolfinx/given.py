@@ -115,7 +115,7 @@ def word(what: str, value: Any, known: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in known:
         some = " or ".join(filter(None, [", ".join(map(repr, known[:-1])), repr(known[-1])]))
         error = InputError if isinstance(value, str) else InputTypeError
-        raise error(sentence(what, value, f"one of {some}", did_you_mean(value, known)))
+        raise error(sentence(what, value, f"one of {some}", did_you_mean(value, known) if isinstance(value, str) else ""))
     return value
 
 

@@ -133,7 +133,7 @@ class Coated(NodeToSurface):
     def place(self, points, state):
         """Gaps from the coating's surface."""
         k = super().place(points, state)
-        p = k.projection.with_gap(k.projection.gap - self.thickness_of_coating)
+        p = replace(k.projection, gap=k.projection.gap - self.thickness_of_coating)
         return replace(k, projection=p, gap=p.gap)
 
 

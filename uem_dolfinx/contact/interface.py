@@ -148,16 +148,12 @@ class Interface:
         return self.kinematics.movable
 
     def return_vectors(self) -> Array:
-        """Displacements that put active contactors back onto the moved target, zero where they are there to rounding ``(n, gdim)``."""
+        """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
         correction = self.kinematics.return_vectors(self.trial)
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
         correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
         return correction
-
-    def return_to_target(self) -> None:
-        """Normal return [UEM, 4.2], to be followed by ``project``."""
-        self.config.displacement[self.nodes] += self.return_vectors()
 
     @property
     def n_active(self) -> int:

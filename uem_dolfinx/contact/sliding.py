@@ -139,9 +139,9 @@ class Sliding:
 
     def return_vectors(self, state: PairState) -> Array:
         """Displacements along the target that put contactors that stick back to their anchors ``(n, gdim)``."""
-        return -np.where(self._anchored(state)[:, None], friction.along(self.frame.free_tangents, self.frame.away), 0.0)
+        return -np.where(self._at_anchors(state)[:, None], friction.along(self.frame.free_tangents, self.frame.away), 0.0)
 
-    def _anchored(self, state: PairState) -> Bools:
+    def _at_anchors(self, state: PairState) -> Bools:
         """Contactors that stick to a point of the target and are free to follow it ``(n,)``."""
         stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
         return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
@@ -411,7 +411,7 @@ class Sliding:
         tau = np.where(held[:, None], friction_in(kinematics.corners, state, committed.facet, slope) * share, f.tau)
         # a contactor that changes facets slides over both
         # one that has stuck all along is where its anchor is, whatever rounding says
-        stuck = (self._anchored(state) & self._anchored(committed))[:, None]
+        stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
         slipped = f.slipped + np.where(held[:, None], end, np.where(self.slipping(state)[:, None], self.frame.slip / share, 0.0))
         taken = friction.work(_of(committed).tau, tau, start, end, held)

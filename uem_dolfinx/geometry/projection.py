@@ -56,9 +56,6 @@ class Projection(Protocol):
     def turnings(self, which: Ints, s: Array) -> Array:
         """Derivative of the rows along tangents ``s (k, gdim)``, which turn with the normal ``(k, (1 + nn) g, (1 + nn) g)``."""
 
-    def with_gap(self, gap: Array) -> Projection:
-        """The same projection of points that have moved along the normal."""
-
 
 class Target(Protocol):
     """Anything that points can be projected onto, meshed or rigid.
@@ -142,10 +139,6 @@ class FacetProjection:
     def facet_size(self) -> Array:
         """Length of a side of each facet ``(n,)``."""
         return np.linalg.norm(self.x[:, 0] - self.x[:, 1], axis=1)
-
-    def with_gap(self, gap: Array) -> FacetProjection:
-        """The same projection of points that have moved along the normal."""
-        return replace(self, gap=gap)
 
     def with_rows(self, which: Ints, values: Mapping[str, Array | float]) -> FacetProjection:
         """Copy with some fields replaced at some points."""

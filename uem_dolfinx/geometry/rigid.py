@@ -85,10 +85,6 @@ class RigidProjection:
         """There is no end."""
         return np.full(len(self.gap), np.inf)
 
-    def with_gap(self, gap: Array) -> RigidProjection:
-        """The same projection of points that have moved along the normal."""
-        return replace(self, gap=gap)
-
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap ``(k, gdim, gdim)``."""
         return self.shape_operator[which]
@@ -147,7 +143,7 @@ class RigidSurface:
         """Its kind, and where its reference point is now."""
         if self.motion is None and self._reference is None:
             return f"{type(self).__name__}({self.name!r})"
-        at = self.reference(self.gdim or len(self.motion.about if self.motion is not None else ()))
+        at = self.reference(self.gdim or 0)
         return f"{type(self).__name__}({self.name!r} at ({', '.join(f'{x:.6g}' for x in at)}))"
 
     def move(

@@ -107,30 +107,32 @@ class BodySystem:
         if not pairs:
             return False
         assert self.bodies.stiffness is not None
-        made = [self.bodies.stiffness[pair.nodes] * pair.return_vectors() for pair in pairs]
+        ways = [pair.return_vectors() for pair in pairs]
+        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(pairs, ways)]
         disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
         if not 0.0 < disturbance <= bound:
             return False
-        for k, pair in enumerate(pairs):
+        for k, (pair, way) in enumerate(zip(pairs, ways)):
             if self.over_constraints.shared and k > 0:
                 # what another pair has returned is returned
                 pair.project()
-            pair.return_to_target()
+                way = pair.return_vectors()
+            self.config.displacement[pair.nodes] += way
         self.bodies.u.x.scatter_forward()
         self.place()
         return True
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
-        self._not_unique, self._led, place = None, False, self.place
+        self._not_unique, self._led = None, False
         self.exchanges.begin_step()
         for pair in self.pairs:
             pair.discretisation.begin_step()
             if pair.sliding == "small":
                 pair.project()
-        self.floating.begin_step(place)
+        self.floating.begin_step(self.place)
         if self.bodies.dynamics is None and self.floating.motions is None:
-            touch_ahead(self.bodies, self.pairs, self.floating.rigid, place)
+            touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
@@ -198,7 +200,7 @@ class BodySystem:
                 for pair in pairs:
                     pair.place_again()
                 moved = True
-            fallen = self.floating.fall_again(lambda: self.place(), unsettled, at_rest)
+            fallen = self.floating.fall_again(self.place, unsettled, at_rest)
             if moved or fallen:
                 rows = self._rows()
                 residual = rows.test.transpose(self._residual())
