@@ -33,6 +33,8 @@ KEPT_CHANGES = 0.1
 #: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
 #: [convention; ratio of iterations; test_linear_solver.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
+#: What takes the place of types for symmetric matrices.
+UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 
 
 class UnitedSolver:
@@ -266,13 +268,13 @@ class UnitedSolver:
             return
         self._symmetric = symmetric
         pc, before = self.pc, self.pc.getType()
-        if symmetric:
-            self.ksp.setType(self._types[0])
-            pc.setType(self._types[1])
-        else:
-            self._types = self.ksp.getType(), before
-            self.ksp.setType({"cg": "gmres", "minres": "gmres"}.get(self._types[0], self._types[0]))
-            pc.setType({"cholesky": "lu", "icc": "ilu"}.get(before, before))
+        self._types = self._types if symmetric else (self.ksp.getType(), before)
+        ksp_type, pc_type = self._types if symmetric else (UNSYMMETRIC.get(kind, kind) for kind in self._types)
+        self.ksp.setType(ksp_type)
+        if ksp_type != self._types[0] or symmetric:
+            # what GMRES leaves is measured as a force, not through a preconditioner: P'KP is nearly singular where all slip
+            self.ksp.setPCSide(PETSc.PC.Side.LEFT if symmetric else PETSc.PC.Side.RIGHT)
+        pc.setType(pc_type)
         # the others have options of their own; one that stays is not shown its options again: hypre would lose what it has set up
         reader = pc
         if pc.getType() == before:
@@ -371,8 +373,7 @@ class UnitedSolver:
             raise LinearSolveError("the united problem is singular: hold free bodies by Dirichlet conditions, or make them touch")
         self._condensed.whole = True
         if self._served is not None:
-            found = self._kept.solve(*self._served, rhs, accuracy) if accuracy > 0 else None
-            if found is not None:
+            if accuracy > 0 and (found := self._kept.solve(*self._served, rhs, accuracy)) is not None:
                 return found
             self._kept.drop()
             self._of = None
@@ -384,6 +385,7 @@ class UnitedSolver:
         self.ksp.setInitialGuessNonzero(guess is not None)
         if self.inexact:
             self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
+        kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
         try:
             if self._new:
                 with timed("factorisation or preconditioner set-up"):
@@ -391,7 +393,6 @@ class UnitedSolver:
             with timed("linear solve"), self._in_database():
                 self.ksp.solve(rhs, dq)
         except PETSc.Error as error:
-            kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
             if error.ierr in NO_SUCH_TYPE:
                 raise InputError(
                     f"PETSc cannot do with petsc_options = {given.shown(self.options)}, {kinds}: {last_words(error)}; choose others"
@@ -411,9 +412,8 @@ class UnitedSolver:
             return dq, iterations + more
         if reason < 0 or not (self.iterative or np.isfinite(dq.norm())):
             raise LinearSolveError(
-                f"the united solve with {self.ksp.getType()} and {self.pc.getType()} failed with KSP reason {reason} after "
-                f"{iterations} iterations{mumps.how_it_ended(self.pc)}: a body may be free to move as a rigid body, the tangent may be "
-                "indefinite (use a direct solver), or ksp_max_it too small"
+                f"the united solve with {kinds} failed, KSP reason {reason}, after {iterations} iterations{mumps.how_it_ended(self.pc)}: "
+                "a body may be free to move as a rigid body, the tangent may be indefinite (use a direct solver), or ksp_max_it too small"
             )
         self._keep_pace(iterations)
         if self._factor_of is not None:

@@ -375,7 +375,7 @@ class Sliding:
         i = np.flatnonzero(self.slipping(state))
         across, stiffness, part = self._turning(state, kinematics)
         nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
-        k, m, g = *share.shape, self.config.gdim
+        (k, m), g = share.shape, self.config.gdim
         blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, moved, across).reshape(k, m * g, m * g)
         forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self.pivot.tau[i]).reshape(k, m * g)
         return nodes, blocks, forces
