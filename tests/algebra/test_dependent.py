@@ -325,19 +325,3 @@ def test_contactor_of_two_pairs(overlap):
     exact = -0.005 * (x[:, 1] + 1)
     assert highest(COMM, np.abs(problem.config.displacement[:, 1] - exact)) < 1e-14
     assert sum(c.resultant().force[1] for c in contacts) == pytest.approx(2 * 0.005 * M, rel=1e-10)
-
-
-def test_ring_of_three_surfaces_is_refused():
-    """Three surfaces at one place that follow each other in a ring have no order of elimination."""
-    cell = "triangle"
-    bodies = [box(cell, [0.0, -1.0], [1.0, 0.0], [2, 2]), box(cell, [0.0, 0.0], [1.0, 1.0], [3, 2]),
-              box(cell, [0.0, 0.0], [1.0, 0.5], [2, 1])]  # fmt: skip
-    s = scene(COMM, cell, bodies)
-    V = compat.function_space(s.mesh, 1, (2,))
-    u = fem.Function(V)
-    a, b, c = s.tag("a", 0, at(1, 0.0)), s.tag("b", 1, at(1, 0.0)), s.tag("c", 2, at(1, 0.0))
-    contacts = [uem.Contact(b, a), uem.Contact(c, b, max_penetration=9.0), uem.Contact(a, c)]
-    bcs = [*clamp(V, s.tag("bottom", 0, at(1, -1.0))), *clamp(V, s.tag("top", 1, at(1, 1.0)), value=[0.0, -0.01])]
-    problem = uem.UnitedProblem(linear(u, modulus(s, 1.0, 1.0, 1.0)), u, bcs=bcs, contacts=contacts)
-    with pytest.raises(uem.ConflictError, match="follows itself"):
-        run(problem)

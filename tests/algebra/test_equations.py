@@ -22,9 +22,9 @@ def test_what_a_condition_leaves_of_a_normal(part, enough):
 
 @pytest.mark.parametrize("size, rounding", [(3e-13, True), (3e-12, False)])
 def test_coefficients_that_are_rounding(size, rounding):
-    """They neither close a circle of equations nor make a new P."""
-    circle = [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)]
-    r = united(triangles(2), circle, coefficient=size)
-    assert r.chain == (1 if rounding else 2) and r.circular != rounding
-    prints = {united(triangles(2), circle[:1], coefficient=c).fingerprint(values=True) for c in (0.5, 0.5 + size)}
+    """They neither close a ring of equations nor make a new P."""
+    ring = [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)]
+    r = united(triangles(2), ring, coefficient=size)
+    assert r.chain == 1 and (r.rings is None) == rounding
+    prints = {united(triangles(2), ring[:1], coefficient=c).fingerprint(values=True) for c in (0.5, 0.5 + size)}
     assert len(prints) == (1 if rounding else 2)

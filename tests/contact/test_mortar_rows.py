@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from mortar_scenes import Blocks, disturbed
 
-from uem_dolfinx.algebra.restriction import FADED, MOST_ROUND
 from uem_dolfinx.contact.duals import basis_of
-from uem_dolfinx.contact.mortar_rows import without_circles
 from uem_dolfinx.geometry.shapes import facet_shape
 
 
@@ -82,22 +80,3 @@ def test_rows_do_not_depend_on_who_is_active(cell):
         assert (made.active == pair.trial.active).all()
         for name in ("node", "direction", "gap", "row", "followed", "coefficients"):
             assert np.array_equal(getattr(made, name), getattr(first, name))
-
-
-def test_circles_are_broken_where_they_are():
-    """Contactors in circles lose their turned rows, the larger ones first; one that a third of what is left leads along keeps its own."""
-    parts = np.zeros((7, 7))
-    # two circles, of which the second leaves 0.3 of what the first does; the fifth follows the first one, the others nobody for long
-    parts[0, 1] = parts[1, 0] = 1.0
-    parts[2, 3] = parts[3, 2] = 0.3 ** (1.0 / MOST_ROUND)
-    parts[4, 0], parts[5, 6] = 0.3, 1.0
-    asked = []
-
-    def left(turned):
-        asked.append(turned)
-        assert len(asked) <= 10
-        return np.linalg.matrix_power(np.where(np.outer(turned, turned), parts, 0.0), MOST_ROUND) @ np.ones(7)
-
-    kept = without_circles(left, np.ones(7, bool), MPI.COMM_SELF)
-    assert list(kept) == [False] * 4 + [True] * 3 and len(asked) == 3
-    assert left(kept).max() <= FADED

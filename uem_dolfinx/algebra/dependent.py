@@ -4,7 +4,7 @@ Most equations eliminate the normal component of their own contactor, whatever t
 
 - the contactor's normal is prescribed, so that a component of the target must go instead;
 - several equations of one node have dependent directions, as where two targets lie in one plane;
-- two surfaces are contactor and target of each other (two-pass), and each follows the other.
+- equations follow each other in a ring, and depend on each other, as where two surfaces are contactor and target of each other.
 
 These are solved for one component each by Gauss-Jordan elimination with pivoting, in the order of their largest coefficients.
 Rows that depend on others end as zeros and are left out: what they ask for holds already, or nothing could make it hold.
@@ -15,19 +15,13 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, replace
 
-from mpi4py import MPI
-
 import numpy as np
 
-from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left, send
+from uem_dolfinx.algebra.rings import DEPENDENT, components
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
-from uem_dolfinx.parallel import Exchange, gathered, reduced
-
-#: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
-#: do so only to the first order of their strain.
-#: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
-DEPENDENT = 0.05
+from uem_dolfinx.parallel import gathered, reduced
 
 
 @dataclass(frozen=True)
@@ -75,13 +69,13 @@ class Group:
 class IndependentEquations:
     """Independent equations in place of conflicting ones, and the forces of the given ones from theirs (collective).
 
-    Conflicting equations are solved together on one rank; all others stay where they are.
+    Conflicting equations that share nodes are solved together on the rank that has most of them; all others stay where they are.
 
     Args:
         space: the nodes whose components are restricted.
         equations: of this rank's contactors.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, block)``.
-        mutual: equations of surfaces that are contactor and target of each other ``(m,)``.
+        ring: equations that follow each other in rings and depend on each other ``(m,)``; None for none.
 
     Attributes:
         equations: the independent ones.
@@ -90,17 +84,18 @@ class IndependentEquations:
         found: whether any equations on any rank conflict.
     """
 
-    def __init__(self, space: Nodes, equations: UnitingEquations, free: Bools, mutual: Bools):
+    def __init__(self, space: Nodes, equations: UnitingEquations, free: Bools, ring: Bools | None = None):
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
         self.undetermined: Bools = self.redundant
-        conflicting = equations.active & (mutual | _cannot_eliminate(equations, free))
-        counts = gathered(space.comm, int(conflicting.sum()))
-        self.found = bool(counts.any())
+        conflicting = equations.active & _cannot_eliminate(equations, free)
+        if ring is not None:
+            conflicting |= ring
+        self.found = bool(reduced(space.comm, int(conflicting.any())))
         self.equations = equations
         if not self.found:
             return
         self._conflicting = _with_neighbours(space, equations, conflicting)
-        self._space, self._rank = space, int(np.argmax(counts))
+        self._space, self._rank = space, _ranks_of_groups(space, equations, self._conflicting)
         self._groups = _solve(space, self._gather(equations), free)
         self._scatter(equations)
 
@@ -129,16 +124,24 @@ class IndependentEquations:
         """The conflicting ones of these equations from all ranks, of global nodes, on the rank that solves them (collective)."""
         mine = equations.select(self._conflicting)
         mine = replace(mine, node=self._space.to_global(mine.node))
-        together, self._gathered = _send(self._space.comm, mine, np.full(len(mine), self._rank))
+        together, self._gathered = send(self._space.comm, mine, self._rank)
         return together
 
     def _scatter(self, equations: UnitingEquations) -> None:
         """Take the groups' independent equations in place of the conflicting ones, each on the rank that has its node (collective)."""
         space = self._space
         independent = UnitingEquations.join([group.independent for group in self._groups], space.block)
-        solved, self._scattered = _send(space.comm, independent, space.owner_of(independent.node))
+        solved, self._scattered = send(space.comm, independent, space.owner_of(independent.node))
         solved = replace(solved, node=(solved.node - space.index_map.local_range[0]).astype(np.int32))
         self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], space.block)
+
+    def of_given(self, of_independent: Bools) -> Bools:
+        """Marks of the equations that stayed as they were, in their places among the given ones ``(m,)``."""
+        if not self.found:
+            return of_independent
+        given = np.zeros(len(self._conflicting), dtype=bool)
+        given[~self._conflicting] = of_independent[: int((~self._conflicting).sum())]
+        return given
 
     def forces(self, multipliers: Array) -> Array:
         """Contact forces of the given equations from ``multipliers``, those of ``equations`` in their order (collective)."""
@@ -156,19 +159,6 @@ class IndependentEquations:
         given[~self._conflicting] = multipliers[:n]
         given[self._conflicting], self.redundant[self._conflicting] = self._gathered.back(lam, redundant)
         return given
-
-
-def _send(comm: MPI.Comm, equations: UnitingEquations, rank: Ints) -> tuple[UnitingEquations, Exchange]:
-    """The equations of global nodes that all ranks send here, each to one ``rank (m,)``, with their terms (collective)."""
-    exchange, order = Exchange.to(comm, rank), np.argsort(equations.row, kind="stable")
-    node, direction, gap, active, n_terms = exchange.send(
-        equations.node.astype(np.int64), equations.direction, equations.gap, equations.active,
-        np.bincount(equations.row, minlength=len(equations)),
-    )  # fmt: skip
-    terms = Exchange.to(comm, rank[equations.row[order]])
-    followed, coefficients = terms.send(equations.followed[order], equations.coefficients[order])
-    row = np.repeat(np.arange(len(node)), n_terms)
-    return UnitingEquations(node, direction, gap, active, row, followed, coefficients), exchange
 
 
 def _solve(space: Nodes, rows: UnitingEquations, free: Bools) -> list[Group]:
@@ -215,6 +205,18 @@ def _with_neighbours(space: Nodes, equations: UnitingEquations, conflicting: Boo
         conflicting |= more
         if not reduced(space.comm, int(more.any())):
             return conflicting
+
+
+def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Bools) -> Ints:
+    """The rank that solves each of the conflicting equations, the same for all that share nodes (collective)."""
+    mine, counts = np.flatnonzero(conflicting), gathered(space.comm, len(equations))
+    number, total = mine + int(counts[: space.comm.rank].sum()), int(counts.sum())
+    terms = np.flatnonzero(conflicting[equations.row])
+    place = np.searchsorted(mine, equations.row[terms])
+    row = np.concatenate([number, number[place]])
+    node = np.concatenate([space.to_global(equations.node[mine]), equations.followed[terms]])
+    label, rank = components(space.comm, np.stack([row, total + node], axis=1), number, strong=False)
+    return rank[label]
 
 
 def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints) -> Group:

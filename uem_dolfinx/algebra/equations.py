@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.parallel import Exchange
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
 #: [convention; part of the direction's length; test_equations.py::test_what_a_condition_leaves_of_a_normal]
@@ -91,3 +94,16 @@ def least_left(A: Array) -> Array:
     if A.shape[1] > A.shape[2]:
         return np.zeros(len(A))
     return np.asarray(np.linalg.svd(A, compute_uv=False)[:, -1])
+
+
+def send(comm: MPI.Comm, equations: UnitingEquations, rank: Ints) -> tuple[UnitingEquations, Exchange]:
+    """The equations of global nodes that all ranks send here, each to one ``rank (m,)``, with their terms (collective)."""
+    exchange, order = Exchange.to(comm, rank), np.argsort(equations.row, kind="stable")
+    node, direction, gap, active, n_terms = exchange.send(
+        equations.node.astype(np.int64), equations.direction, equations.gap, equations.active,
+        np.bincount(equations.row, minlength=len(equations)),
+    )  # fmt: skip
+    terms = Exchange.to(comm, rank[equations.row[order]])
+    followed, coefficients = terms.send(equations.followed[order], equations.coefficients[order])
+    row = np.repeat(np.arange(len(node)), n_terms)
+    return UnitingEquations(node, direction, gap, active, row, followed, coefficients), exchange

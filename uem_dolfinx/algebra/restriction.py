@@ -10,8 +10,8 @@ Every equation eliminates one component of a node in a frame rotated to its dire
     du = T dq + M du + d    so    P = (1 + M + M^2 + ...) T,    c = (1 + M + M^2 + ...) d
 
 T rotates each node's free components, M lets an eliminated component follow other nodes, d closes gaps and carries prescribed
-increments. The powers of M end after as many terms as bodies are stacked upon each other. Where equations follow each other in
-circles, by a small part each, they fade, and end where they are rounding.
+increments. The powers of M end after as many terms as bodies are stacked upon each other; equations that follow each other in rings
+are closed first.
 """
 
 from __future__ import annotations
@@ -26,17 +26,11 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.blocks import Blocks, product, rows_at, summed, together
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
+from uem_dolfinx.algebra.rings import Rings
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Halo, Nodes
 from uem_dolfinx.parallel import agree, gathered, reduced
-
-#: Equations may follow each other in circles if what has gone through so many of them is rounding.
-#: [convention; number of equations; test_restriction.py::test_circles_that_fade]
-MOST_ROUND = 32
-#: Parts of a unit displacement below it are rounding.
-#: [derived; directions of length one; test_restriction.py::test_circles_that_fade]
-FADED = np.finfo(float).eps
 
 
 class Restriction:
@@ -51,7 +45,8 @@ class Restriction:
         like: restriction of the same equations in other directions, whose components are eliminated and whose unknowns kept.
 
     Raises:
-        ConflictError: if the equations leave a node no free component to eliminate, or follow each other in a circle that does not fade.
+        ConflictError: if the equations leave a node no free component to eliminate.
+        DependentRingError: if they follow each other in a ring and depend on each other.
     """
 
     def __init__(
@@ -79,17 +74,28 @@ class Restriction:
         #: Columns of P that are in use ``(n_owned, block)``.
         self.used: Bools = free.copy()
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
+        self.rings: Rings | None = None
+        self._hold(equations, prescribed)
+        #: The number of terms with M in the series of P and c.
+        self.chain = 1 if self.n_equations else 0
+        if self.n_equations and stacked:
+            self.chain, endless = self._longest_chain()
+            if endless is not None:
+                self.rings = Rings(space, equations, self.lift, endless)
+                self._hold(self.rings.equations, prescribed)
+                self.chain, _ = self._longest_chain()
+
+    def _hold(self, equations: UnitingEquations, prescribed: Array) -> None:
+        """Take the equations, which eliminate what they are known to, and what closes their gaps (collective)."""
+        self.equations = equations
         closure = np.array(prescribed)
         known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
         np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
-        self.d = space.vector(closure)
+        self.d = self.space.vector(closure)
         #: Terms of the equations that hold, which are those of M, and the nodes that they follow.
         self._held = equations.select(equations.active)
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
-        self._halo = Halo(space, self._follows) if self._n_rows else None
-        #: Whether equations follow each other in circles, and the number of terms with M in the series of P and c.
-        self.circular = False
-        self.chain = 0 if self.n_equations == 0 else self._longest_chain() if stacked else 1
+        self._halo = Halo(self.space, self._follows) if self._n_rows else None
 
     @property
     def alone(self) -> bool:
@@ -146,13 +152,10 @@ class Restriction:
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=sizes[0][0]))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
 
-    def _longest_chain(self) -> int:
-        """How many equations follow one another from node to node, till they end or what is left is rounding (collective).
+    def _longest_chain(self) -> tuple[int, PETSc.Mat | None]:
+        """How many equations follow one another from node to node, and which follow which if that has no end (collective).
 
         An equation follows another if its terms have a part in what the other eliminates of a node; what that leaves free ends a chain.
-
-        Raises:
-            ConflictError: if they neither end nor fade.
         """
         g, eq = self.space.block, self.equations
         m, k = len(eq), np.arange(g)
@@ -163,18 +166,16 @@ class Restriction:
         eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
         on = self.space.ask_owners(eq.followed, eliminated)[:, 0] > 0
         if not reduced(self.comm, int(on.any())):
-            return int(sizes[1] > 0)
+            return int(sizes[1] > 0), None
         terms = np.broadcast_to(eq.row[on, None], (on.sum(), g)), eq.followed[on, None] * g + k, eq.coefficients[on]
         own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift
         C = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in terms)), (sizes, self._sizes[1]))
         L = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in own)), (self._sizes[0], sizes))
-        path = C.matMult(L)
-        indptr, columns, values = path.getValuesCSR()
-        follows = path.duplicate()
-        for matrix, entries in ((path, np.abs(values)), (follows, (np.abs(values) > NEGLIGIBLE).astype(float))):
-            matrix.setValuesCSR(indptr, columns, entries)
-            matrix.assemble()
-        at = path.createVecRight()
+        follows = C.matMult(L)
+        indptr, columns, values = follows.getValuesCSR()
+        follows.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
+        follows.assemble()
+        at = follows.createVecRight()
         at.set(1.0)
         length, left, before = 0, at.sum(), np.inf
         # equations from which a path of so many leads; if none of them drops out, it has no end
@@ -182,30 +183,7 @@ class Restriction:
             at, length, before = follows * at, length + 1, left
             at.array[:] = at.array_r > 0
             left = at.sum()
-        if left > 0.0:
-            self.circular, length = True, self._fading(path)
-        return length
-
-    def _fading(self, path: PETSc.Mat) -> int:
-        """How many equations of circles follow one another till what is left of a unit displacement is rounding (collective).
-
-        Args:
-            path: parts by which equations follow each other, positive ``(m, m)``.
-        """
-        at = path.createVecRight()
-        at.set(1.0)
-        for length in range(1, MOST_ROUND + 1):
-            at = path * at
-            if at.norm(PETSc.NormType.INFINITY) <= FADED:
-                return length
-        rows, error = np.flatnonzero(at.array_r > FADED), None
-        if len(rows):
-            error = ConflictError(
-                f"the contactor at {self.space.describe(int(self.equations.node[rows[0]]))} follows itself through its targets: "
-                "two surfaces are contactor and target of each other; drop one of the two contacts"
-            )
-        agree(self.comm, error)
-        return MOST_ROUND
+        return length, follows if left > 0.0 else None
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
@@ -221,8 +199,6 @@ class Restriction:
             terms.append(power)
             if len(terms) > self.chain:
                 return summed(together(*terms))
-            if self.circular:
-                power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
             power = product(M, rows_at(self.space, power, asked))
 
     def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
@@ -318,9 +294,10 @@ class Restriction:
         return self.reduce(self.pass_on(F))
 
     def multipliers(self, y: PETSc.Vec) -> Array:
-        """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed."""
+        """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed (collective with rings)."""
         nodal = y.array_r.reshape(-1, self.space.block)
-        return np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
+        along = np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
+        return along if self.rings is None else self.rings.forces(along)
 
     def _series(self, v: PETSc.Vec) -> PETSc.Vec:
         """``(1 + M + M^2 + ...) v`` (collective)."""

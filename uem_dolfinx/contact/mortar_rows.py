@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
-
-from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.algebra.restriction import FADED, MOST_ROUND
-from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.overlaps import Segments
-from uem_dolfinx.parallel import Exchange, reduced
+from uem_dolfinx.parallel import Exchange
 
 #: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
 #: [bound; bits; -]
 MOST_BITS = 52
-#: A contactor of which less than this part of the largest rest is left is led along by circles rather than in one.
-#: [convention; what circles leave; test_mortar_rows.py::test_circles_are_broken_where_they_are]
-LED_ALONG = 0.5
-#: Ranks tell each other what is left of circles after so many rounds, which decides nothing.
-#: [bound; rounds; -]
-ROUNDS_TOGETHER = 8
 
 
 #: Rows that terms belong to, the nodes they follow and the coefficients.
@@ -103,11 +93,10 @@ class Elimination:
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        free: components without Dirichlet condition ``(n, gdim)``.
     """
 
-    def __init__(self, config: Configuration, nodes: Indices, free: Bools):
-        self.config, self.nodes, self.free = config, nodes, free
+    def __init__(self, config: Configuration, nodes: Indices):
+        self.config, self.nodes = config, nodes
         self._place = np.full(config.n_owned, -1, dtype=np.int64)
         self._place[nodes] = np.arange(len(nodes))
         self._own = config.to_global(nodes)
@@ -123,7 +112,7 @@ class Elimination:
         """What the derivatives of the gaps add to the ``plain`` rows, since normals and weights vary, over ``scale (n,)`` (collective).
 
         Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
-        they do, or that follow others in circles which do not fade: all others can be eliminated whoever is active.
+        they do: all others can be eliminated whoever is active.
 
         Returns:
             Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.
@@ -133,10 +122,6 @@ class Elimination:
         variation = row, term, value = self.at_owners(terms, scale)
         own = np.einsum("ng,ng->n", self.of_themselves(plain, variation), plain.direction)
         kept = own[row] > 0.0
-        variation = row, term, value = row[kept], term[kept], value[kept]
-        circles = Circles(self.config, self.nodes, self.free, plain, self.derivatives(plain, variation)[0])
-        turned = np.bincount(row, minlength=len(own)) > 0
-        kept = without_circles(circles.left, turned, self.config.comm)[row]
         return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
 
     def of_themselves(self, plain: UnitingEquations, variation: Terms) -> Array:
@@ -158,74 +143,6 @@ class Elimination:
         made = with_terms(plain, (row[other], term[other], value[other]))
         gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]
         return replace(made, direction=direction / by[:, None], gap=gap, coefficients=coefficients), by
-
-
-class Circles:
-    """How contactors follow each other, some by their turned rows, the others by their plain ones, if all were active (collective).
-
-    Args:
-        config: configuration of the displacement.
-        nodes: owned contactor nodes ``(n,)``.
-        free: components without Dirichlet condition ``(n, gdim)``.
-        plain: a row of each contactor.
-        turned: the same rows with other directions and terms.
-    """
-
-    def __init__(self, config: Configuration, nodes: Indices, free: Bools, plain: UnitingEquations, turned: UnitingEquations):
-        self._comm, self._n, g = config.comm, len(nodes), config.gdim
-        at_nodes = np.zeros((config.n_owned, 2 * g))
-        for k, rows in enumerate((plain, turned)):
-            left = rows.direction * free
-            size = np.einsum("ng,ng->n", left, left)
-            at_nodes[nodes, k * g : (k + 1) * g] = left / np.where(size > 0, size, np.inf)[:, None]
-        row, followed, coefficients = (
-            np.concatenate([getattr(plain, what), getattr(turned, what)]) for what in ("row", "followed", "coefficients")
-        )
-        there = config.ask_owners(followed, at_nodes).reshape(-1, 2, g)
-        parts = np.abs(np.einsum("kg,ksg->ks", coefficients, there))
-        on = parts.any(axis=1)
-        #: Terms of plain and of turned rows, which rows they are of, and by how much they follow a plain row and a turned one.
-        self._row, self._parts, self._turned = row[on], parts[on], np.arange(len(row))[on] >= len(plain.row)
-        followed, self._place = np.unique(followed[on], return_inverse=True)
-        self._halo = Halo(config, followed)
-        self._contactor = np.zeros(config.n_owned, dtype=np.int64)
-        self._contactor[nodes] = np.arange(self._n)
-
-    def _there(self, values: AnyArray) -> AnyArray:
-        """Contactors' values ``(n,)`` where terms follow them ``(k,)`` (collective)."""
-        return np.asarray(self._halo.take(lambda nodes: values[self._contactor[nodes]])[self._place])
-
-    def left(self, turned: Bools) -> Array:
-        """What is left of a unit displacement after as many rounds as circles may take, or rounding at most ``(n,)`` (collective).
-
-        ``turned (n,)`` are the contactors with turned rows.
-        """
-        follows = np.where(self._there(turned), self._parts.max(axis=1), self._parts[:, 0])
-        follows = np.where(turned[self._row] == self._turned, follows, 0.0)
-        at: Array = np.ones(self._n)
-        for number in range(1, MOST_ROUND + 1):
-            at = np.asarray(np.bincount(self._row, follows * self._there(at), minlength=self._n), float)
-            looks = number % ROUNDS_TOGETHER == 0
-            if looks and reduced(self._comm, float(at.max(initial=0.0)), op=MPI.MAX) <= FADED:
-                break
-        return at
-
-
-def without_circles(left: Callable[[Bools], Array], turned: Bools, comm: MPI.Comm) -> Bools:
-    """The contactors of ``turned (n,)`` that may keep their turned rows: what circles leave fades (collective).
-
-    Args:
-        left: what is left where contactors have turned rows ``(n,)``, as ``Circles`` finds it.
-        turned: contactors that would have them.
-        comm: of the ranks that have the contactors.
-    """
-    while True:
-        # the plain rows' own circles are not theirs to break
-        still = np.where(turned, left(turned), 0.0)
-        most = reduced(comm, float(still.max(initial=0.0)), op=MPI.MAX)
-        if most <= FADED:
-            return turned
-        turned = turned & (still <= LED_ALONG * most)
 
 
 class Remembered:

@@ -46,7 +46,7 @@ class Contactors(OnTarget):
         super().__init__(config, nodes, target, **how)
         self.surface = surface
         self.basis: Basis = basis_of(surface.shape)
-        self.elimination = Elimination(config, nodes, self.free)
+        self.elimination = Elimination(config, nodes)
         self.remembered = Remembered(config, nodes, surface)
         self.begin_step()
 

@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.rings import DependentRingError
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Constraints, Traction
@@ -34,7 +35,7 @@ class OverConstraints:
         shared: whether a node is a contactor of several pairs.
         mutual: pairs whose surfaces are contactor and target of each other (two-pass) ``(n_pairs,)``.
         stacked: whether a node that is followed may itself be eliminated.
-        contestable: whether equations can conflict.
+        contestable: whether equations can conflict that follow each other in no ring.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface]):
@@ -56,26 +57,27 @@ class OverConstraints:
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
         self.stacked = bool(meets.any()) or any(pair.discretisation.chained for pair in pairs)
-        self.contestable = self.shared or bool(self.mutual.any()) or any(pair.discretisation.prescribed for pair in pairs)
+        self.contestable = self.shared or any(pair.discretisation.prescribed for pair in pairs)
 
     def restrict(
-        self, labelled: list[Constraints], equations: UnitingEquations, free: Bools, prescribed: Array
+        self, equations: UnitingEquations, free: Bools, prescribed: Array
     ) -> tuple[Restriction, IndependentEquations | None]:
         """P or Q of equations, and how conflicts among them were resolved (collective).
 
         Args:
-            labelled: equations of every pair, in the order of those to be joined.
             equations: of all pairs together.
             free: components that are not held ``(n_owned, gdim)``.
             prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
         """
-        independent = None
-        if self.contestable:
-            mutual = np.repeat(self.mutual, [len(own) for own in labelled])
-            independent = IndependentEquations(self._config, equations, free, mutual)
-            equations = independent.equations
+        independent = IndependentEquations(self._config, equations, free) if self.contestable else None
+        own = equations if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
-        return Restriction(self._config, equations, free, prescribed, stacked), independent
+        try:
+            return Restriction(self._config, own, free, prescribed, stacked), independent
+        except DependentRingError as error:
+            ring = error.rows if independent is None else independent.of_given(error.rows)
+        independent = IndependentEquations(self._config, equations, free, ring)
+        return Restriction(self._config, independent.equations, free, prescribed), independent
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def make_rows(
         stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
-    Q, independent = over_constraints.restrict(equations, frictionless, free, prescribed)
+    Q, independent = over_constraints.restrict(frictionless, free, prescribed)
     rotated = Q
     if any(e.test is not e.frictionless for e in equations):
         test = UnitingEquations.join([e.test for e in equations], g)

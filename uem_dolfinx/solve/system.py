@@ -245,7 +245,7 @@ class BodySystem:
         self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
         trial = rows.frictionless
         if apart is not None:
-            trial, _ = self.over_constraints.restrict(rows.equations, apart, rows.test.free, self.bodies.prescribed)
+            trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
         largest = max((pair.largest_gap_here() for pair in self.pairs), default=0.0)
         told = gathered(self.comm, np.array([active_here(self.pairs), largest])) if self.pairs else np.zeros((1, 2))
         return trial, *slip_terms(self.pairs, self.config.vector()), int(told[:, 0].sum()), float(told[:, 1].max())

@@ -1,0 +1,228 @@
+"""Uniting equations that follow each other in rings, closed: pure algebra, for equations of any origin.
+
+Three bodies that meet in a point may each be the target of the next: every equation follows what another one eliminates. Equations
+``A du = C du - gap`` that eliminate ``L``, with ``A L = 1``, follow each other by ``M = C L``. Those of one ring, which are strongly
+connected by M, are solved for what they eliminate,
+
+    A du = W C (1 - L A) du - W gap,    W = (1 - M)^-1
+
+and follow each other no more. Forces of the given equations are ``W'`` times those of the closed ones. Where W is large they depend
+on each other, and have to be made independent first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.equations import UnitingEquations, send
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import agree, gathered, reduced
+
+#: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
+#: do so only to the first order of their strain.
+#: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
+DEPENDENT = 0.05
+#: Parts of a unit displacement below it are rounding.
+#: [derived; directions of length one; test_rings.py::test_a_ring_of_equal_parts]
+FADED = np.finfo(float).eps
+#: Closed equations of a ring are found for so many nodes that they follow at a time.
+#: [bound; number of nodes; -]
+NODES_TOGETHER = 256
+
+
+class DependentRingError(ConflictError):
+    """Equations that follow each other in a ring and depend on each other.
+
+    Attributes:
+        rows: which of the equations of this rank they are ``(m,)``.
+    """
+
+    rows: Bools
+
+
+def components(comm: MPI.Comm, links: Ints, mine: Ints, strong: bool) -> tuple[Ints, Ints]:
+    """Connected components of a graph that is spread over ranks, and a rank for each (collective).
+
+    Args:
+        comm: communicator.
+        links: pairs of numbers ``(k, 2)`` of which the first leads to the second, those that this rank knows.
+        mine: numbers of this rank ``(m,)``, of which the rank that has most of a component takes it.
+        strong: whether ways must lead from each to each.
+
+    Returns:
+        The component of each of ``mine``, -1 for those in no link, and the ranks of all components.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    links = np.concatenate(comm.allgather(links))
+    known, place = np.unique(links, return_inverse=True)
+    tail, head = place.reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(tail)), (tail, head)), shape=(len(known),) * 2)
+    count, label = connected_components(graph, directed=strong, connection="strong")
+    at = np.minimum(np.searchsorted(known, mine), len(known) - 1)
+    here = np.where(known[at] == mine, label[at], -1) if len(known) else np.full(len(mine), -1)
+    found = gathered(comm, np.bincount(here[here >= 0], minlength=count))
+    return here.astype(np.int64), np.argmax(found, axis=0)
+
+
+def in_rings(follows: PETSc.Mat) -> tuple[Ints, Ints]:
+    """The ring of each of this rank's equations ``(m,)``, -1 for none, and the rank that closes each ring (collective).
+
+    Args:
+        follows: entries of one where an equation, its row, follows another one, its column ``(m, m)``.
+    """
+    comm, (first, end) = follows.comm.tompi4py(), follows.getOwnershipRange()
+    core = follows.createVecRight()
+    core.set(1.0)
+    left, before = core.sum(), np.inf
+    # what follows nothing of the rest is in no ring, nor is what nothing of the rest follows
+    while 0.0 < left < before:
+        ways = (follows * core).array_r * core.array_r
+        core.array[:] = ways > 0
+        back = follows.createVecRight()
+        follows.multTranspose(core, back)
+        core.array[:] = back.array_r * core.array_r > 0
+        left, before = core.sum(), left
+    inner = follows.copy()
+    inner.diagonalScale(core, core)
+    indptr, columns, values = inner.getValuesCSR()
+    row = np.repeat(np.arange(first, end), np.diff(indptr))
+    links = np.stack([row, columns], axis=1).astype(np.int64)[values > 0]
+    label, rank = components(comm, links, np.arange(first, end), strong=True)
+    many = np.bincount(label[label >= 0], minlength=len(rank))
+    alone = np.bincount(label[links[links[:, 0] == links[:, 1], 0] - first], minlength=len(rank))
+    ring = (reduced(comm, many) > 1) | (reduced(comm, alone) > 0)
+    return np.where(label >= 0, np.where(ring, np.cumsum(ring) - 1, -1)[label], -1), rank[ring]
+
+
+@dataclass(frozen=True)
+class _Closed:
+    """One ring on the rank that closes it: its equations' numbers there, ``1 - M`` factorised, and the closed equations."""
+
+    rows: Ints
+    factor: Any
+    equations: UnitingEquations
+
+
+class Rings:
+    """Closed equations in place of those that follow each other in rings (collective).
+
+    Args:
+        space: the nodes whose components are restricted.
+        equations: of this rank.
+        lift: how each acts on its node ``(m, block)``.
+        follows: entries of one where an equation follows another one.
+
+    Attributes:
+        equations: in the order of those that are given.
+
+    Raises:
+        DependentRingError: if equations of a ring depend on each other.
+    """
+
+    def __init__(self, space: Nodes, equations: UnitingEquations, lift: Array, follows: PETSc.Mat):
+        label, rank = in_rings(follows)
+        self._mine = np.flatnonzero(label >= 0)
+        held = equations.select(label >= 0)
+        held = replace(held, node=space.to_global(held.node))
+        there, self._exchange = send(space.comm, held, rank[label[self._mine]])
+        lift, label, place = self._exchange.send(lift[self._mine], label[self._mine], self._mine)
+        closed = [_close(there, lift, np.flatnonzero(label == k)) for k in np.unique(label)]
+        self._check(space, equations, closed, len(place))
+        self._rings = [ring for ring in closed if isinstance(ring, _Closed)]
+        order = np.concatenate([np.zeros(0, np.int64), *(ring.rows for ring in self._rings)])
+        solved = UnitingEquations.join([ring.equations for ring in self._rings], space.block)
+        solved, back = send(space.comm, solved, self._exchange.origins[order])
+        (at,) = back.send(place[order])
+        self.equations = _replaced(equations, solved, at)
+
+    def _check(self, space: Nodes, equations: UnitingEquations, closed: list[_Closed | Ints], n: int) -> None:
+        """Raise if any ring could not be closed (collective)."""
+        bad = np.zeros(n, dtype=bool)
+        for ring in closed:
+            if not isinstance(ring, _Closed):
+                bad[ring] = True
+        dependent, error = np.zeros(len(equations), dtype=bool), None
+        (dependent[self._mine[self._exchange.rows]],) = self._exchange.back(bad)
+        if dependent.any():
+            node = int(equations.node[np.argmax(dependent)])
+            error = DependentRingError(
+                f"the contactor at {space.describe(node)} follows itself through its targets: surfaces are contactors and targets of "
+                "each other in a ring; drop one of the contacts"
+            )
+        try:
+            agree(space.comm, error)
+        except DependentRingError as ring:
+            ring.rows = dependent
+            raise
+
+    def forces(self, multipliers: Array) -> Array:
+        """Forces of the given equations ``(m,)`` from those of the closed ones (collective)."""
+        (mu,) = self._exchange.send(multipliers[self._mine])
+        lam = np.zeros(len(mu))
+        for ring in self._rings:
+            lam[ring.rows] = ring.factor.solve(mu[ring.rows], "T")
+        given = multipliers.copy()
+        (given[self._mine[self._exchange.rows]],) = self._exchange.back(lam)
+        return given
+
+
+def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | Ints:
+    """A ring of equations ``rows`` of global nodes, closed; these numbers if they depend on each other."""
+    from scipy.sparse import csr_matrix, identity
+    from scipy.sparse.linalg import LinearOperator, onenormest, splu
+
+    which = np.zeros(len(there), dtype=bool)
+    which[rows] = True
+    eq, m, g = there.select(which), len(rows), there.direction.shape[1]
+    nodes, at = np.unique(np.concatenate([eq.node, eq.followed]), return_inverse=True)
+
+    def matrix(row: Ints, node: Ints, values: Array) -> Any:
+        columns = node[:, None] * g + np.arange(g)
+        return csr_matrix((values.ravel(), (np.repeat(row, g), columns.ravel())), shape=(m, len(nodes) * g))
+
+    own = np.arange(m), at[:m]
+    C, A, L = matrix(eq.row, at[m:], eq.coefficients), matrix(*own, eq.direction), matrix(*own, lift[rows])
+    M = C @ L.T
+    try:
+        factor = splu((identity(m) - M).tocsc())
+    except RuntimeError:
+        # PETSc's word for it would be a zero pivot
+        return rows
+    inverse = LinearOperator(
+        (m, m), matvec=factor.solve, rmatvec=lambda v: factor.solve(v, "T"), matmat=factor.solve, dtype=float
+    )
+    if not onenormest(inverse) <= 1.0 / DEPENDENT:
+        return rows
+    B = (C - M @ A).tocsc()
+    used = np.unique(np.flatnonzero(np.diff(B.indptr)) // g)
+    terms: list[tuple[Ints, Ints, Array]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, g)))]
+    for some in np.split(used, np.arange(NODES_TOGETHER, len(used), NODES_TOGETHER)):
+        X = factor.solve(B[:, (some[:, None] * g + np.arange(g)).ravel()].toarray()).reshape(m, len(some), g)
+        row, column = np.nonzero((np.abs(X) > FADED).any(axis=2))
+        terms.append((row, nodes[some[column]], X[row, column]))
+    row, followed, coefficients = (np.concatenate(parts) for parts in zip(*terms))
+    return _Closed(rows, factor, replace(eq, gap=factor.solve(eq.gap), row=row, followed=followed, coefficients=coefficients))
+
+
+def _replaced(equations: UnitingEquations, solved: UnitingEquations, at: Ints) -> UnitingEquations:
+    """The equations with others in the places ``at (k,)``, of the same components."""
+    gap, stays = equations.gap.copy(), np.ones(len(equations), dtype=bool)
+    gap[at], stays[at] = solved.gap, False
+    terms = stays[equations.row]
+    return replace(
+        equations,
+        gap=gap,
+        row=np.concatenate([equations.row[terms], at[solved.row]]),
+        followed=np.concatenate([equations.followed[terms], solved.followed]),
+        coefficients=np.concatenate([equations.coefficients[terms], solved.coefficients]),
+    )
