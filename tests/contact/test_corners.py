@@ -96,7 +96,7 @@ def test_friction_in_a_vertex():
 
 
 @pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), pytest.param(2, 0.0, marks=pytest.mark.slow)])
-def test_a_valley_that_ends_with_its_target(degree, friction):
+def test_a_concave_edge_that_ends_with_its_target(degree, friction):
     """A ridge is pushed along a groove and out of it: contactors that have passed its end carry nothing, moments balance."""
     low, high = (box("hexahedron", [0, 0, z], [1, 1, z + 1.0], [n, 2, 2]) for z, n in ((-1.0, 5), (0.0, 4)))
 

@@ -233,7 +233,7 @@ def test_overlap_is_an_approach_in_3d(overlap):
 
 
 @pytest.mark.parametrize("shuffle", [1, 7, 11])
-def test_contactor_led_past_the_end_of_a_valley(shuffle):
+def test_contactor_led_past_the_end_of_a_concave_edge(shuffle):
     """One that has changed facets too often to be followed lets go of an edge it has left, whatever order the facets come in."""
     m = meet("hexahedron", (2, 2), d=0.25, shuffle=shuffle)
     assert m.active == 9

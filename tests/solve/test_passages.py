@@ -262,7 +262,7 @@ def test_bodies_that_turn_together(angle):
 
 
 def across(slope, n, coupling):
-    """A small block that is led from flank to flank of a valley (slope > 0) or a ridge (slope < 0), in front of both all along."""
+    """A small block that is led from flank to flank of a concave edge (slope > 0) or a ridge (slope < 0), in front of both all along."""
     deep = 1.0 + abs(slope)
 
     def bend(x):
@@ -290,7 +290,7 @@ def across(slope, n, coupling):
 @pytest.mark.parametrize("slope", [0.4, 0.6])
 @pytest.mark.parametrize("n", [2, 5])
 def test_faces_that_look_at_each_other(slope, n, coupling):
-    """From flank to flank of a valley a contactor meets nothing, however long its way; over a ridge it might have met the other face."""
+    """From flank to flank of a concave edge a contactor meets nothing, however long its way; on a ridge it may have met the other."""
     problem, contact = across(slope, n, coupling)
     problem.solve()
     assert contact.n_active > 0

@@ -1,6 +1,6 @@
 """Contactors in the concave corners of a faceted target: held by two facets on an edge, by three in a vertex.
 
-Facet normals jump from facet to facet; where two facets form a valley, a contactor
+Facet normals jump from facet to facet; where two facets form a concave edge, a contactor
 drawn to it belongs to both, and would flip between them for ever if it had to choose.
 """
 

@@ -279,7 +279,7 @@ class Interface:
 
     def calm(self, which: Bools) -> bool:
         """Give those of contactors ``which (n,)`` that bends lead to and fro averaged normals in this step: whether any gets them."""
-        from uem_dolfinx.contact.valleys import HOLD_AFTER, MOST_CHANGES
+        from uem_dolfinx.contact.concave_edges import HOLD_AFTER, MOST_CHANGES
 
         changes = self.trial.changes
         some = which & self.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)

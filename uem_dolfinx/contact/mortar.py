@@ -18,12 +18,12 @@ import numpy as np
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.concave_edges import MOST_CHANGES, with_averaged_normals
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Covered, dual_functions
 from uem_dolfinx.contact.mortar_rows import Pieces, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import slopes
 from uem_dolfinx.contact.state import PairState
-from uem_dolfinx.contact.valleys import MOST_CHANGES, with_averaged_normals
 from uem_dolfinx.contact.weighted_gaps import Contactors, MortarKinematics
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets

@@ -1,6 +1,6 @@
 """Node to surface: each contactor node is united to the point of the target below it, the paper's coupling [UEM, 4.1-4.3].
 
-Targets may be meshed or rigid. Where the normals of a meshed target jump from facet to facet, ``valleys`` says which facets hold a
+Targets may be meshed or rigid. Where the normals of a meshed target jump from facet to facet, ``concave_edges`` says which facets hold a
 contactor.
 """
 
@@ -47,9 +47,9 @@ class NodeToSurface(OnTarget):
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.chords = chords
-        from uem_dolfinx.contact.valleys import create_valleys
+        from uem_dolfinx.contact.concave_edges import create_concave_edges
 
-        self.valleys = create_valleys(config, target, self.free) if self.sliding == "finite" else None
+        self.concave_edges = create_concave_edges(config, target, self.free) if self.sliding == "finite" else None
 
     @classmethod
     def like(cls, other: OnTarget) -> NodeToSurface:
@@ -60,16 +60,16 @@ class NodeToSurface(OnTarget):
     def with_friction(self, mu: Array) -> None:
         """Take the slopes of the cones ``(n,)``, with which contactors leave corners."""
         super().with_friction(mu)
-        if self.valleys is not None:
-            self.valleys.mu = mu
+        if self.concave_edges is not None:
+            self.concave_edges.mu = mu
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)
-            if self.valleys is not None:
-                projection, corners = self.valleys.place(nearest, points, state)
+            if self.concave_edges is not None:
+                projection, corners = self.concave_edges.place(nearest, points, state)
         else:
             if self.anchor is None:
                 nearest = projection = self.take_feet(points)
@@ -181,19 +181,19 @@ class NodalKinematics:
 
     def placed_again(self, state: PairState) -> NodalKinematics:
         """Put contactors that have entered or left a corner where they now belong (collective)."""
-        if self.of.valleys is None:
+        if self.of.concave_edges is None:
             return self
         left = np.zeros(len(self.points), dtype=bool) if self.left is None else self.left
-        nearest, projection, corners = self.of.valleys.place_again(self.nearest, left, self.points, state)
+        nearest, projection, corners = self.of.concave_edges.place_again(self.nearest, left, self.points, state)
         there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
         return self.of.measured(there, state)
 
     def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
         """Follow contactors across bends, into corners and out of them (collective)."""
-        if self.of.valleys is None:
+        if self.of.concave_edges is None:
             return self, state, False
-        state, left = self.of.valleys.leave(self.corners, state)
-        state, entered = self.of.valleys.follow(self.nearest, left, self.points, state)
+        state, left = self.of.concave_edges.leave(self.corners, state)
+        state, entered = self.of.concave_edges.follow(self.nearest, left, self.points, state)
         return replace(self, left=left), state, bool(left.any()) or entered
 
     # -- what decides ----------------------------------------------------------------------------------------------------

@@ -30,13 +30,13 @@ SHARP = 0.5
 MOST_CHANGES = 8
 
 
-def create_valleys(config: Configuration, target: Target, free: Bools) -> Valleys | None:
+def create_concave_edges(config: Configuration, target: Target, free: Bools) -> ConcaveEdges | None:
     """What follows contactors from facet to facet; None where normals do not jump between facets."""
-    return Valleys(config, cast("MeshTarget", target), free) if target.faceted else None
+    return ConcaveEdges(config, cast("MeshTarget", target), free) if target.faceted else None
 
 
-class Valleys:
-    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its valleys.
+class ConcaveEdges:
+    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges.
 
     Args:
         config: configuration of the displacement.
