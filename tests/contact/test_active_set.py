@@ -148,6 +148,13 @@ def test_when_the_worst_goes_alone():
     assert [i for i, n in enumerate(counts) if pivoting.choose(n, next(new)) == Rule.WORST] == alone
 
 
+def test_when_the_first_goes_alone():
+    """After the worst has gone alone thirty times more without fewer that are wrong than ever before."""
+    pivoting, new = active_set.Pivoting(), iter(range(99))
+    rules = [pivoting.choose(5, next(new)) for _ in range(70)]
+    assert rules == [Rule.ALL] * 31 + [Rule.WORST] * 31 + [Rule.FIRST] * 8
+
+
 def test_states_that_come_again():
     """A state that a rule has been in ends it at once; after the last rule nothing is left, unless fewer are wrong than ever."""
     pivoting = active_set.Pivoting()

@@ -19,9 +19,10 @@ from helpers import Body, at, blocks, box, clamp, linear, modulus, raised, run, 
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.active_set import Rule, Violations
+from uem_dolfinx.contact.active_set import Pivoting, Rule, Violations
 from uem_dolfinx.contact.friction import FrictionViolations, Seen
 from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.solve import exchanges as exchanges_of_a_step
 from uem_dolfinx.solve.exchanges import ALONG, Exchanges
 
 COMM = MPI.COMM_WORLD
@@ -101,6 +102,30 @@ def test_who_goes_in_a_circle_is_named():
 
         found = raised(error, "goes in a circle", exchange_for_ever)
         assert "upper on lower at (1, 0.5), upper on lower at (2, 0.5), upper on lower at (4, 0.5), and 1 more" in str(found)
+
+
+@pytest.mark.parametrize("most", [0, exchanges_of_a_step.MOST_OF_EACH])
+def test_the_first_alone_finds_any_active_set(most, monkeypatch):
+    """Exchanged one by one in their order, however many these are, contactors end where all at once do; a bound is told of."""
+    ends = []
+    for rule in (None, Rule.FIRST):
+        if rule is not None:
+            monkeypatch.setattr(Pivoting, "choose", lambda self, count, state: Rule.FIRST)
+            monkeypatch.setattr(exchanges_of_a_step, "MOST_EXCHANGES", 1)
+            monkeypatch.setattr(exchanges_of_a_step, "MOST_OF_EACH", most)
+        b = blocks(
+            COMM, "triangle", 30, 150, gap=0.02, pose=lambda x: x + np.array([0.0, 0.02]) * np.cos(40 * x[:, :1]) * (x[:, 1:] > 0)
+        )
+        contact = uem.Contact(b.high, b.low, sliding="fixed")
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.08])]
+        problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], max_iterations=50)
+        if most == 0 and rule is not None:
+            raised(uem.ConvergenceError, "goes in a circle", problem.solve)
+            return
+        history = problem.solve()
+        ends.append((contact.n_active, contact.resultant().force[1], sum(i.exchanges for i in history)))
+    assert ends[0][0] == ends[1][0] and ends[1][1] == pytest.approx(ends[0][1], rel=1e-10)
+    assert ends[1][2] > exchanges_of_a_step.MOST_EXCHANGES
 
 
 def test_without_curvature_first():

@@ -35,7 +35,8 @@ HALF_WIDTH = 1 / 3
 #: Contactors as wrong as the worst, but for this part, are exchanged with it: rounding does not choose between equals.
 #: [convention; the worst violation; test_active_set.py::test_equals_are_exchanged_together]
 TIED = 1e-6
-#: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the worst is exchanged alone.
+#: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the worst is exchanged alone, and as many
+#: of the worst before the first.
 #: [convention; exchanges; test_active_set.py::test_when_the_worst_goes_alone]
 PATIENCE = 30
 
@@ -197,7 +198,7 @@ class Pivoting:
         """
         if count < self._fewest:
             self._fewest, self._tries, self._rule, self._seen = count, PATIENCE, Rule.ALL, set()
-        elif self._rule == Rule.ALL:
+        elif self._rule < Rule.FIRST:
             self._tries -= 1
         if self._rule < Rule.NONE and (state in self._seen or self._tries < 0):
             self._rule, self._tries, self._seen = self._rule + 1, PATIENCE, set()

@@ -34,9 +34,12 @@ from uem_dolfinx.solve.floating import FAR
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
 #: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
 ALONG = np.sqrt([2.0, 3.0, 5.0])
-#: The active set of a linearised problem settles within so many exchanges, or the step is cut.
+#: The active set of a linearised problem settles within so many exchanges of many contactors or of the worst, or the step is cut.
 #: [bound; exchanges; -]
 MOST_EXCHANGES = 100
+#: Exchanges of the first contactor alone find the active set of every convex problem without friction; they may take so many of them.
+#: [bound; exchanges for each contactor; -]
+MOST_OF_EACH = 20
 #: A state that comes again with more than this part of the residual that it had has led nowhere.
 #: [convention; norm of the residual; test_exchanges.py::test_states_that_come_again]
 NO_LESS = 0.9
@@ -105,7 +108,7 @@ class Exchanges:
     def begin(self) -> None:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
-        self._number, self._rule = 0, Rule.ALL
+        self._number, self._alone, self._rule = 0, 0, Rule.ALL
         #: Whether limits have been held, and the last states without a mechanism.
         self.held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
@@ -179,6 +182,11 @@ class Exchanges:
         if rule != self._rule:
             self._rule, self._lately = rule, self._none()
         self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
+        if rule == Rule.FIRST:
+            self._alone += 1
+            if self._alone > MOST_OF_EACH * reduced(comm, sum(len(pair.nodes) for pair in self._pairs)):
+                raise self._circle(self._lately)
+            return chosen
         self._solve_again()
         return chosen
 
