@@ -90,13 +90,31 @@ class Limited:
         return np.minimum(coulomb, most), np.where(coulomb < most, value, 0.0)
 
 
-def test_a_law_from_outside():
-    """Coulomb's with a limit is Coulomb's where little presses and Tresca's where much does."""
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize(
+    ("cell", "degree", "rigid"), [("quadrilateral", 1, False), ("triangle", 2, False), ("hexahedron", 1, True)]
+)
+def test_coulomb_with_a_limit(cell, degree, rigid, coupling):
+    """It is Coulomb's where little presses and Tresca's where much does."""
     for press, law in ((0.002, 0.3), (0.04, uem.Tresca(STRESS))):
-        own, other = (
-            np.array(dragged("quadrilateral", one, press=press)[0].resultant().force) for one in (Limited(0.3, STRESS), law)
+        limited, other = (
+            np.array(dragged(cell, one, press=press, degree=degree, rigid=rigid, coupling=coupling)[0].resultant().force)
+            for one in (uem.Coulomb(0.3, limit=STRESS), law)
         )
-        np.testing.assert_allclose(own, other, rtol=1e-6)
+        np.testing.assert_allclose(limited, other, rtol=1e-6, atol=1e-9)
+
+
+def test_a_law_from_outside():
+    """What the package's own law says, a law of the user's says as well, where some contactors are below the limit and others at it."""
+    for press in (0.006, 0.01, 0.014):
+        own, other = (
+            dragged("quadrilateral", one, press=press)[0] for one in (Limited(0.3, STRESS), uem.Coulomb(0.3, limit=STRESS))
+        )
+        np.testing.assert_allclose(np.array(own.resultant().force), np.array(other.resultant().force), rtol=1e-12)
+        pair = other.pair
+        bound = np.minimum(0.3 * pair.trial.lam, STRESS * pair.friction.area)
+        borne = np.linalg.norm(pair.trial.friction.tau, axis=1)
+        assert (borne <= bound * (1 + 1e-8)).all()
 
 
 def test_a_proportional_limit_has_no_rest():
@@ -121,6 +139,13 @@ def test_laws_that_are_set_anew():
     contact, _ = dragged("quadrilateral", uem.Tresca(STRESS))
     contact.friction = uem.Tresca(2 * STRESS)
     assert (contact.pair.friction.value == 2 * STRESS).all()
+    # all that it was made with
+    contact, _ = dragged("quadrilateral", uem.Coulomb(0.3, limit=10.0), press=0.04)
+    contact.friction = uem.Coulomb(0.3, limit=STRESS)
+    assert contact.pair.friction.law.most == STRESS
+    raised(uem.InputTypeError, "limit", lambda: uem.Coulomb(0.3, limit="soft"))
+    raised(uem.InputError, "limit = -1.0: expected a positive number", lambda: uem.Coulomb(0.3, limit=-1.0))
+    contact, _ = dragged("quadrilateral", uem.Tresca(STRESS))
     raised(uem.InputTypeError, "friction = 0.3", lambda: setattr(contact, "friction", 0.3))
     raised(uem.InputError, "friction", lambda: uem.Contact(0, uem.RigidPlane([0, 0], [0, 1]), friction=uem.Tresca(-1.0)))
 

@@ -19,7 +19,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, values_at
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, parameters, values_at
 from uem_dolfinx.contact.results import Balance, Resultant, imbalance, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -62,9 +62,9 @@ class Contact:
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
             than this lies behind the body, not in it. None takes the body to have no back.
         friction: Coulomb's coefficient, a number, or a function of place that is given points ``(3, n)`` of the reference
-            configuration and returns ``(n,)``; or a law of friction, such as ``Tresca``. With 0 the contact is the one without friction.
-            It may be set anew between steps, of a contact that was made with friction, by the same law; all else is settled once a
-            problem has been made.
+            configuration and returns ``(n,)``; or a law of friction: ``Coulomb`` with a limit, ``Tresca``. With 0
+            the contact is the one without friction. It may be set anew between steps, of a contact that was made with friction, by the
+            same law; all else is settled once a problem has been made.
         measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
             small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
@@ -139,7 +139,7 @@ class Contact:
     def __repr__(self) -> str:
         """Its name, coupling and sliding, and friction if there is any."""
         law, coupling = as_law(self._friction), self.coupling if isinstance(self.coupling, str) else self.coupling.__name__
-        friction = "" if law.field == 0.0 else f", friction={type(law).__name__}({given.shown(law.field)})"
+        friction = "" if law.field == 0.0 else f", friction={type(law).__name__}({', '.join(map(given.shown, parameters(law)))})"
         return f"Contact({self.name!r}, coupling={coupling!r}, sliding={self.sliding!r}{friction})"
 
     @property
@@ -157,15 +157,15 @@ class Contact:
             value = given_friction(value)
             law = as_law(value)
             given.kind("friction", value, type(law) is type(before), f"a value for the law {type(before).__name__}")
-        given.alike(self.config.comm, f"contact '{self.name}'", friction=law.field)
-        mu = values_at(law, self.config, self.pair.nodes, self.name)
+        given.alike(self.config.comm, f"contact '{self.name}'", friction=parameters(law))
+        mu = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0)
         if mu is not None and not self.pair.frictional:
             raise InputError(
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
                 "the friction that it is to have, and set friction = 0 until then"
             )
         if self.pair.frictional:
-            self.pair.set_friction(np.zeros(len(self.pair.nodes)) if mu is None else mu)
+            self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
         self._friction = value
 
     def attach(self, config: Configuration, free: Bools) -> Interface:
@@ -189,7 +189,7 @@ class Contact:
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
-            friction=as_law(self.friction).field, measure=self.measure,
+            friction=parameters(as_law(self.friction)), measure=self.measure,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes = surface_nodes(config, self.contactor)
@@ -221,12 +221,9 @@ class Contact:
         bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
         law, friction = as_law(self.friction), None
-        value = values_at(law, config, nodes, self.name)
+        value = values_at(law, config, nodes, self.name, self.contactor.dim > 0)
         if value is not None:
             from uem_dolfinx.contact.sliding import Sliding
-
-            if law.per_area and self.contactor.dim == 0:
-                raise InputError(f"contact '{self.name}': {type(law).__name__} needs areas, and points have none: give facets")
 
             friction = Sliding(
                 config, nodes, discretisation, law=law, value=value, areas=lambda: self._surface.reference[nodes], free=free[nodes],

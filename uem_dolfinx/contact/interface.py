@@ -18,6 +18,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -177,10 +178,10 @@ class Interface:
 
     # -- activation and release ------------------------------------------------------------------------------------------
 
-    def set_friction(self, value: Array) -> None:
-        """Take other values of the law of friction's parameter ``(n,)`` between two steps (collective)."""
+    def set_friction(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law of friction, and other values of its parameter ``(n,)``, between two steps (collective)."""
         assert self.friction is not None
-        self.trial = self.committed = self.friction.other_values(self.committed, value)
+        self.trial = self.committed = self.friction.other_law(self.committed, law, value)
 
     def _set_active(self, state: PairState) -> None:
         """Take over a state of which only the active set is another (collective)."""

@@ -66,13 +66,12 @@ class Sliding:
         keeps_feet: bool,
     ):
         self.config, self.nodes, self.discretisation = config, nodes, discretisation
-        self.law, self.free, self.keeps_feet = law, free, keeps_feet
+        self.free, self.keeps_feet = free, keeps_feet
         n, g = len(nodes), config.gdim
-        self._areas = areas() if law.per_area else np.zeros(n)
-        self.area = self._areas
+        self._areas_of = areas
         #: Limits that stay while forces along the normal change ``(n,)``.
         self._held: Array | None = None
-        self.set(value)
+        self.set(law, value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
         self._other_normals: Array = np.zeros((n, 0, g))
         self._anchors: Array = np.zeros((n, g))
@@ -80,9 +79,10 @@ class Sliding:
         self._last: LastStep | None = None
         self.pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
-    def set(self, value: Array) -> None:
-        """Take other values of the law's parameter ``(n,)``."""
-        self.value = value
+    def set(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law, and the values of its parameter ``(n,)``."""
+        self.law, self.value = law, value
+        self.area = self._areas = self._areas_of() if law.per_area else np.zeros(len(value))
         _, slope = self.law.limit(value, np.zeros(len(value)), self.area)
         self.discretisation.with_friction(slope)
 
@@ -184,10 +184,10 @@ class Sliding:
         """The state in which contactors that were not active ``before (n,)`` stick, and those that are no longer forget."""
         return replace(state, friction=friction.come_and_go(_of(state), before, state.active, self.value > 0))
 
-    def other_values(self, state: PairState, value: Array) -> PairState:
-        """The state with other values of the law's parameter ``(n,)``: contactors that get friction stick where they are."""
+    def other_law(self, state: PairState, law: FrictionLaw, value: Array) -> PairState:
+        """The state with a law, and other values ``(n,)`` of its parameter: contactors that get friction stick where they are."""
         was = state.active & (self.value > 0)
-        self.set(value)
+        self.set(law, value)
         now = friction.come_and_go(_of(state), was, state.active & (value > 0), value > 0)
         return replace(state, friction=now)
 

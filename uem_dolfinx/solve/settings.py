@@ -21,7 +21,9 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.laws.law import as_law, parameters
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.given import described
 from uem_dolfinx.restart.numbering import DIGEST
 
 #: Numbers of a form that are shown.
@@ -76,6 +78,8 @@ class Settings:
             name = f"contact {i} '{contact.name}'"
             for what in ("coupling", "sliding", "normals", "thickness", "chords"):
                 words[f"{name}, {what}"] = str(getattr(contact, what))
+            for k, value in enumerate(parameters(as_law(contact.friction))[1:], 2):
+                words[f"{name}, parameter {k} of friction"] = described(value)
             values[f"{name}, friction"] = _extent(np.zeros(0) if contact.pair.friction is None else contact.pair.friction.value)
         if (d := self._dynamics) is not None:
             words |= {

@@ -63,8 +63,20 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
     return law if hasattr(friction, "limit") else law.field
 
 
-def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str) -> Array | None:
-    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)``; None if all are zero (collective)."""
+def parameters(law: FrictionLaw) -> list[Any]:
+    """What a law was made with, ``field`` first; what was left out aside."""
+    others = [value for name, value in getattr(law, "__dict__", {}).items() if name != "field" and value is not None]
+    return [law.field, *others]
+
+
+def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool) -> Array | None:
+    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)``; None if all are zero (collective).
+
+    Raises:
+        InputError, UserFunctionError: if the law needs areas and the contactors have none, or if a function of place is no good.
+    """
+    if law.per_area and not areas:
+        raise InputError(f"contact '{name}': {type(law).__name__} needs areas, and points have none: give facets")
     if not callable(law.field):
         return np.full(len(nodes), law.field) if law.field > 0 else None
     places = np.zeros((3, len(nodes)))
