@@ -289,3 +289,11 @@ def test_chains_of_any_length(comm, length):
     assert np.abs(gathered_matrix(r.P) @ gathered_vector(q) - moved.ravel()).max() < 1e-15
     with pytest.raises(uem.ConflictError, match="follows itself"):
         united(config, [*rows, (order[-1], [0.0, 1.0], order[0])])
+
+
+@pytest.mark.parametrize("part, length", [(5e-9, 2), (0.1, 16), (0.32, 32), (0.33, None), (0.5, None)])
+def test_rings_that_fade(comm, part, length):
+    """Equations that follow each other by a part each: the series ends where what comes round is rounding, or the ring is closed."""
+    config = Configuration(blocks(comm, "triangle", 2, 2, gap=0.5).u)
+    r = united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part)
+    assert (r.chain, r.fades, r.rings is None) == (length or 1, bool(length), bool(length))

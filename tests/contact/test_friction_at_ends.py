@@ -54,7 +54,7 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     list(uem.load_steps(problem, 2))
     pair, state, size = contact.pair, contact.pair.trial, problem.config.n_owned
     stick = state.active & state.friction.stick
-    assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().frictionless.rings is not None
+    assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().frictionless.fades
     made, placed, free = pair.equations(), pair.kinematics, problem.bodies.free[:size].ravel()
     kept = made.frictionless.active
     rows, who, normal = rows_of(made.frictionless.select(kept), size)[:, free], made.contactor[kept], made.tangent[kept] < 0

@@ -77,7 +77,7 @@ def test_a_target_that_ends_over_facets_that_stick(cell, degree):
     circular = []
     for x in (0.0, 0.01, 0.06):
         scene.to(x, 0.3 * x, -0.01)
-        circular.append(scene.problem.system.restriction().rings is not None)
+        circular.append(scene.problem.system.restriction().fades)
     assert any(circular) and scene.states[0] == 0
     f = scene.contact.resultant().force
     assert np.linalg.norm(f[:2]) == pytest.approx(-0.3 * f[2], rel=0.015)

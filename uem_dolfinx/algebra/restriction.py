@@ -10,8 +10,8 @@ Every equation eliminates one component of a node in a frame rotated to its dire
     du = T dq + M du + d    so    P = (1 + M + M^2 + ...) T,    c = (1 + M + M^2 + ...) d
 
 T rotates each node's free components, M lets an eliminated component follow other nodes, d closes gaps and carries prescribed
-increments. The powers of M end after as many terms as bodies are stacked upon each other; equations that follow each other in rings
-are closed first.
+increments. The powers of M end after as many terms as bodies are stacked upon each other. Where equations follow each other in rings,
+by a small part each, they fade, and end where they are rounding; other rings are closed first.
 """
 
 from __future__ import annotations
@@ -26,11 +26,15 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.blocks import Blocks, product, rows_at, summed, together
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left
-from uem_dolfinx.algebra.rings import Rings
+from uem_dolfinx.algebra.rings import FADED, Rings
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Halo, Nodes
 from uem_dolfinx.parallel import agree, gathered, reduced
+
+#: Rings of equations are closed unless what has gone through so many of them is rounding.
+#: [convention; number of equations; test_restriction.py::test_rings_that_fade]
+MOST_ROUND = 32
 
 
 class Restriction:
@@ -76,14 +80,17 @@ class Restriction:
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
         self.rings: Rings | None = None
         self._hold(equations, prescribed)
-        #: The number of terms with M in the series of P and c.
-        self.chain = 1 if self.n_equations else 0
+        #: The number of terms with M in the series of P and c, and whether equations follow each other in rings that fade.
+        self.chain, self.fades = 1 if self.n_equations else 0, False
         if self.n_equations and stacked:
-            self.chain, endless = self._longest_chain()
-            if endless is not None:
-                self.rings = Rings(space, equations, self.lift, endless)
-                self._hold(self.rings.equations, prescribed)
-                self.chain, _ = self._longest_chain()
+            self.chain, parts = self._longest_chain()
+            if parts is not None:
+                self.chain = _fading(parts)
+                self.fades = self.chain > 0
+                if not self.fades:
+                    self.rings = Rings(space, equations, self.lift, parts)
+                    self._hold(self.rings.equations, prescribed)
+                    self.chain, _ = self._longest_chain()
 
     def _hold(self, equations: UnitingEquations, prescribed: Array) -> None:
         """Take the equations, which eliminate what they are known to, and what closes their gaps (collective)."""
@@ -153,7 +160,7 @@ class Restriction:
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
 
     def _longest_chain(self) -> tuple[int, PETSc.Mat | None]:
-        """How many equations follow one another from node to node, and which follow which if that has no end (collective).
+        """How many equations follow one another from node to node, and by what parts if that has no end (collective).
 
         An equation follows another if its terms have a part in what the other eliminates of a node; what that leaves free ends a chain.
         """
@@ -171,10 +178,12 @@ class Restriction:
         own = eq.node[:, None] * g + k, np.broadcast_to(first + np.arange(m)[:, None], eq.direction.shape), self.lift
         C = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in terms)), (sizes, self._sizes[1]))
         L = self._matrix(*_sum_duplicates(*(np.ascontiguousarray(a).ravel() for a in own)), (self._sizes[0], sizes))
-        follows = C.matMult(L)
-        indptr, columns, values = follows.getValuesCSR()
-        follows.setValuesCSR(indptr, columns, (np.abs(values) > NEGLIGIBLE).astype(float))
-        follows.assemble()
+        parts = C.matMult(L)
+        indptr, columns, values = parts.getValuesCSR()
+        follows = parts.duplicate()
+        for matrix, entries in ((parts, np.abs(values)), (follows, (np.abs(values) > NEGLIGIBLE).astype(float))):
+            matrix.setValuesCSR(indptr, columns, entries)
+            matrix.assemble()
         at = follows.createVecRight()
         at.set(1.0)
         length, left, before = 0, at.sum(), np.inf
@@ -183,7 +192,7 @@ class Restriction:
             at, length, before = follows * at, length + 1, left
             at.array[:] = at.array_r > 0
             left = at.sum()
-        return length, follows if left > 0.0 else None
+        return length, parts if left > 0.0 else None
 
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
@@ -199,6 +208,8 @@ class Restriction:
             terms.append(power)
             if len(terms) > self.chain:
                 return summed(together(*terms))
+            if self.fades:
+                power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
             power = product(M, rows_at(self.space, power, asked))
 
     def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
@@ -320,6 +331,21 @@ class Restriction:
             rounded = (np.rint(v / NEGLIGIBLE).astype(np.int64) for v in (eq.direction, eq.coefficients))
             parts += [*(v.tobytes() for v in rounded), eq.active.tobytes()]
         return zlib.crc32(b"".join(parts))
+
+
+def _fading(parts: PETSc.Mat) -> int:
+    """After how many equations what goes round in rings is rounding of a unit displacement; 0 for too many (collective).
+
+    Args:
+        parts: by which equations follow each other, positive ``(m, m)``.
+    """
+    at = parts.createVecRight()
+    at.set(1.0)
+    for length in range(1, MOST_ROUND + 1):
+        at = parts * at
+        if at.norm(PETSc.NormType.INFINITY) <= FADED:
+            return length
+    return 0
 
 
 def _frames(A: Array, pinv: Array, free: Bools) -> Array:

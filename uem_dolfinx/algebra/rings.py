@@ -20,7 +20,7 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import UnitingEquations, send
+from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations, send
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Nodes
@@ -31,7 +31,7 @@ from uem_dolfinx.parallel import agree, gathered, reduced
 #: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
 DEPENDENT = 0.05
 #: Parts of a unit displacement below it are rounding.
-#: [derived; directions of length one; test_rings.py::test_a_ring_of_equal_parts]
+#: [derived; directions of length one; test_restriction.py::test_rings_that_fade]
 FADED = np.finfo(float).eps
 #: Closed equations of a ring are found for so many nodes that they follow at a time.
 #: [bound; number of nodes; -]
@@ -74,13 +74,17 @@ def components(comm: MPI.Comm, links: Ints, mine: Ints, strong: bool) -> tuple[I
     return here.astype(np.int64), np.argmax(found, axis=0)
 
 
-def in_rings(follows: PETSc.Mat) -> tuple[Ints, Ints]:
+def in_rings(parts: PETSc.Mat) -> tuple[Ints, Ints]:
     """The ring of each of this rank's equations ``(m,)``, -1 for none, and the rank that closes each ring (collective).
 
     Args:
-        follows: entries of one where an equation, its row, follows another one, its column ``(m, m)``.
+        parts: by which an equation, its row, follows another one, its column, positive ``(m, m)``.
     """
-    comm, (first, end) = follows.comm.tompi4py(), follows.getOwnershipRange()
+    comm, (first, end) = parts.comm.tompi4py(), parts.getOwnershipRange()
+    follows = parts.copy()
+    indptr, columns, values = parts.getValuesCSR()
+    follows.setValuesCSR(indptr, columns, (values > NEGLIGIBLE).astype(float))
+    follows.assemble()
     core = follows.createVecRight()
     core.set(1.0)
     left, before = core.sum(), np.inf
@@ -92,9 +96,8 @@ def in_rings(follows: PETSc.Mat) -> tuple[Ints, Ints]:
         follows.multTranspose(core, back)
         core.array[:] = back.array_r * core.array_r > 0
         left, before = core.sum(), left
-    inner = follows.copy()
-    inner.diagonalScale(core, core)
-    indptr, columns, values = inner.getValuesCSR()
+    follows.diagonalScale(core, core)
+    indptr, columns, values = follows.getValuesCSR()
     row = np.repeat(np.arange(first, end), np.diff(indptr))
     links = np.stack([row, columns], axis=1).astype(np.int64)[values > 0]
     label, rank = components(comm, links, np.arange(first, end), strong=True)
@@ -120,7 +123,7 @@ class Rings:
         space: the nodes whose components are restricted.
         equations: of this rank.
         lift: how each acts on its node ``(m, block)``.
-        follows: entries of one where an equation follows another one.
+        parts: by which an equation, its row, follows another one, its column, positive ``(m, m)``.
 
     Attributes:
         equations: in the order of those that are given.
@@ -129,8 +132,8 @@ class Rings:
         DependentRingError: if equations of a ring depend on each other.
     """
 
-    def __init__(self, space: Nodes, equations: UnitingEquations, lift: Array, follows: PETSc.Mat):
-        label, rank = in_rings(follows)
+    def __init__(self, space: Nodes, equations: UnitingEquations, lift: Array, parts: PETSc.Mat):
+        label, rank = in_rings(parts)
         self._mine = np.flatnonzero(label >= 0)
         held = equations.select(label >= 0)
         held = replace(held, node=space.to_global(held.node))
