@@ -35,15 +35,15 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError", "InputTypeError",
-    "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
-    "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
-    "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
-    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError",
-    "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
-    "consistent_mass", "dirichlet", "ds", "dx", "figure", "function_space", "generalised_alpha", "integrate", "interpolate", "load_steps",
-    "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene",
-    "read_checkpoint", "read_gmsh", "time_steps", "timing", "timings", "write_checkpoint",
+    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError",
+    "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
+    "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError",
+    "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface",
+    "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
+    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "consistent_mass", "dirichlet", "ds",
+    "dx", "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "tangent",
+    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -108,6 +108,7 @@ from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
+from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem

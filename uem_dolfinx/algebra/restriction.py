@@ -271,6 +271,19 @@ class Restriction:
         """Increment that closes the gaps and carries the prescribed displacements; not to be changed (first time: collective)."""
         return self._series(self.d)
 
+    def carried(self, prescribed: Array) -> PETSc.Vec:
+        """What prescribed increments ``(n_owned, block)`` alone make of c: ``S (1 - L A) p`` with the series S of P (collective)."""
+        eq, p = self.equations, np.array(prescribed)
+        np.add.at(p, eq.node, -self.lift * np.einsum("mg,mg->m", eq.direction, prescribed[eq.node])[:, None])
+        return self._series(self.space.vector(p))
+
+    def carried_back(self, F: PETSc.Vec) -> Array:
+        """The transpose of ``carried``: ``(1 - A'L') S'F (n_owned, block)`` (collective)."""
+        eq, t = self.equations, self.pass_on(F).array_r.reshape(-1, self.space.block).copy()
+        along = np.einsum("mg,mg->m", self.lift, t[eq.node])
+        np.add.at(t, eq.node, -along[:, None] * eq.direction)
+        return t
+
     def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
         """``P dq``, without c."""
         q = dq.array_r.reshape(-1, self.space.block)

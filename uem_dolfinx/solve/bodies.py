@@ -63,6 +63,8 @@ class Bodies:
     ):
         self.config, self.comm, self.u, self.bcs = config, config.comm, config.u, list(bcs)
         self.materials, self.dynamics = list(materials), dynamics
+        #: The residual in UFL.
+        self.F = F
         self.tangent = Tangent(F, self.u, self.materials, dynamics)
         with compiling("the residual"):
             self._F = forms.form(F)

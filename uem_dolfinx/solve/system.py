@@ -425,6 +425,11 @@ class BodySystem:
         dq = self.solver.complete(step.dq)
         return step if dq is step.dq else step._replace(dq=dq, du=self.move(problem.state, dq))
 
+    @property
+    def curvature(self) -> PETSc.Mat | None:
+        """Curvature of the contact in the last united matrix; None where it had none."""
+        return self._curvature
+
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
         self._factored = None
