@@ -141,6 +141,33 @@ def test_forward_and_adjoint_agree(cell, degree, coupling, rigid, law):
     assert uem.integrate(ufl.algorithms.expand_derivatives(explicit)) == pytest.approx(adjoint, rel=1e-11)
 
 
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_a_body_that_contact_alone_holds(coupling):
+    """A block that lies on another by its weight stays where it is across it: derivatives along that motion are zero, others right."""
+    b = blocks(COMM, "triangle", 4, 6, overhang=0.25)
+    E, weight = fem.Constant(b.scene.mesh, 1.0), fem.Constant(b.scene.mesh, 0.05)
+    F = uem.NeoHooke(E, 0.3, kind="plane_strain").residual(b.u, ufl.TestFunction(b.V)) * ufl.dx
+    F += weight * ufl.TestFunction(b.V)[1] * ufl.dx
+    J = ufl.inner(b.u, b.u) * ufl.dx + 0.1 * b.u[0] * ufl.dx
+
+    def value(h, control):
+        before = float(control.value)
+        control.value += h
+        b.u.x.array[:] = 0.0
+        contact = uem.Contact(b.high, b.low, coupling=coupling)
+        value.problem = uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[contact], rtol=1e-13)
+        run(value.problem)
+        control.value = before
+        return uem.integrate(J)
+
+    for control in (E, weight):
+        value(0.0, control)
+        (by,) = uem.gradient(value.problem, J, control)
+        du = uem.tangent(value.problem, [(control, 1.0)])
+        assert uem.integrate(ufl.derivative(J, b.u, du)) == pytest.approx(float(by), rel=1e-10)
+        assert uem.taylor_test(lambda h, control=control: value(h, control), float(by), 1e-3, 2) >= 1.95
+
+
 def test_the_state_is_left_as_it_was():
     """A gradient between two steps changes neither the state nor what comes next."""
     ends = []

@@ -170,6 +170,14 @@ class _Linearised:
         self.test = self.F.arguments()[0]
 
     def __enter__(self) -> _Linearised:
+        try:
+            self._linearise()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def _linearise(self) -> None:
         bodies, system = self.problem.bodies, self.problem.system
         assert isinstance(system, BodySystem)
         bodies.wanted[:] = self.config.displacement
@@ -188,7 +196,6 @@ class _Linearised:
                 "%d contactor(s) have neither force nor gap: the functional has another gradient on either side, and this is that of "
                 "the contactors that are active now", idle,
             )  # fmt: skip
-        return self
 
     def __exit__(self, *error: object) -> None:
         # the next step makes a united matrix of its own
@@ -199,6 +206,11 @@ class _Linearised:
         """``P dq`` under forces: symmetric, since P is Q without friction (collective)."""
         dq, _ = self.problem.solver.solve(self.P.transpose(forces), ACCURACY)
         return self.P.expand(dq)
+
+    def held(self, v: PETSc.Vec) -> PETSc.Vec:
+        """Without what bodies that contact alone holds move along it, where steps leave them; its own transpose (collective)."""
+        assert isinstance(self.problem.system, BodySystem)
+        return self.config.vector(self.problem.system.floating.without_open_motions(np.array(v.array_r)))
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
         """``(K + G) du`` (collective)."""
@@ -227,7 +239,7 @@ class _Linearised:
         du = self.solve(forces - self.stiffness(c))
         du.axpy(1.0, c)
         du.axpy(-1.0, shape)
-        return du
+        return self.held(du)
 
     def prescribed_with(self, m: Any, values: Array) -> Array:
         """Dirichlet values of the owned components with other ``values`` of a control, zero where free ``(n_owned, gdim)``."""
@@ -251,6 +263,7 @@ class _Adjoint:
         self.at, self.config, self.J = at, at.config, J
         config, of_u = at.config, _derivative(J, at.problem.u, at.test)
         drive = config.vector() if of_u is None else config.vector(forms.assemble_array(config.V, forms.form(of_u)))
+        drive = at.held(drive)
         along = at.solve(drive)
         self.a = fem.Function(config.V)
         self.a.x.array[: len(along.array_r)] = along.array_r
