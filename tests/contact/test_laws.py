@@ -92,7 +92,11 @@ class Limited:
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize(
-    ("cell", "degree", "rigid"), [("quadrilateral", 1, False), ("triangle", 2, False), ("hexahedron", 1, True)]
+    ("cell", "degree", "rigid"),
+    [
+        ("quadrilateral", 1, False),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("triangle", 2, False), ("hexahedron", 1, True))),
+    ],
 )
 def test_coulomb_with_a_limit(cell, degree, rigid, coupling):
     """It is Coulomb's where little presses and Tresca's where much does."""
