@@ -31,6 +31,11 @@ M = oedometric()
 serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
 
 
+def slow(*values: object) -> Any:
+    """Values of a test that is among the slow ones."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def raised(error: type[Exception], match: str, call: Callable[[], object]) -> Exception:
     """The same error on all ranks, of this class and of no other of the package's, with a message that matches (collective)."""
     with pytest.raises(error, match=match or None) as caught:

@@ -11,16 +11,11 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import RADIUS, cylinder, driven, fields, history, loose
-from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, lowest, modulus, refused, rotation, run, st_venant
+from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, lowest, modulus, refused, rotation, run, slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.solve.tangent import curvature_of
-
-
-def slow(*values):
-    """Values of a test that is among the slow ones."""
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("mu", [slow(0.1), 0.3, slow(0.9)])

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from friction_scenes import cylinder, driven, fields, loose
-from helpers import st_venant
+from helpers import slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -18,11 +18,6 @@ from uem_dolfinx.solve.tangent import contact_curvature
 
 COMM = MPI.COMM_WORLD
 MORTAR = {"coupling": "mortar"}
-
-
-def slow(*values):
-    """Values of a test that is among the slow ones."""
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def friction_at_nodes(contact):

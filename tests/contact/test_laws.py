@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import blocks, clamp, linear, modulus, raised, run
+from helpers import blocks, clamp, linear, modulus, raised, run, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx.contact.node_to_surface import NodeToSurface
@@ -95,7 +95,7 @@ class Limited:
     ("cell", "degree", "rigid"),
     [
         ("quadrilateral", 1, False),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("triangle", 2, False), ("hexahedron", 1, True))),
+        *(slow(*one) for one in (("triangle", 2, False), ("hexahedron", 1, True))),
     ],
 )
 def test_coulomb_with_a_limit(cell, degree, rigid, coupling):

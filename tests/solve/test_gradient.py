@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import blocks, clamp, linear, modulus, raised, refused, run
+from helpers import blocks, clamp, linear, modulus, raised, refused, run, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -30,10 +30,6 @@ SCENES = [
     ("tetrahedron", 1, "mortar", False, "linear"),
     ("hexahedron", 1, "node_to_surface", False, "neo"),
 ]
-
-
-def slow(*values):
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def wave(V, size=1.0):

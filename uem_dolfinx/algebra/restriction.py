@@ -95,10 +95,7 @@ class Restriction:
     def _hold(self, equations: UnitingEquations, prescribed: Array) -> None:
         """Take the equations, which eliminate what they are known to, and what closes their gaps (collective)."""
         self.equations = equations
-        closure = np.array(prescribed)
-        known = np.einsum("mg,mg->m", equations.direction, prescribed[equations.node])
-        np.add.at(closure, equations.node, -self.lift * (equations.gap + known)[:, None])
-        self.d = self.space.vector(closure)
+        self.d = self._closing(prescribed, equations.gap)
         #: Terms of the equations that hold, which are those of M, and the nodes that they follow.
         self._held = equations.select(equations.active)
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
@@ -273,9 +270,14 @@ class Restriction:
 
     def carried(self, prescribed: Array) -> PETSc.Vec:
         """What prescribed increments ``(n_owned, block)`` alone make of c: ``S (1 - L A) p`` with the series S of P (collective)."""
-        eq, p = self.equations, np.array(prescribed)
-        np.add.at(p, eq.node, -self.lift * np.einsum("mg,mg->m", eq.direction, prescribed[eq.node])[:, None])
-        return self._series(self.space.vector(p))
+        return self._series(self._closing(prescribed, np.zeros(len(self.equations))))
+
+    def _closing(self, prescribed: Array, gap: Array) -> PETSc.Vec:
+        """``p - L (gap + A p)``: what each node does by itself to close gaps ``(m,)`` under prescribed increments p."""
+        eq, closure = self.equations, np.array(prescribed)
+        known = np.einsum("mg,mg->m", eq.direction, prescribed[eq.node])
+        np.add.at(closure, eq.node, -self.lift * (gap + known)[:, None])
+        return self.space.vector(closure)
 
     def carried_back(self, F: PETSc.Vec) -> Array:
         """The transpose of ``carried``: ``(1 - A'L') S'F (n_owned, block)`` (collective)."""

@@ -139,21 +139,18 @@ class Rings:
         held = replace(held, node=space.to_global(held.node))
         there, self._exchange = send(space.comm, held, rank[label[self._mine]])
         lift, label, place = self._exchange.send(lift[self._mine], label[self._mine], self._mine)
-        closed = [_close(there, lift, np.flatnonzero(label == k)) for k in np.unique(label)]
-        self._check(space, equations, closed, len(place))
-        self._rings = [ring for ring in closed if isinstance(ring, _Closed)]
+        rows = [np.flatnonzero(label == k) for k in np.unique(label)]
+        closed = [_close(there, lift, own) for own in rows]
+        self._check(space, equations, np.isin(label, [label[own[0]] for own, ring in zip(rows, closed) if ring is None]))
+        self._rings = [ring for ring in closed if ring is not None]
         order = np.concatenate([np.zeros(0, np.int64), *(ring.rows for ring in self._rings)])
         solved = UnitingEquations.join([ring.equations for ring in self._rings], space.block)
         solved, back = send(space.comm, solved, self._exchange.origins[order])
         (at,) = back.send(place[order])
         self.equations = _replaced(equations, solved, at)
 
-    def _check(self, space: Nodes, equations: UnitingEquations, closed: list[_Closed | Ints], n: int) -> None:
-        """Raise if any ring could not be closed (collective)."""
-        bad = np.zeros(n, dtype=bool)
-        for ring in closed:
-            if not isinstance(ring, _Closed):
-                bad[ring] = True
+    def _check(self, space: Nodes, equations: UnitingEquations, bad: Bools) -> None:
+        """Raise if any equations here are of rings that could not be closed (collective)."""
         dependent, error = np.zeros(len(equations), dtype=bool), None
         (dependent[self._mine[self._exchange.rows]],) = self._exchange.back(bad)
         if dependent.any():
@@ -179,8 +176,8 @@ class Rings:
         return given
 
 
-def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | Ints:
-    """A ring of equations ``rows`` of global nodes, closed; these numbers if they depend on each other."""
+def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | None:
+    """A ring of equations ``rows`` of global nodes, closed; None if they depend on each other."""
     from scipy.sparse import csr_matrix, identity
     from scipy.sparse.linalg import LinearOperator, onenormest, splu
 
@@ -199,13 +196,13 @@ def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | Ints:
     try:
         factor = splu((identity(m) - M).tocsc())
     except RuntimeError:
-        # PETSc's word for it would be a zero pivot
-        return rows
+        # 1 - M is singular to the last bit
+        return None
     inverse = LinearOperator(
         (m, m), matvec=factor.solve, rmatvec=lambda v: factor.solve(v, "T"), matmat=factor.solve, dtype=float
     )
     if not onenormest(inverse) <= 1.0 / DEPENDENT:
-        return rows
+        return None
     B = (C - M @ A).tocsc()
     used = np.unique(np.flatnonzero(np.diff(B.indptr)) // g)
     terms: list[tuple[Ints, Ints, Array]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, g)))]

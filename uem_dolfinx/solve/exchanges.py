@@ -144,9 +144,14 @@ class Exchanges:
         comm = self._pairs[0].config.comm
         if self.frozen:
             violated = [w.of_contact() for w in violated]
-        own = (sum(w.count for w in violated), sum(int(w.enter.sum()) for w in violated), active_here(self._pairs))
+        own = (
+            sum(w.count for w in violated),
+            sum(int(w.enter.sum()) for w in violated),
+            active_here(self._pairs),
+            sum(len(p.nodes) for p in self._pairs),
+        )
         told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
-        (number, entering, active), state = told[:, :3].sum(axis=0), tuple(told[:, 3])
+        (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
         self.again = False
         if not number:
             if not self.held:
@@ -184,7 +189,7 @@ class Exchanges:
         self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
         if rule == Rule.FIRST:
             self._alone += 1
-            if self._alone > MOST_OF_EACH * reduced(comm, sum(len(pair.nodes) for pair in self._pairs)):
+            if self._alone > MOST_OF_EACH * every:
                 raise self._circle(self._lately)
             return chosen
         self._solve_again()

@@ -39,8 +39,6 @@ from uem_dolfinx.solve.system import CLOSED, BodySystem
 
 #: What a functional may be differentiated by.
 Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
-KINDS = (fem.Constant, fem.Function, ufl.SpatialCoordinate)
-NAMES = "Constants, Functions, or ufl.SpatialCoordinate(mesh)"
 
 
 def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | Control) -> list[Array | fem.Function]:
@@ -65,7 +63,7 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
             consistent tangent, or what is no functional or no control of this problem.
         LinearSolveError: if the united matrix is singular.
     """
-    some = [controls] if isinstance(controls, KINDS) else list(controls)
+    some = [controls] if isinstance(controls, Control) else list(controls)
     _check(problem, some)
     with agreed(problem.comm):
         given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
@@ -134,7 +132,7 @@ def _check(problem: UnitedProblem, controls: Sequence[Any]) -> None:
         if not problem.progress.steps:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         for control in controls:
-            given.kind("controls", control, isinstance(control, KINDS), NAMES)
+            given.kind("controls", control, isinstance(control, Control), "Constants, Functions, or ufl.SpatialCoordinate(mesh)")
             if control is problem.u:
                 raise InputError("controls hold the displacement, which the problem solves for: expected what it is made of")
             if isinstance(control, ufl.SpatialCoordinate):
@@ -229,7 +227,7 @@ class _Linearised:
             if (form := _along(self.F, m, change)) is not None:
                 forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
             values = change.x.array if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
-            prescribed += self.prescribed_with(m, values) - self.prescribed_with(m, 0.0 * values)
+            prescribed += self.prescribed_by(m, values)
         forces.axpy(1.0, self.K * shape)
         held = ~self.problem.bodies.free[: config.n_owned]
         c = self.P.carried(prescribed + np.where(held, shape.array_r.reshape(-1, config.gdim), 0.0))
@@ -238,14 +236,17 @@ class _Linearised:
         du.axpy(-1.0, shape)
         return self.held(du)
 
-    def prescribed_with(self, m: Any, values: Array) -> Array:
-        """Dirichlet values of the owned components with other ``values`` of a control, zero where free ``(n_owned, gdim)``."""
-        bodies, config, out = self.problem.bodies, self.config, np.zeros(len(self.problem.u.x.array))
+    def prescribed_by(self, m: Any, values: Array) -> Array:
+        """What the ``values`` of a control make of the Dirichlet values of the owned components, zero where free ``(n_owned, gdim)``."""
+        bodies, config, found = self.problem.bodies, self.config, []
         before = np.array(m.x.array if isinstance(m, fem.Function) else m.value)
-        _set(m, values)
-        compat.set_bc_values(out, bodies.bcs)
+        for now in (values, 0.0 * values):
+            out = np.zeros(len(self.problem.u.x.array))
+            _set(m, now)
+            compat.set_bc_values(out, bodies.bcs)
+            found.append(out)
         _set(m, before)
-        return np.where(bodies.free, 0.0, out.reshape(-1, config.gdim))[: config.n_owned]
+        return np.where(bodies.free, 0.0, (found[0] - found[1]).reshape(-1, config.gdim))[: config.n_owned]
 
 
 class _Adjoint:
@@ -257,7 +258,7 @@ class _Adjoint:
     """
 
     def __init__(self, at: _Linearised, J: ufl.Form):
-        self.at, self.config, self.J = at, at.config, J
+        self.at, self.config = at, at.config
         config, of_u = at.config, _derivative(J, at.problem.u, at.test)
         drive = config.vector() if of_u is None else config.vector(forms.assemble_array(config.V, forms.form(of_u)))
         drive = at.held(drive)
@@ -265,6 +266,8 @@ class _Adjoint:
         self.a = fem.Function(config.V)
         self.a.x.array[: len(along.array_r)] = along.array_r
         self.a.x.scatter_forward()
+        #: J, and the work of the residual along a, with their signs.
+        self._forms = (J, 1.0), (ufl.replace(at.F, {at.test: self.a}), -1.0)
         held = ~at.problem.bodies.free[: config.n_owned]
         self.by_values = np.where(held, at.P.carried_back(drive - at.stiffness(along)), 0.0)
         #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
@@ -286,8 +289,7 @@ class _Adjoint:
             for form, sign in self._forms:
                 if (part := _along(form, m, unit)) is not None:
                     found[entry] += sign * forms.assemble_scalar(forms.form(part), comm)
-            moved = self.at.prescribed_with(m, unit) - self.at.prescribed_with(m, 0.0 * unit)
-            found[entry] += float(reduced(comm, float((self.by_values * moved).sum())))
+            found[entry] += float(reduced(comm, float((self.by_values * self.at.prescribed_by(m, unit)).sum())))
         return found
 
     def _by_function(self, m: fem.Function) -> fem.Function:
@@ -296,8 +298,7 @@ class _Adjoint:
         found = fem.Function(V)
         self._assemble(found, lambda form: _derivative(form, m, ufl.TestFunction(V)))
         # conditions that take its values tell which
-        size = len(m.x.array)
-        which = self.at.prescribed_with(m, np.arange(1.0, size + 1)) - self.at.prescribed_with(m, np.zeros(size))
+        which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own, added = which > 0.5, fem.Function(V)
         np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.by_values[own])
         forms.sum_ghosts(added)
@@ -311,11 +312,6 @@ class _Adjoint:
         found.x.array[: len(self._by_places)] += self._by_places
         found.x.scatter_forward()
         return found
-
-    @property
-    def _forms(self) -> tuple[tuple[ufl.Form, float], ...]:
-        """J, and the work of the residual along a, with their signs."""
-        return (self.J, 1.0), (ufl.replace(self.at.F, {self.at.test: self.a}), -1.0)
 
     def _assemble(self, found: fem.Function, derivative: Callable[[ufl.Form], ufl.Form | None]) -> None:
         """Add up the derivatives of both forms."""
