@@ -126,7 +126,7 @@ if args.plot:
             panels[1].legend()
 if args.output:
     with uem.ResultsWriter(f"{args.output}/identify", work["problem"]) as writer:
-        writer.write()
+        writer.write(1.0)
 
 # %%
 assert results["modulus_error"] < 1e-5
