@@ -35,7 +35,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "HistoryWriter", "InputError",
+    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "GeneralContact", "HistoryWriter", "InputError",
     "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
     "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError",
     "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface",
@@ -62,6 +62,7 @@ except ImportError as _error:
 from uem_dolfinx.algebra.options import multigrid_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Balance, Contact, Resultant
+from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.tresca import Tresca
 from uem_dolfinx.dynamics.inertia import Dynamics

@@ -196,6 +196,18 @@ def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
     return total
 
 
+def sums_by_keys(comm: MPI.Comm, keys: Ints, values: AnyArray) -> AnyArray:
+    """Sums of the rows of ``values (n, k)`` with equal ``keys (n, l)`` over all ranks, for every row ``(n, k)`` (collective)."""
+    meeting = Exchange.to(comm, keys[:, 0] % comm.size)
+    met, their = meeting.send(keys, values)
+    _, inverse = np.unique(met, axis=0, return_inverse=True)
+    sums = np.zeros((inverse.max(initial=-1) + 1, values.shape[1]))
+    np.add.at(sums, inverse.ravel(), their)
+    total = np.empty(values.shape)
+    (total[meeting.rows],) = meeting.back(sums[inverse.ravel()])
+    return total
+
+
 def gathered(comm: MPI.Comm, value: Any) -> AnyArray:
     """A number, or an array ``(...)`` of the same shape on all ranks, of every rank ``(n_ranks, ...)``, in one call (collective)."""
     own = np.ascontiguousarray(value)

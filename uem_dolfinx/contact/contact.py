@@ -192,15 +192,7 @@ class Contact:
             friction=parameters(as_law(self.friction)), measure=self.measure,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
-        nodes = surface_nodes(config, self.contactor)
-        target: Target
-        if hasattr(self.target, "project"):
-            target = shared_target(self.target, config.comm, config.gdim)
-        else:
-            self.target = as_tag(self.target, config.mesh, (facets,), "target")
-            surface = TargetFacets(config, self.target)
-            check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
-            target = MeshTarget(surface, averaged=self.normals == "averaged")
+        nodes, target = self._sides(config)
         thickness = np.inf if self.thickness is None else self.thickness
         how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
         discretisation: Discretisation
@@ -232,6 +224,16 @@ class Contact:
         self._pair = Interface(config, nodes, discretisation, friction, **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def _sides(self, config: Configuration) -> tuple[Indices, Target]:
+        """Owned contactor nodes, and what they may touch (collective)."""
+        nodes = surface_nodes(config, self.contactor)
+        if hasattr(self.target, "project"):
+            return nodes, shared_target(self.target, config.comm, config.gdim)
+        self.target = as_tag(self.target, config.mesh, (config.tdim - 1,), "target")
+        surface = TargetFacets(config, self.target)
+        check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
+        return nodes, MeshTarget(surface, averaged=self.normals == "averaged")
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""

@@ -216,6 +216,10 @@ class Discretisation(Protocol):
         """Whether contact forces act at the feet of the projection."""
 
     @property
+    def ordered_by(self) -> int:
+        """Number of the order in which bodies follow each other, which rows of this and others of that order keep; -1 without one."""
+
+    @property
     def chained(self) -> bool:
         """Whether contactors may follow each other."""
 

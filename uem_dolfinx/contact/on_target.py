@@ -31,6 +31,8 @@ class OnTarget:
         anchor: projection whose feet a contact with small or fixed sliding keeps.
     """
 
+    ordered_by = -1
+
     def __init__(
         self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf
     ):

@@ -36,7 +36,9 @@ class Crossings:
     normal: Array
 
 
-def find_crossings(start: tuple[Array, Array], end: tuple[Array, Array], sign: Array, reach: float) -> Crossings:
+def find_crossings(
+    start: tuple[Array, Array], end: tuple[Array, Array], sign: Array, reach: float, meet: Callable[[Ints, Ints], Bools] | None = None
+) -> Crossings:
     """Crossings of ``n`` points with ``m`` simplices of ``gdim`` nodes each, all of which move straight.
 
     Args:
@@ -44,9 +46,13 @@ def find_crossings(start: tuple[Array, Array], end: tuple[Array, Array], sign: A
         end: the same at the end.
         sign: 1 where a simplex is numbered so that its normal points out of its body, -1 where it points inwards ``(m,)``.
         reach: length by which each point's way is continued at both ends: points that rest on a facet cross it.
+        meet: which of points and simplices ``(k,)`` each count; None are all.
     """
     (p0, x0), (p1, x1) = start, end
     i, f = _near(p0, p1, x0, x1, reach)
+    if meet is not None:
+        some = meet(i, f)
+        i, f = i[some], f[some]
     p0, p1, x0, x1 = p0[i], p1[i], x0[f], x1[f]
     way = np.linalg.norm(p1 - p0 - (x1 - x0).mean(axis=1), axis=1)
     further = np.minimum(reach / np.where(way > 0, way, np.inf), 1.0)

@@ -111,10 +111,14 @@ class Nodes:
         """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
         return Halo(self, nodes).take(lambda own: values[own])
 
+    def send_to_owners(self, nodes: Ints, values: Array) -> tuple[Ints, Array]:
+        """Values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners: owned nodes, repeated or not, and values (collective)."""
+        there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
+        return there - self.first, arrived
+
     def add_at_owners(self, nodes: Ints, values: Array) -> Array:
         """Sums of values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners ``(n_owned, k)`` (collective)."""
-        there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
-        return sums_of_rows(there - self.first, arrived, self.n_owned)
+        return sums_of_rows(*self.send_to_owners(nodes, values), self.n_owned)
 
     def describe(self, node: int) -> str:
         """Where a local node is, for error messages."""

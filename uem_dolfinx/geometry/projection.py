@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -146,6 +146,10 @@ class FacetProjection:
         for name, value in values.items():
             updates[name][which] = value
         return replace(self, **updates)
+
+    def take(self, which: Ints) -> FacetProjection:
+        """Some of its rows ``(k,)``."""
+        return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).

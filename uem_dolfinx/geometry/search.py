@@ -6,7 +6,7 @@ ever holds a whole surface; what follows from them is found where the point is.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -80,8 +80,13 @@ class MeshTarget:
         self.stride = 0.5 * reduced(self.comm, float(shortest), op=MPI.MIN)
         self.first: Ints = np.append(0, np.cumsum(gathered(self.comm, len(facets.dofs))))
 
-    def project(self, points: Array) -> FacetProjection:
-        """Exact closest points of ``points (n, gdim)`` on the whole target (collective)."""
+    def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
+        """Exact closest points of ``points (n, gdim)`` on the whole target (collective).
+
+        Args:
+            points: positions.
+            which: of the contactors they are ``(n,)``, where it matters who asks; None are all.
+        """
         data, size = self.facets.current(corners=True), self.comm.size
         if size == 1:
             return self._evaluate(points, self._project_here(points, data))
@@ -146,6 +151,14 @@ class MeshTarget:
         """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
         return self.of_facets(facet, self.facets.keys)
 
+    def told(self, which: Ints) -> Ints:
+        """What tells which facets the contactors ``which (k,)`` may pass through: nothing, they may touch all ``(k,)``."""
+        return np.zeros(len(which), np.int64)
+
+    def may_touch(self, told: Ints, facet: Ints) -> Bools:
+        """Whether contactors of whom this was ``told (k,)`` may touch this rank's facets ``(k,)``."""
+        return np.ones(len(told), bool)
+
     def of_facets(self, facet: Ints, values: AnyArray) -> Any:
         """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
         exchange = self._to_owners(facet)
@@ -197,24 +210,33 @@ class MeshTarget:
         rows, feet = exchange.rows, Feet._make(exchange.back(*feet))
         if found is not None:
             rows, feet = np.append(rows, np.arange(len(points))), Feet._make(map(np.concatenate, zip(feet, found)))
+        return self._nearest_foot(points, rows, feet)
+
+    def _nearest_foot(self, points: Array, rows: Ints, feet: Feet) -> tuple[FacetProjection, Feet]:
+        """The nearest of several feet of ``points (n, gdim)``, of places ``rows (k,)``, in the order of those that have any."""
         answer = self._evaluate(points[rows], feet)
         distance = np.linalg.norm(points[rows] - answer.foot, axis=1)
         best = _nearest(rows, distance, feet.facing, feet.key, ON_SIDE * self.stride)
-        return FacetProjection(*(getattr(answer, f.name)[best] for f in fields(answer))), Feet._make(a[best] for a in feet)
+        return answer.take(best), Feet._make(a[best] for a in feet)
 
     def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> Feet:
         """Project onto this rank's facets."""
-        facing = np.zeros(len(points))
         if facet is None:
-            pairs, candidates = candidate_pairs(self.shape, data.x, points)
-            xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
-            tab = self.shape.tabulate(xi)
-            away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
-            facing = self._facing(tab, away, candidates, data)
-            best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride)
-            facet, xi, facing = candidates[best], xi[best], facing[best]
-        elif xi is None:
+            return self._on_nearest(points, data, *candidate_pairs(self.shape, data.x, points))
+        if xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
+        return self._feet(facet, xi, data, np.zeros(len(points)))
+
+    def _on_nearest(self, points: Array, data: FacetData, pairs: Ints, candidates: Ints) -> Feet:
+        """Feet of points that have candidates, on the nearest of them: places ``pairs`` of points and facets, ``(k,)`` each."""
+        xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
+        tab = self.shape.tabulate(xi)
+        away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
+        facing = self._facing(tab, away, candidates, data)
+        best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride)
+        return self._feet(candidates[best], xi[best], data, facing[best])
+
+    def _feet(self, facet: Ints, xi: Array, data: FacetData, facing: Array) -> Feet:
         of = self.facets
         return Feet(
             facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],

@@ -124,7 +124,7 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     i = np.unique(found.point[out])
     if any(comm.allgather(len(i))):
         i = found.point[out]
-        back = _dot(_normals_at_start(pair, start, i), found.normal[out]) < LOOKING_AWAY
+        back = _dot(_normals_at_start(pair, target, start, i), found.normal[out]) < LOOKING_AWAY
         depth[i[back]] = np.maximum(depth[i[back]], reach)
     return depth
 
@@ -140,9 +140,10 @@ def _crossings(target: MeshTarget, which: Ints, p0: Array, p1: Array, moved: Arr
     low, high = np.minimum(p0, p1), np.maximum(p0, p1)
     rows = [np.flatnonzero(((low <= b[1]) & (high >= b[0])).all(axis=1)) for b in comm.allgather(box)]
     there = Exchange(comm, rows)
-    q0, q1, number, home = there.send(p0, p1, which, np.full(len(which), comm.rank))
+    q0, q1, number, told, home = there.send(p0, p1, which, target.told(which), np.full(len(which), comm.rank))
     sign = np.repeat(target.facets.sign, len(pieces))
-    found = find_crossings((q0, x0[:, pieces].reshape(-1, g, g)), (q1, x1[:, pieces].reshape(-1, g, g)), sign, reach)
+    ways = (q0, x0[:, pieces].reshape(-1, g, g)), (q1, x1[:, pieces].reshape(-1, g, g))
+    found = find_crossings(*ways, sign, reach, lambda i, f: target.may_touch(told[i], f // len(pieces)))
     back = Exchange.to(comm, home[found.point])
     return Crossings(*back.send(number[found.point], found.time, found.inwards, found.normal))
 
@@ -160,10 +161,10 @@ def _entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
     return entry, leaving, np.setdiff1d(outs, leaving)
 
 
-def _normals_at_start(pair: Interface, start: Array, which: Ints) -> Array:
+def _normals_at_start(pair: Interface, target: MeshTarget, start: Array, which: Ints) -> Array:
     """Normals of the target at contactors ``which (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
     with pair.config.at(start):
-        p = pair.target.project(pair.points[which])
+        p = target.project(pair.points[which], which)
     began = pair.committed.active[which] | (p.gap < 0.0)
     return np.where(began[:, None], p.normal, 0.0)
 
@@ -180,7 +181,7 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
     if any(pair.config.comm.allgather(len(new))):
         with pair.config.at(start):
             x = pair.points[new]
-            nearest, touched = target.project(x), target.project_on(x, pair.projection.facet[new])
+            nearest, touched = target.project(x, new), target.project_on(x, pair.projection.facet[new])
         behind[new] = np.where(nearest.gap >= 0.0, -touched.gap, 0.0)
         outward, away = target.outward(nearest), x - nearest.foot
         beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
@@ -192,7 +193,7 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
         turned = (_dot(normal, outward) < sharp) & (_dot(nearest.foot - touched.foot, normal) <= PASSAGE_DEPTH * target.stride)
         other = (beside & (_dot(nearest.averaged, outward) < sharp)) | turned
         way = np.linalg.norm(x - touched.foot, axis=1)
-        unsure[new] = np.where(other & (way > target.stride), way, 0.0)
+        unsure[new] = np.where(other & (way > target.stride) & (nearest.facet >= 0), way, 0.0)
     return behind, unsure
 
 

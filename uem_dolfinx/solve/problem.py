@@ -13,6 +13,7 @@ from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
@@ -48,7 +49,7 @@ class UnitedProblem:
             forces are added by ``dynamics``.
         u: displacement, a Function of a vector Lagrange space; holds the solution.
         bcs: Dirichlet conditions.
-        contacts: contacts between bodies or with rigid surfaces; none is fine.
+        contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
             iterative solve is as accurate as its Newton iteration can use.
@@ -85,7 +86,7 @@ class UnitedProblem:
         u: fem.Function,
         *,
         bcs: Sequence[fem.DirichletBC] = (),
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[Contact | GeneralContact] = (),
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
         load: fem.Constant | Mapping[fem.Constant, Any] | Callable[[float], None] | None = None,
@@ -107,8 +108,10 @@ class UnitedProblem:
             check_residual(F, u)
             self.load = check_load(load)
             bcs = check_conditions(self.config, bcs)
-            self.contacts = given.items("contacts", contacts, lambda one: isinstance(one, Contact), "a Contact")
-            check_new(self.contacts)
+            contacts = given.items(
+                "contacts", contacts, lambda one: isinstance(one, Contact | GeneralContact), "a Contact or a GeneralContact"
+            )
+            check_new(contacts)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -119,10 +122,12 @@ class UnitedProblem:
             consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(
-            self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in self.contacts], materials=len(self.materials),
+            self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
+        #: All contacts; a general one is several.
+        self.contacts: list[Contact] = parts_of(contacts, self.config)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")

@@ -48,7 +48,10 @@ class OverConstraints:
         config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
         meets = found[:-1].reshape(meets.shape)
         self.shared = bool(found[-1])
-        self.mutual: Bools = (meets & meets.T).any(axis=1)
+        # bodies that follow each other in one order never follow each other both ways
+        ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
+        one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
+        self.mutual: Bools = (meets & meets.T & ~one_order).any(axis=1)
         for pair, mutual in zip(pairs, self.mutual):
             pair.mutual = bool(mutual)
             if mutual and not pair.discretisation.two_pass:

@@ -1,0 +1,353 @@
+"""General contact: the surfaces of all bodies against each other and against rigid ones, by one declaration.
+
+Of two bodies the nodes of one follow the facets of the other; an order of all bodies tells which, so that none follow each other in a
+ring. A node may touch as many bodies at once as there are directions to hold it in, each by a contact of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.bernstein import Bernstein
+from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
+from uem_dolfinx.contact.kinematics import Kinematics
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
+from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.results import Resultant, sum_up
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
+from uem_dolfinx.geometry.projection import Target
+from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
+from uem_dolfinx.parallel import agreed, reduced
+
+
+class _Among:
+    """Tells the lists of neighbours which facets hold contactors; before a discretisation in the order of classes."""
+
+    target: Neighbour
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
+        super().__init__(config, nodes, target, **how)  # type: ignore[call-arg]
+        self.ordered_by = target.neighbours.number
+
+    def place(self, points: Array, state: PairState) -> Kinematics:
+        """Project contactors (collective); see ``Discretisation``."""
+        self.target.hold(np.where(state.active, state.facet, -1))
+        return super().place(points, state)  # type: ignore[misc, no-any-return]
+
+    def commit(self) -> None:
+        """Nodes are in front of facets from where they are now."""
+        super().commit()  # type: ignore[misc]
+        self.target.neighbours.commit()
+
+
+class AmongBodies(_Among, NodeToSurface):
+    """Implements ``Discretisation``: nodes against the facets of the bodies that they may touch."""
+
+
+class AmongQuadraticBodies(_Among, Bernstein):
+    """The same with control gaps, of degree 2."""
+
+
+class AmongContact(Contact):
+    """One of the contacts that a general contact consists of: every node against one body near it."""
+
+    def __init__(self, general: GeneralContact, neighbours: Neighbours, number: int, **options: Any):
+        skin = neighbours.skin
+        quadratic = skin.config.degree == 2
+        coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
+        name = general.name if number == 0 else f"{general.name} {number + 1}"
+        super().__init__(skin.tag, skin.tag, coupling=coupling, name=name, **options)
+        self._neighbours, self._number = neighbours, number
+
+    def _sides(self, config: Configuration) -> tuple[Indices, Target]:
+        return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
+
+    def begin(self) -> None:
+        """Take the contact for that of a problem that is complete (collective)."""
+        super().begin()
+        # every node is beside something, and every corner of one body within the surface of all
+        self._corners = None
+
+    def look_at_ends(self) -> None:
+        """Contactors come and go past the edges of bodies."""
+
+
+class Touch(NamedTuple):
+    """Two bodies that touch, or a body and a rigid surface.
+
+    Attributes:
+        first: name of the one.
+        second: name of the other.
+        n_active: number of contactors that touch.
+        force: on the first ``(gdim,)``.
+    """
+
+    first: str
+    second: str
+    n_active: int
+    force: Array
+
+
+class GeneralContact:
+    """Every surface against every other, and against rigid ones, by one declaration.
+
+    Surfaces are found from the mesh; what does not come near anything costs next to nothing. Between two bodies the nodes of the one
+    whose facets are smaller follow the other. Bodies are what cells connect: one body does not touch itself.
+
+    Args:
+        surfaces: parts that may touch, named as for ``Contact``; None is all exterior facets.
+        rigid: rigid surfaces that all of them may touch: one, or a list.
+        exclude: parts that touch nothing, and pairs of parts ``(one, other)`` that never touch each other, of facets or of cells. What
+            another ``Contact`` of the same problem names against each other is left to it.
+        order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer first.
+        bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
+            order of the mesh's input.
+        friction: as of ``Contact``, for all.
+        normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
+        max_penetration: bound on overlaps at the start, a length; None is 5 % of the model's size.
+        measure: as of ``Contact``.
+        name: for messages and files.
+
+    Raises:
+        InputError, InputTypeError: for an unknown word, or numbers out of their range.
+    """
+
+    def __init__(
+        self,
+        surfaces: Part | None = None,
+        *,
+        rigid: Any = (),
+        exclude: Sequence[Any] = (),
+        order: Sequence[Part] = (),
+        bodies: dict[str, Part] | None = None,
+        friction: Field | FrictionLaw = 0.0,
+        normals: str = "facet",
+        max_penetration: float | None = None,
+        measure: str = "reference",
+        name: str = "general contact",
+    ):
+        with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
+            rigid = [rigid] if hasattr(rigid, "project") else rigid
+            self.rigid = given.items("rigid", rigid, lambda one: hasattr(one, "project"), "a rigid surface")
+            self.exclude = given.items("exclude", exclude, lambda one: one is not None, "a part, or a pair of parts")
+            self.order = given.items("order", order, lambda one: one is not None, "a part of a mesh")
+            given.kind("bodies", bodies, bodies is None or isinstance(bodies, dict), "names and parts, {name: part}, or None")
+            given_friction(friction)
+            self.normals = given.word("normals", normals, ("facet", "averaged"))
+            self.measure = given.word("measure", measure, ("reference", "current"))
+            if max_penetration is not None:
+                max_penetration = given.number("max_penetration", max_penetration, BOUND)
+            given.kind("name", name, isinstance(name, str) and bool(name), "a text")
+        self.surfaces, self.bodies, self.friction = surfaces, dict(bodies or {}), friction
+        self.max_penetration, self.name = max_penetration, name
+        #: Whether a problem has been made of it.
+        self.taken = False
+        self._parts: list[Contact] = []
+
+    def __repr__(self) -> str:
+        """Its name, and how many rigid surfaces it has."""
+        return f"GeneralContact({self.name!r}, rigid surfaces: {len(self.rigid)})"
+
+    def make_parts(self, config: Configuration, others: Sequence[Contact]) -> list[Contact]:
+        """The contacts that it consists of, in a problem with these ``others`` (collective).
+
+        Raises:
+            TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
+            SurfaceError: if nothing is left that may touch, or a body has two names.
+        """
+        self.taken, self._config = True, config
+        alone = [one for one in self.exclude if not _is_pair(one)]
+        pairs = [one for one in self.exclude if _is_pair(one)]
+        pairs += [(c.contactor, c.target) for c in others if not hasattr(c.target, "project")]
+        surface = _surface(config, self.surfaces, [as_tag(p, config.mesh, (config.tdim - 1, config.tdim), "exclude") for p in alone])
+        self._skin = skin = Skin(config, surface)
+        place = skin.order([_part(config, part, "order") for part in self.order])
+        self._name_bodies()
+        nodes = surface_nodes(config, surface)
+        options: dict[str, Any] = {
+            "friction": self.friction, "max_penetration": self.max_penetration, "measure": self.measure,
+        }  # fmt: skip
+        with_facets = place[skin.size > 0]
+        if len(with_facets) < 2 and not self.rigid:
+            raise SurfaceError(
+                f"{self.name}: there is one body and no rigid surface, and a body does not touch itself: give rigid=..., or leave it out"
+            )
+        parts: list[Contact] = []
+        if len(with_facets) > 1:
+            own = nodes[place[skin.body_of_node[nodes]] < with_facets.max()]
+            apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
+            bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
+            neighbours = Neighbours(skin, own, place, apart, bound, config.gdim)
+            parts += [AmongContact(self, neighbours, k, normals=self.normals, **options) for k in range(config.gdim)]
+        for i, target in enumerate(self.rigid):
+            name = getattr(target, "name", type(target).__name__)
+            name += f" {i + 1}" if len(self.rigid) > 1 else ""
+            parts.append(Contact(surface, target, name=f"{self.name} on {name}", **options))
+        self._parts = parts
+        return parts
+
+    def _name_bodies(self) -> None:
+        self._names = [f"body {k + 1}" for k in range(self._skin.n_bodies)]
+        for name, part in self.bodies.items():
+            tag = _part(self._config, part, "bodies")
+            told = np.zeros(len(self._names), bool)
+            told[self._skin.body_of_node[surface_nodes(self._config, tag)]] = True
+            for body in np.flatnonzero(reduced(self._config.comm, told, op=MPI.LOR)):
+                if self._names[body] in self.bodies:
+                    raise SurfaceError(f"bodies: '{name}' and '{self._names[body]}' are one body: give each body one name")
+                self._names[body] = name
+
+    # -- results ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def parts(self) -> list[Contact]:
+        """The contacts that it consists of: bodies with bodies, one for each that a node may touch at once, and with each rigid surface."""
+        if not self._parts:
+            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+        return self._parts
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks, of a node as many as it touches bodies (collective)."""
+        return sum(part.n_active for part in self.parts)
+
+    def max_gap(self) -> float:
+        """Largest gap of an active contactor, a length (collective)."""
+        return max(part.max_gap() for part in self.parts)
+
+    def max_pressure(self) -> float:
+        """Largest contact pressure, a force per area (collective)."""
+        return max(part.max_pressure() for part in self.parts)
+
+    @property
+    def pressure(self) -> fem.Function:
+        """Contact pressure as a scalar field on contactors, the sum where they touch several bodies (collective)."""
+        return self._sum("pressure")
+
+    @property
+    def force(self) -> fem.Function:
+        """Nodal contact forces as a vector field, on both bodies (collective)."""
+        return self._sum("force")
+
+    def _sum(self, what: str) -> fem.Function:
+        fields = [getattr(part, what) for part in self.parts]
+        total = fem.Function(fields[0].function_space, name=f"contact_{what}_in_all")
+        for field in fields:
+            total.x.array[:] += field.x.array
+        return total
+
+    def touching(self) -> list[Touch]:
+        """Bodies that touch now, and rigid surfaces with them, sorted by their numbers in the mesh's input (collective)."""
+        return [Touch(self._names[a], b, n, force) for (a, _, b), (n, force, _) in sorted(self._touching().items())]
+
+    def between(self, first: str, second: str | None = None, about: Any = None) -> Resultant:
+        """Force and moment on a body from another one or from a rigid surface (collective).
+
+        Args:
+            first: name of the body.
+            second: name of the other, of a rigid surface as ``touching`` tells it; None is all that touches it.
+            about: point that the moment is taken about ``(gdim,)``; None is the origin.
+
+        Raises:
+            InputError: for an unknown name.
+        """
+        g = self._config.gdim
+        given.word("first", first, tuple(self._names))
+        centre = np.zeros(g) if about is None else given.vector("about", about, g)
+        total = sum_up(self._config.comm, np.zeros((0, g)), np.zeros((0, g)))
+        force, moment = total.force * np.ones(g), total.moment * 1.0
+        for (a, _, b), (_, f, m) in self._touching(centre).items():
+            if first == self._names[a] and second in (None, b):
+                force, moment = force + f, moment + m
+            elif first == b and second in (None, self._names[a]):
+                force, moment = force - f, moment - m
+        return Resultant(force, moment)
+
+    def _touching(self, centre: Array | None = None) -> dict[tuple[int, int, str], tuple[int, Array, Array]]:
+        """Numbers of contactors that touch, forces and moments on the first, by number of the first, and number and name of the second."""
+        from uem_dolfinx.contact.results import moments
+
+        config, skin, found = self._config, self._skin, {}
+        centre = np.zeros(config.gdim) if centre is None else centre
+        for k, part in enumerate(self.parts):
+            pair = part.pair
+            i = np.flatnonzero(pair.trial.active)
+            target = pair.target
+            second = np.full(len(i), skin.n_bodies + k)
+            if isinstance(target, Neighbour):
+                second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
+            first, force = skin.body_of_node[pair.nodes[i]], pair.trial.force[i]
+            rows = np.column_stack([np.ones(len(i)), force, moments(pair.points[i] - centre, force)])
+            keys, inverse = np.unique(first * (skin.n_bodies + len(self.parts)) + second, return_inverse=True)
+            sums = np.zeros((len(keys), rows.shape[1]))
+            np.add.at(sums, inverse.ravel(), rows)
+            for key, row in (item for own in config.comm.allgather(list(zip(keys.tolist(), sums))) for item in own):
+                a, b = divmod(key, skin.n_bodies + len(self.parts))
+                name = self._names[b] if b < skin.n_bodies else part.name.removeprefix(f"{self.name} on ")
+                n, f, m = found.get((a, b, name), (0, 0.0, 0.0))
+                found[a, b, name] = n + int(row[0]), f + row[1 : 1 + config.gdim], m + row[1 + config.gdim :]
+        return found
+
+
+def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration) -> list[Contact]:
+    """Contacts with general ones taken apart (collective)."""
+    single = [one for one in contacts if isinstance(one, Contact)]
+    return [part for one in contacts for part in ([one] if isinstance(one, Contact) else one.make_parts(config, single))]
+
+
+def _is_pair(one: Any) -> bool:
+    """Whether this is a pair of parts, rather than one."""
+    return isinstance(one, tuple) and len(one) == 2 and not hasattr(one[0], "indices") and not isinstance(one[0], int | np.integer)
+
+
+def _part(config: Configuration, part: Part, role: str) -> Tag:
+    return as_tag(part, config.mesh, (config.tdim - 1, config.tdim), role)
+
+
+def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag]) -> Tag:
+    """The facets that may touch something (collective)."""
+    mesh, facets = config.mesh, config.tdim - 1
+    if surfaces is None:
+        mesh.topology.create_connectivity(facets, config.tdim)
+        surfaces = np.asarray(exterior_facet_indices(mesh.topology))
+    tag = as_tag(surfaces, mesh, (facets,), "surfaces")
+    left = tag.entities
+    for part in without:
+        if part.dim == config.tdim:
+            mesh.topology.create_connectivity(facets, config.tdim)
+            behind = mesh.topology.connectivity(facets, config.tdim)
+            left = np.array([f for f in left if not np.isin(behind.links(f), part.entities).any()], dtype=np.int32)
+        else:
+            left = np.setdiff1d(left, part.entities)
+    if reduced(config.comm, len(left)) == 0:
+        raise SurfaceError("general contact: exclude leaves no facet that may touch: leave some out of exclude")
+    return Tag("all surfaces", 0, facets, mesh, left.astype(np.int32))
+
+
+def _where(skin: Skin, part: Part) -> tuple[Bools, Bools]:
+    """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part (collective)."""
+    config = skin.config
+    tag = _part(config, part, "exclude")
+    nodes = np.zeros(config.n_local, bool)
+    nodes[surface_nodes(config, tag)] = True
+    if tag.dim == config.tdim:
+        return nodes, np.isin(skin.cells, tag.entities)
+    config.mesh.topology.create_connectivity(config.tdim, tag.dim)
+    links = config.mesh.topology.connectivity(config.tdim, tag.dim)
+    facet: Ints = np.array([links.links(c)[s] for c, s in zip(skin.cells, skin.sides)], dtype=np.int64)
+    return nodes, np.isin(facet, tag.entities)
+

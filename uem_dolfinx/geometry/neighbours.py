@@ -1,0 +1,272 @@
+"""Which facets of which bodies each surface node may touch: lists that are made anew only when something has moved far enough.
+
+A facet may hold a node if it belongs to a body that the node's own follows, if it faces the node, and if the node was in front of it in
+the last state that was kept. All that is not listed costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import count
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.geometry.facets import FacetData
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import EQUALLY_NEAR, Feet, MeshTarget, balls_that_meet, box_distances
+from uem_dolfinx.geometry.shapes import closest_point, unit_normals
+from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange, gathered, reduced
+
+#: Lists reach so far ahead of every body, if it hardly moves.
+#: [convention; mean length of the sides of its facets; test_general_contact.py::test_lists_last]
+AHEAD_AT_REST = 0.5
+#: Lists reach ahead of a body by so many times what it moves in a step.
+#: [convention; motion in a step; test_general_contact.py::test_lists_last]
+STEPS_AHEAD = 4.0
+#: A facet faces a node if the cosine of the angle between its normal and that of a facet around the node is smaller than minus this.
+#: [convention; cosine; test_general_contact.py::test_who_faces_whom]
+FACING = 0.1
+#: A node that was farther behind a facet than this is not in front of it.
+#: [convention; depth of the cell behind, or half a side of the facet; test_general_contact.py::test_through_a_thin_plate]
+BEHIND = 0.25
+
+_orders = count()
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Pairs of nodes and facets, each on the facet's rank.
+
+    Attributes:
+        exchange: with the ranks that have facets for this rank's nodes; its rows are places of nodes.
+        node: places among the nodes received ``(k,)``.
+        facet: of this rank ``(k,)``.
+        empty: whether there is none on any rank.
+    """
+
+    exchange: Exchange
+    node: Ints
+    facet: Ints
+    empty: bool
+
+
+class Neighbours:
+    """Lists of what surface nodes may touch, one for each of the bodies that a node may touch at once (collective).
+
+    Args:
+        skin: the surfaces.
+        nodes: owned surface nodes that may touch others ``(n,)``.
+        place: of each body in the order in which they follow each other ``(n_bodies,)``.
+        apart: pairs of sets of facets that never touch each other, as local nodes and this rank's facets of both, each once.
+        overlap: bound on what nodes may be inside others at the start, a length.
+        n_lists: how many bodies a node may touch at once.
+    """
+
+    def __init__(
+        self, skin: Skin, nodes: Indices, place: Ints, apart: Sequence[tuple[Bools, Bools, Bools, Bools]], overlap: float, n_lists: int
+    ):  # fmt: skip
+        self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
+        self._apart, self._behind = apart, overlap
+        config = self._config = skin.config
+        self._watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
+        self._committed = config.x.copy()
+        self._last_motion = np.zeros(skin.n_bodies)
+        #: Facets that hold nodes now, by list ``(n_lists, n)``, -1 for none.
+        self.held: Ints = np.full((n_lists, len(nodes)), -1)
+        #: Number of the order that they keep.
+        self.number = next(_orders)
+        self._made_at: Array | None = None
+        self._kept = False
+        self._reach = np.zeros(skin.n_bodies)
+        self.lists: list[Listing] = []
+        #: How often lists have been made.
+        self.times_made = 0
+        self.first: Ints = np.append(0, np.cumsum(gathered(config.comm, len(skin.dofs))))
+
+    def _motion(self, since: Array) -> Array:
+        """Largest motion of each body's surface on this rank ``(n_bodies,)``."""
+        w, most = self._watched, np.zeros(self.skin.n_bodies)
+        np.maximum.at(most, self.skin.body_of_node[w], np.linalg.norm(self._config.x[w] - since[w], axis=1))
+        return most
+
+    def update(self) -> None:
+        """Make the lists anew if a body has moved farther than they reach (collective)."""
+        if self._kept:
+            self._last_motion, self._committed, self._kept = self._motion(self._committed), self._config.x.copy(), False
+            # what was inside at the start has been taken out by now
+            self._behind = 0.0
+        stale = self._made_at is None or bool((self._motion(self._made_at) > self._reach).any())
+        if reduced(self._config.comm, stale, op=MPI.LOR):
+            self._make()
+
+    def commit(self) -> None:
+        """A step has been kept, or is gone back to: nodes are in front of facets from where they are when they are next looked at."""
+        self._kept = True
+
+    @timed("search")
+    def _make(self) -> None:
+        skin, config, comm = self.skin, self._config, self._config.comm
+        motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
+        self._reach = np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion)
+        self._made_at = config.x.copy()
+        self.times_made += 1
+        # what facets' ranks have to know of a node, which goes where a facet may be in reach
+        n, g, own = len(self.nodes), config.gdim, skin.body_of_node[self.nodes]
+        points, reach = self._made_at[self.nodes], self._reach[own]
+        ahead = self._reach[skin.body]
+        most = gathered(comm, float(ahead.max(initial=0.0)))
+        near, _ = box_distances(comm, points, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
+        exchange = Exchange(comm, [np.flatnonzero(near[r] <= reach + most[r]) for r in range(comm.size)])
+        sides = np.column_stack([a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)])
+        told = exchange.send(
+            points, self._committed[self.nodes], reach, self.place[own], skin.cones(self.nodes), sides, self.held.T, np.arange(n)
+        )
+        node, facet, distance = self._pairs(*told[:7])
+        home, row, body = exchange.origins[node], told[7][node], skin.body[facet]
+        # the bodies near each node, on its own rank, and which of them it may touch by which list
+        key = (home * (config.index_map.size_global + 1) + row) * skin.n_bodies + body
+        nearest = np.lexsort((distance, key))
+        _, first = np.unique(key[nearest], return_index=True)
+        some = nearest[first]
+        rows, bodies, distances = Exchange.to(comm, home[some]).send(row[some], body[some], distance[some])
+        self.body = self._shared_out(rows, bodies, distances)
+        (lists,) = exchange.send(self.body.T)
+        mine = [np.flatnonzero(lists[node, k] == body) for k in range(self._n)]
+        empty = reduced(comm, np.array([len(m) for m in mine])) == 0
+        self.lists = [self._list(home[m], row[m], facet[m], bool(e)) for m, e in zip(mine, empty)]
+
+    def _pairs(
+        self, points: Array, committed: Array, reach: Array, place: Ints, cones: Array, sides: Bools, held: Ints
+    ) -> tuple[Ints, Ints, Array]:
+        """Nodes and this rank's facets that may touch, and their distances, ``(k,)`` each."""
+        skin, x = self.skin, self._made_at[self.skin.dofs]  # type: ignore[index]
+        none = np.zeros(0, np.int64)
+        if not len(points) or not len(x):
+            return none, none, np.zeros(0)
+        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(x), 1)))
+        middle = np.einsum("na,nag->ng", tab.N, x)
+        radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
+        i, f = balls_that_meet(points, reach, middle, radius + self._reach[skin.body])
+        later = self.place[skin.body[f]] > place[i]
+        i, f = i[later], f[later]
+        faces = np.einsum("kcg,kg->kc", cones[i], unit_normals(tab, x)[f] * skin.sign[f, None]).min(axis=1, initial=0.0) < -FACING
+        y = self._committed[skin.dofs]
+        normal = unit_normals(tab, y) * skin.sign[:, None]
+        height = np.einsum("kg,kg->k", committed[i] - np.einsum("na,nag->ng", tab.N, y)[f], normal[f])
+        front = height >= -np.maximum(BEHIND * np.minimum(skin.depth, skin.radius)[f], self._behind)
+        kept = (faces & front) | (held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
+        for k, (_, a, _, b) in enumerate(self._apart):
+            kept &= ~((sides[i, k] & b[f]) | (sides[i, len(self._apart) + k] & a[f]))
+        i, f = i[kept], f[kept]
+        distance = np.sqrt(closest_point(skin.shape, x[f], points[i])[1])
+        near = distance <= (reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
+        return i[near], f[near], distance[near]
+
+    def _shared_out(self, row: Ints, body: Ints, distance: Array) -> Ints:
+        """The body that each node may touch by each list, -1 for none ``(n_lists, n)``: that which holds it now, then the nearest.
+
+        Args:
+            row: places of nodes ``(k,)``.
+            body: near them.
+            distance: of a node from the body.
+        """
+        order = np.lexsort((body, distance, row))
+        row, body = row[order], body[order]
+        # several ranks may tell of one body
+        _, first = np.unique(row * self.skin.n_bodies + body, return_index=True)
+        first.sort()
+        row, body = row[first], body[first]
+        held = np.stack([self._body_of(h) for h in self.held])
+        found, taken = np.full(held.shape, -1), np.zeros(len(row), bool)
+        for k in range(self._n):
+            keeps = (held[k][row] == body) & ~taken
+            found[k][row[keeps]] = body[keeps]
+            taken |= keeps
+        for k in range(self._n):
+            left = np.flatnonzero(~taken & (found[k][row] < 0))
+            rows, nearest = np.unique(row[left], return_index=True)
+            found[k][rows] = body[left[nearest]]
+            taken[left[nearest]] = True
+        return found
+
+    def _body_of(self, facet: Ints) -> Ints:
+        """Bodies of facets of any rank ``(n,)``, -1 for -1 (collective)."""
+        exchange = Exchange.to(self._config.comm, np.searchsorted(self.first, facet, side="right") - 1)
+        (asked,) = exchange.send(facet)
+        found = np.full(len(facet), -1)
+        (found[exchange.rows],) = exchange.back(self.skin.body[asked - self.first[self._config.comm.rank]])
+        return found
+
+    def _list(self, home: Ints, row: Ints, facet: Ints, empty: bool) -> Listing:
+        """The list of pairs, whose nodes are ``row (k,)`` of the ranks ``home (k,)`` (collective)."""
+        comm = self._config.comm
+        n = len(self.nodes) if comm.size == 1 else int(reduced(comm, len(self.nodes), op=MPI.MAX))
+        asked, node = np.unique(home * n + row, return_inverse=True)
+        # ranks that have facets tell so; nodes then come in the order in which they were asked for
+        back = Exchange.to(comm, asked // max(n, 1))
+        (rows,) = back.send(asked % max(n, 1))
+        ends = np.searchsorted(back.origins, np.arange(comm.size + 1))
+        return Listing(Exchange(comm, [rows[a:b] for a, b in zip(ends, ends[1:])]), node.ravel(), facet, empty)
+
+
+class Neighbour(MeshTarget):
+    """What nodes may touch by one of the lists: facets of the body that each has on it.
+
+    Args:
+        neighbours: the lists.
+        number: of the list.
+        averaged: as of ``MeshTarget``.
+    """
+
+    def __init__(self, neighbours: Neighbours, number: int, averaged: bool = False):
+        super().__init__(neighbours.skin, averaged)
+        self.neighbours, self.number = neighbours, number
+
+    def hold(self, facet: Ints) -> None:
+        """Take the facets that hold the contactors now ``(n,)``, -1 for none."""
+        self.neighbours.held[self.number] = facet
+
+    def told(self, which: Ints) -> Ints:
+        """Place of the contactors' bodies in the order; past the last for lists after the first, which tell of no passage."""
+        n = self.neighbours
+        return n.place[n.skin.body_of_node[n.nodes[which]]] if self.number == 0 else np.full(len(which), n.skin.n_bodies)
+
+    def may_touch(self, told: Ints, facet: Ints) -> Bools:
+        """Whether this rank's facets ``(k,)`` are of bodies that contactors follow, of whom this was told ``(k,)``."""
+        return np.asarray(self.neighbours.place[self.facets.body[facet]] > told)  # type: ignore[attr-defined]
+
+    def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
+        """Closest points of contactors on what they may touch; far away where there is nothing (collective)."""
+        self.neighbours.update()
+        listed, n = self.neighbours.lists[self.number], len(self.neighbours.nodes)
+        if which is not None:
+            every = np.zeros((n, points.shape[1]))
+            every[which] = points
+            points = every
+        found = self._nothing(points)
+        if not listed.empty:
+            data: FacetData = self.facets.current(corners=True)
+            (p,) = listed.exchange.send(points)
+            feet = Feet._make(listed.exchange.back(*self._on_nearest(p, data, listed.node, listed.facet)))
+            nearest, _ = self._nearest_foot(points, listed.exchange.rows, feet)
+            rows = np.unique(listed.exchange.rows)
+            found = found.with_rows(rows, {name: getattr(nearest, name) for name in found.__dataclass_fields__})
+        return found if which is None else found.take(which)
+
+    def _nothing(self, points: Array) -> FacetProjection:
+        """Of points that have nothing near: no facet, no normal, and a gap as large as the model."""
+        (n, g), nn, d = points.shape, self.n_nodes, self.shape.dim
+        facet = np.zeros((nn, g))
+        facet[:, :d] = self.stride * self.shape.nodes
+        none = np.zeros((n, g))
+        dN = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
+        return FacetProjection(
+            np.full(n, self.facets.config.size), none, np.full((n, nn), -1), np.zeros((n, nn)), np.full(n, -1), none,
+            np.full(n, np.inf), np.zeros((n, d)), points, none, points[:, None] + facet, dN.dN, dN.ddN, np.zeros((n, d, g)),
+        )  # fmt: skip

@@ -1,0 +1,122 @@
+"""Surfaces of many bodies as one: which body each facet belongs to, where edges are sharp, and which bodies follow which."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets
+from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.parallel import reduced, sums_by_keys
+
+#: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
+#: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
+SHARP = 0.7
+#: Bodies whose facets differ by less than this factor are alike in size, and the order of the mesh's input tells who follows.
+#: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
+ALIKE = 1.5
+
+
+class Skin(TargetFacets):
+    """Facets of the surfaces of many bodies (collective).
+
+    Args:
+        config: configuration of the displacement.
+        tag: of all surfaces.
+
+    Attributes:
+        n_bodies: number of bodies of the mesh.
+        body_of_node: body of each local node, numbered by the first cell in the mesh's input ``(n_local,)``.
+        body: of each facet ``(m,)``.
+        size: mean length of the sides of each body's facets, 0 where it has none ``(n_bodies,)``.
+    """
+
+    def __init__(self, config: Configuration, tag: Tag):
+        super().__init__(config, tag, "surface")
+        label, self.n_bodies = find_bodies(config)
+        first = np.full(self.n_bodies, np.iinfo(np.int64).max)
+        cells = compat.cell_dofs(config.V)
+        np.minimum.at(first, label[cells[:, 0]], forms.original_cells(config.mesh)[: len(cells)])
+        number = np.empty(self.n_bodies, np.int64)
+        number[np.argsort(reduced(config.comm, first, op=MPI.MIN))] = np.arange(self.n_bodies)
+        self.body_of_node: Ints = number[label]
+        self.body: Ints = self.body_of_node[self.dofs[:, 0]]
+        #: Half of what the longest side of each facet measures ``(m,)``.
+        self.radius: Array = 0.5 * self._sides().max(axis=1, initial=0.0)
+        sums = np.zeros((self.n_bodies, 2))
+        np.add.at(sums, self.body, np.column_stack([self._sides().mean(axis=1), np.ones(len(self.body))]))
+        total = reduced(config.comm, sums)
+        self.size: Array = total[:, 0] / np.maximum(total[:, 1], 1.0)
+
+    def _sides(self) -> Array:
+        corners = self.config.X[self.dofs[:, : len(self.shape.topology[0])]]
+        return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+
+    def order(self, first: list[Tag]) -> Ints:
+        """Place of each body in the order in which they follow each other, each those behind it ``(n_bodies,)`` (collective).
+
+        Args:
+            first: parts of bodies that come first, in this order; then the finer ones.
+        """
+        named = np.full(self.n_bodies, len(first))
+        for k, tag in reversed(list(enumerate(first))):
+            told = np.zeros(self.n_bodies, bool)
+            told[self.body_of_node[surface_nodes(self.config, tag)]] = True
+            named[reduced(self.config.comm, told, op=MPI.LOR)] = k
+        with np.errstate(divide="ignore"):
+            fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE))
+        place = np.empty(self.n_bodies, np.int64)
+        place[np.lexsort((np.arange(self.n_bodies), fine, named))] = np.arange(self.n_bodies)
+        return place
+
+    # -- sharp edges -----------------------------------------------------------------------------------------------------
+
+    def _open_sides(self) -> Bools:
+        """Sides that bound the surface, or lie on a sharp convex edge, round which no facet reaches ``(m, n_sides)``."""
+        X = self.config.X[self.dofs]
+        normal = self._area_vectors(X).mean(axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        middle = X[:, : len(self.shape.topology[0])].mean(axis=1)
+        corners = 1 if self.shape.dim == 1 else 2
+        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
+        keys = np.stack(sides, axis=1).reshape(-1, corners)
+        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle]), len(sides), axis=0)
+        others = sums_by_keys(self.config.comm, keys, told) - told
+        g, one = self.config.gdim, others[:, 0] == 1
+        cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
+        falls = np.einsum("kg,kg->k", others[:, 1 + g :] - told[:, 1 + g :], told[:, 1 : 1 + g]) < 0
+        self.sharp_sides: Bools = (one & (cosine < SHARP)).reshape(len(X), -1)
+        return (~one | (falls & (cosine < SHARP))).reshape(len(X), -1)
+
+    @cached_property
+    def _sharp_nodes(self) -> Bools:
+        """Which nodes of facets lie on a sharp edge, of any facet ``(m, nn)`` (first time: collective)."""
+        sides = enumerate(self.shape.edges())
+        dofs = np.concatenate([self.dofs[self.sharp_sides[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
+        return self.config.to_owners(dofs, np.ones(len(dofs)))[self.dofs] > 0
+
+    def current(self, corners: bool = False) -> FacetData:
+        """Facets where they are now; at sharp edges normals are the facets' own (collective)."""
+        data = super().current(corners)
+        own = self.normals()
+        return replace(data, nodal_normals=np.where(self._sharp_nodes[:, :, None], own, data.nodal_normals))
+
+    def cones(self, nodes: Indices) -> Array:
+        """Normals of the facets around owned nodes ``(n, k, gdim)``, those that there are not are zero (collective)."""
+        config = self.config
+        there, normal = config.send_to_owners(self.nodes.ravel(), self.normals().reshape(-1, config.gdim))
+        order = np.argsort(there, kind="stable")
+        there, normal = there[order], normal[order]
+        place = np.arange(len(there)) - np.searchsorted(there, there)
+        cones = np.zeros((config.n_owned, int(reduced(config.comm, int(place.max(initial=0)), op=MPI.MAX)) + 1, config.gdim))
+        cones[there, place] = normal
+        return cones[nodes]
