@@ -76,6 +76,9 @@ class Contact:
             a tag tells which they are. Also where an attribute is set that there is not, or that the problem would not take any more.
     """
 
+    #: Whether it is one of those that a general contact consists of.
+    of_all_surfaces = False
+
     def __init__(
         self,
         contactor: Part,
@@ -119,7 +122,6 @@ class Contact:
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
-        #: Whether a problem has been made of it.
         self.taken = False
         self._pair: Interface | None = None
         self._fields: dict[str, fem.Function] = {}

@@ -62,8 +62,16 @@ class AmongQuadraticBodies(_Among, Bernstein):
     """The same with control gaps, of degree 2."""
 
 
+class RigidContact(Contact):
+    """One of the contacts that a general contact consists of: every node against a rigid surface."""
+
+    of_all_surfaces = True
+
+
 class AmongContact(Contact):
     """One of the contacts that a general contact consists of: every node against one body near it."""
+
+    of_all_surfaces = True
 
     def __init__(self, general: GeneralContact, neighbours: Neighbours, number: int, **options: Any):
         skin = neighbours.skin
@@ -196,7 +204,7 @@ class GeneralContact:
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
-            parts.append(Contact(surface, target, name=f"{self.name} on {name}", **options))
+            parts.append(RigidContact(surface, target, name=f"{self.name} on {name}", **options))
         self._parts = parts
         return parts
 

@@ -16,6 +16,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
+from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes, surface_nodes, tributary_areas
 from uem_dolfinx.geometry.tags import Tag
@@ -34,10 +35,30 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
     Raises:
         MassError: if a body cannot do without the mass of its contactors, with the part of them, if any, whose mass it could spare.
     """
-    config, contactors = mass.config, contactor_nodes(contacts)
-    followed = [_followed(config, contact)[: config.n_owned] for contact in contacts]
-    targets = np.flatnonzero(np.any([np.zeros(config.n_owned, bool), *followed], axis=0))
-    return mass.without(contactors, where_possible=targets, distance=lambda: _distances(contactors, contacts))
+    config, of_all = mass.config, [contact for contact in contacts if contact.of_all_surfaces]
+    named = [contact for contact in contacts if not contact.of_all_surfaces]
+    contactors, spare = contactor_nodes(named), np.zeros(config.n_owned, bool)
+    for contact in contacts:
+        spare |= _followed(config, contact)[: config.n_owned]
+    spare[contactor_nodes(of_all)] = True
+    bare = mass.without(contactors, where_possible=np.flatnonzero(spare), distance=lambda: _distances(contactors, named))
+    if of_all:
+        _warn_of_mass(bare, of_all[0].name, contactor_nodes(of_all))
+    return bare
+
+
+def _warn_of_mass(mass: Mass, name: str, nodes: Indices) -> None:
+    """Warn, once, of bodies whose contactors keep their mass since the others could not take it over (collective)."""
+    body, count = find_bodies(mass.config)
+    kept = np.zeros(count, bool)
+    kept[body[nodes[mass.of_nodes[nodes].any(axis=1)]]] = True
+    number = int(reduced(mass.config.comm, kept, op=MPI.LOR).sum())
+    if number:
+        logger.warning(
+            "%s: %d bodies are too thin, or their meshes too coarse, to do without the mass of their surfaces: impact will set these in "
+            "vibration; refine them to seven layers of cells of degree 1 from one side to the other, six with a lumped mass",
+            name, number,
+        )  # fmt: skip
 
 
 def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Callable[[], Array]) -> None:
