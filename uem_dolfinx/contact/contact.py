@@ -116,9 +116,8 @@ class Contact:
                 )
             given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
-        self.coupling = coupling
+        self.coupling, self.measure = coupling, measure
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
-        self.measure = measure
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
