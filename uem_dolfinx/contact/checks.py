@@ -185,7 +185,7 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
         Whether there was something to tell.
     """
     p = pair.projection
-    near = np.linalg.norm(p.beyond, axis=1) < 0.5 * p.facet_size
+    near = p.way_beyond < 0.5 * p.facet_size
     slipped = pair.off & ~before & near & (p.gap < 0.0)
     lost, held, count = reduced(
         pair.config.comm, np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])

@@ -328,7 +328,7 @@ def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
     """
     limit = np.where(state.at_end & ~state.passed, END_HOLDS, ON_SIDE)
     behind = state.passed & (p.gap < -thickness)
-    return behind | (np.linalg.norm(p.beyond, axis=1) > limit * p.facet_size)
+    return behind | (p.way_beyond > limit * p.facet_size)
 
 
 def near_target(p: Projection, state: PairState, off: Bools) -> Bools:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,6 +46,10 @@ class Projection(Protocol):
     @property
     def beyond(self) -> Array:
         """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
+
+    @property
+    def way_beyond(self) -> Array:
+        """Length of that ``(n,)``."""
 
     @property
     def from_end(self) -> Array:
@@ -135,10 +140,15 @@ class FacetProjection:
     ddN: Array
     shape_operator: Array
 
-    @property
+    @cached_property
     def facet_size(self) -> Array:
         """Length of a side of each facet ``(n,)``."""
         return np.linalg.norm(self.x[:, 0] - self.x[:, 1], axis=1)
+
+    @cached_property
+    def way_beyond(self) -> Array:
+        """Length of ``beyond (n,)``."""
+        return np.linalg.norm(self.beyond, axis=1)
 
     def with_rows(self, which: Ints, values: Mapping[str, Array | float]) -> FacetProjection:
         """Copy with some fields replaced at some points."""
