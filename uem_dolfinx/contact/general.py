@@ -114,7 +114,7 @@ class GeneralContact:
     """Every surface against every other, and against rigid ones, by one declaration.
 
     Surfaces are found from the mesh; what does not come near anything costs next to nothing. Between two bodies the nodes of the one
-    whose facets are smaller follow the other. Bodies are what cells connect: one body does not touch itself.
+    whose facets are smaller follow the other; of two parts of one body that meet, the nodes of one follow. Bodies are what cells connect.
 
     Args:
         surfaces: parts that may touch, named as for ``Contact``; None is all exterior facets.
@@ -122,6 +122,7 @@ class GeneralContact:
         exclude: parts that touch nothing, and pairs of parts ``(one, other)`` that never touch each other, of facets or of cells. What
             another ``Contact`` of the same problem names against each other is left to it.
         order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer first.
+        self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
         friction: as of ``Contact``, for all.
@@ -141,6 +142,7 @@ class GeneralContact:
         rigid: Any = (),
         exclude: Sequence[Any] = (),
         order: Sequence[Part] = (),
+        self_contact: bool | Sequence[Part] = False,
         bodies: dict[str, Part] | None = None,
         friction: Field | FrictionLaw = 0.0,
         normals: str = "facet",
@@ -153,6 +155,8 @@ class GeneralContact:
             self.rigid = given.items("rigid", rigid, lambda one: hasattr(one, "project"), "a rigid surface")
             self.exclude = given.items("exclude", exclude, lambda one: one is not None, "a part, or a pair of parts")
             self.order = given.items("order", order, lambda one: one is not None, "a part of a mesh")
+            if not isinstance(self_contact, bool):
+                self_contact = given.items("self_contact", self_contact, lambda one: one is not None, "a part of a mesh")
             given.kind("bodies", bodies, bodies is None or isinstance(bodies, dict), "names and parts, {name: part}, or None")
             given_friction(friction)
             self.normals = given.word("normals", normals, ("facet", "averaged"))
@@ -161,7 +165,7 @@ class GeneralContact:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
         self.surfaces, self.bodies, self.friction = surfaces, dict(bodies or {}), friction
-        self.max_penetration, self.name = max_penetration, name
+        self.max_penetration, self.name, self.self_contact = max_penetration, name, self_contact
         #: Whether a problem has been made of it.
         self.taken = False
         self._parts: list[Contact] = []
@@ -189,17 +193,21 @@ class GeneralContact:
         options: dict[str, Any] = {
             "friction": self.friction, "max_penetration": self.max_penetration, "measure": self.measure,
         }  # fmt: skip
-        with_facets = place[skin.size > 0]
-        if len(with_facets) < 2 and not self.rigid:
+        with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
+        for part in () if isinstance(self.self_contact, bool) else self.self_contact:
+            itself |= self._bodies_of(_part(config, part, "self_contact"))
+        if len(with_facets) < 2 and not itself.any() and not self.rigid:
             raise SurfaceError(
-                f"{self.name}: there is one body and no rigid surface, and a body does not touch itself: give rigid=..., or leave it out"
+                f"{self.name}: there is one body and no rigid surface: give rigid=..., self_contact=True for a body that touches itself, or "
+                "leave it out"
             )
         parts: list[Contact] = []
-        if len(with_facets) > 1:
-            own = nodes[place[skin.body_of_node[nodes]] < with_facets.max()]
+        if len(with_facets) > 1 or itself.any():
+            body = skin.body_of_node[nodes]
+            own = nodes[(place[body] < with_facets.max()) | itself[body]]
             apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
             bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
-            neighbours = Neighbours(skin, own, place, apart, bound, config.gdim)
+            neighbours = Neighbours(skin, own, place, apart, bound, config.gdim, itself)
             parts += [AmongContact(self, neighbours, k, normals=self.normals, **options) for k in range(config.gdim)]
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
@@ -208,13 +216,14 @@ class GeneralContact:
         self._parts = parts
         return parts
 
+    def _bodies_of(self, tag: Tag) -> Bools:
+        """Which bodies a part of the mesh is of ``(n_bodies,)`` (collective)."""
+        return self._skin.bodies_of(surface_nodes(self._config, tag))
+
     def _name_bodies(self) -> None:
         self._names = [f"body {k + 1}" for k in range(self._skin.n_bodies)]
         for name, part in self.bodies.items():
-            tag = _part(self._config, part, "bodies")
-            told = np.zeros(len(self._names), bool)
-            told[self._skin.body_of_node[surface_nodes(self._config, tag)]] = True
-            for body in np.flatnonzero(reduced(self._config.comm, told, op=MPI.LOR)):
+            for body in np.flatnonzero(self._bodies_of(_part(self._config, part, "bodies"))):
                 if self._names[body] in self.bodies:
                     raise SurfaceError(f"bodies: '{name}' and '{self._names[body]}' are one body: give each body one name")
                 self._names[body] = name

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -32,6 +33,13 @@ STEPS_AHEAD = 4.0
 #: A facet faces a node if the cosine of the angle between its normal and that of a facet around the node is smaller than minus this.
 #: [convention; cosine; test_general_contact.py::test_who_faces_whom]
 FACING = 0.1
+#: Of two places of one body that meet, the nodes of that one follow whose normal in the reference configuration points more in this
+#: direction, or that lies farther in it: its slopes are irrational, so that no side of a body is likely to lie along it.
+#: [convention; direction; -]
+DIRECTION = np.array([0.6180339887, 1.0, 0.4142135624])
+#: Normals whose parts in it differ by less do not tell who follows, and places do.
+#: [convention; cosine; test_self_contact.py::test_who_follows_where_normals_are_alike]
+ALIKE = 0.1
 #: A node that was farther behind a facet than this is not in front of it.
 #: [convention; depth of the cell behind, or half a side of the facet; test_general_contact.py::test_through_a_thin_plate]
 BEHIND = 0.25
@@ -56,6 +64,32 @@ class Listing:
     empty: bool
 
 
+class Asking(NamedTuple):
+    """What facets' ranks have to know of nodes.
+
+    Attributes:
+        points: where they are ``(n, gdim)``.
+        committed: where they were when a step was last kept ``(n, gdim)``.
+        drawn: in the reference configuration ``(n, gdim)``.
+        reach: how far ahead of them is looked ``(n,)``.
+        body: of each ``(n,)``.
+        node: global number ``(n,)``.
+        cones: normals of the facets around them, now and in the reference configuration ``(n, c, 2, gdim)``.
+        sides: whether they are in sets of facets that never touch each other ``(n, s)``.
+        held: facets that hold them ``(n, n_lists)``.
+    """
+
+    points: Array
+    committed: Array
+    drawn: Array
+    reach: Array
+    body: Ints
+    node: Ints
+    cones: Array
+    sides: Bools
+    held: Ints
+
+
 class Neighbours:
     """Lists of what surface nodes may touch, one for each of the bodies that a node may touch at once (collective).
 
@@ -66,13 +100,15 @@ class Neighbours:
         apart: pairs of sets of facets that never touch each other, as local nodes and this rank's facets of both, each once.
         overlap: bound on what nodes may be inside others at the start, a length.
         n_lists: how many bodies a node may touch at once.
+        itself: which bodies may touch themselves ``(n_bodies,)``.
     """
 
     def __init__(
-        self, skin: Skin, nodes: Indices, place: Ints, apart: Sequence[tuple[Bools, Bools, Bools, Bools]], overlap: float, n_lists: int
+        self, skin: Skin, nodes: Indices, place: Ints, apart: Sequence[tuple[Bools, Bools, Bools, Bools]], overlap: float, n_lists: int,
+        itself: Bools,
     ):  # fmt: skip
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
-        self._apart, self._behind = apart, overlap
+        self._apart, self._behind, self._itself = apart, overlap, itself
         config = self._config = skin.config
         self._watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
         self._committed = config.x.copy()
@@ -124,11 +160,13 @@ class Neighbours:
         near, _ = box_distances(comm, points, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
         exchange = Exchange(comm, [np.flatnonzero(near[r] <= reach + most[r]) for r in range(comm.size)])
         sides = np.column_stack([a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)])
-        told = exchange.send(
-            points, self._committed[self.nodes], reach, self.place[own], skin.cones(self.nodes), sides, self.held.T, np.arange(n)
-        )
-        node, facet, distance = self._pairs(*told[:7])
-        home, row, body = exchange.origins[node], told[7][node], skin.body[facet]
+        about = Asking(
+            points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes), skin.cones(self.nodes),
+            sides, self.held.T,
+        )  # fmt: skip
+        *told, rows = exchange.send(*about, np.arange(n))
+        node, facet, distance = self._pairs(Asking(*told))
+        home, row, body = exchange.origins[node], rows[node], skin.body[facet]
         # the bodies near each node, on its own rank, and which of them it may touch by which list
         key = (home * (config.index_map.size_global + 1) + row) * skin.n_bodies + body
         nearest = np.lexsort((distance, key))
@@ -141,32 +179,59 @@ class Neighbours:
         empty = reduced(comm, np.array([len(m) for m in mine])) == 0
         self.lists = [self._list(home[m], row[m], facet[m], bool(e)) for m, e in zip(mine, empty)]
 
-    def _pairs(
-        self, points: Array, committed: Array, reach: Array, place: Ints, cones: Array, sides: Bools, held: Ints
-    ) -> tuple[Ints, Ints, Array]:
+    def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array]:
         """Nodes and this rank's facets that may touch, and their distances, ``(k,)`` each."""
-        skin, x = self.skin, self._made_at[self.skin.dofs]  # type: ignore[index]
+        assert self._made_at is not None
+        skin, x, points = self.skin, self._made_at[self.skin.dofs], of.points
         none = np.zeros(0, np.int64)
         if not len(points) or not len(x):
             return none, none, np.zeros(0)
         tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(x), 1)))
         middle = np.einsum("na,nag->ng", tab.N, x)
         radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
-        i, f = balls_that_meet(points, reach, middle, radius + self._reach[skin.body])
-        later = self.place[skin.body[f]] > place[i]
-        i, f = i[later], f[later]
-        faces = np.einsum("kcg,kg->kc", cones[i], unit_normals(tab, x)[f] * skin.sign[f, None]).min(axis=1, initial=0.0) < -FACING
-        y = self._committed[skin.dofs]
-        normal = unit_normals(tab, y) * skin.sign[:, None]
-        height = np.einsum("kg,kg->k", committed[i] - np.einsum("na,nag->ng", tab.N, y)[f], normal[f])
-        front = height >= -np.maximum(BEHIND * np.minimum(skin.depth, skin.radius)[f], self._behind)
-        kept = (faces & front) | (held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
+        i, f = balls_that_meet(points, of.reach, middle, radius + self._reach[skin.body])
+        own, its = of.body[i], skin.body[f]
+        same = (own == its) & self._itself[own]
+        follows = (self.place[its] > self.place[own]) | (same & (skin.nodes[f] != of.node[i, None]).all(axis=1))
+        i, f, same = i[follows], f[follows], same[follows]
+        cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], unit_normals(tab, x)[f] * skin.sign[f, None])
+        front = self._in_front(of.committed[i], f, same)
+        kept = (cosines.min(axis=1, initial=0.0) < -FACING) & front
+        kept[same] &= self._first_of_itself(of, i[same], f[same], cosines[same])
+        kept |= (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
         for k, (_, a, _, b) in enumerate(self._apart):
-            kept &= ~((sides[i, k] & b[f]) | (sides[i, len(self._apart) + k] & a[f]))
+            kept &= ~((of.sides[i, k] & b[f]) | (of.sides[i, len(self._apart) + k] & a[f]))
         i, f = i[kept], f[kept]
         distance = np.sqrt(closest_point(skin.shape, x[f], points[i])[1])
-        near = distance <= (reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
+        near = distance <= (of.reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
         return i[near], f[near], distance[near]
+
+    def _in_front(self, points: Array, facet: Ints, same: Bools) -> Bools:
+        """Which nodes at ``points (k, gdim)`` were in front of this rank's facets, some of the nodes' own body."""
+        skin, y = self.skin, self._committed[self.skin.dofs]
+        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(y), 1)))
+        normal, middle = unit_normals(tab, y) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, y)
+        height = np.einsum("kg,kg->k", points - middle[facet], normal[facet])
+        depth = BEHIND * np.minimum(skin.depth, skin.radius)[facet]
+        return np.asarray(height >= -np.where(same, depth, np.maximum(depth, self._behind)))
+
+    def _first_of_itself(self, of: Asking, node: Ints, facet: Ints, cosines: Array) -> Bools:
+        """Which nodes ``(k,)`` of a body follow its facets rather than these those.
+
+        Args:
+            of: the nodes.
+            node: their places ``(k,)``.
+            facet: of this rank.
+            cosines: between their normals and those of the facets around the node ``(k, c)``.
+        """
+        skin, d = self.skin, DIRECTION[: self._config.gdim]
+        X = self._config.X[skin.dofs]
+        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(X), 1)))
+        normal, middle = unit_normals(tab, X) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, X)
+        # the normal of that facet around the node that faces most squarely
+        own = of.cones[node, cosines.argmin(axis=1), 1] if len(node) else np.zeros((0, len(d)))
+        turned, farther = (own - normal[facet]) @ d, (of.drawn[node] - middle[facet]) @ d
+        return np.where(np.abs(turned) > ALIKE, turned, farther) > 0
 
     def _shared_out(self, row: Ints, body: Ints, distance: Array) -> Ints:
         """The body that each node may touch by each list, -1 for none ``(n_lists, n)``: that which holds it now, then the nearest.

@@ -81,6 +81,11 @@ class RigidProjection:
         return np.full(len(self.gap), np.inf)
 
     @property
+    def way_beyond(self) -> Array:
+        """There is no end to be beyond."""
+        return np.zeros(len(self.gap))
+
+    @property
     def from_end(self) -> Array:
         """There is no end."""
         return np.full(len(self.gap), np.inf)

@@ -69,14 +69,18 @@ class Skin(TargetFacets):
         """
         named = np.full(self.n_bodies, len(first))
         for k, tag in reversed(list(enumerate(first))):
-            told = np.zeros(self.n_bodies, bool)
-            told[self.body_of_node[surface_nodes(self.config, tag)]] = True
-            named[reduced(self.config.comm, told, op=MPI.LOR)] = k
+            named[self.bodies_of(surface_nodes(self.config, tag))] = k
         with np.errstate(divide="ignore"):
             fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE))
         place = np.empty(self.n_bodies, np.int64)
         place[np.lexsort((np.arange(self.n_bodies), fine, named))] = np.arange(self.n_bodies)
         return place
+
+    def bodies_of(self, nodes: Indices) -> Bools:
+        """Which bodies local ``nodes (n,)`` of all ranks are of ``(n_bodies,)`` (collective)."""
+        told = np.zeros(self.n_bodies, bool)
+        told[self.body_of_node[nodes]] = True
+        return np.asarray(reduced(self.config.comm, told, op=MPI.LOR))
 
     # -- sharp edges -----------------------------------------------------------------------------------------------------
 
@@ -111,12 +115,18 @@ class Skin(TargetFacets):
         return replace(data, nodal_normals=np.where(self._sharp_nodes[:, :, None], own, data.nodal_normals))
 
     def cones(self, nodes: Indices) -> Array:
-        """Normals of the facets around owned nodes ``(n, k, gdim)``, those that there are not are zero (collective)."""
-        config = self.config
-        there, normal = config.send_to_owners(self.nodes.ravel(), self.normals().reshape(-1, config.gdim))
+        """Normals of the facets around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
+
+        They are those of the facets at the node, zero where there are no more.
+        """
+        config, g = self.config, self.config.gdim
+        drawn = self._area_vectors(config.X[self.dofs])
+        normals = np.stack([self.normals(), drawn / np.linalg.norm(drawn, axis=2, keepdims=True)], axis=2)
+        there, arrived = config.send_to_owners(self.nodes.ravel(), normals.reshape(-1, 2 * g))
         order = np.argsort(there, kind="stable")
-        there, normal = there[order], normal[order]
+        there, arrived = there[order], arrived[order]
         place = np.arange(len(there)) - np.searchsorted(there, there)
-        cones = np.zeros((config.n_owned, int(reduced(config.comm, int(place.max(initial=0)), op=MPI.MAX)) + 1, config.gdim))
-        cones[there, place] = normal
+        most = int(reduced(config.comm, int(place.max(initial=0)), op=MPI.MAX)) + 1
+        cones = np.zeros((config.n_owned, most, 2, g))
+        cones[there, place] = arrived.reshape(-1, 2, g)
         return cones[nodes]
