@@ -100,7 +100,8 @@ class NodeToSurface(OnTarget):
         """Which targets can move along the normal (collective)."""
         if not p.nodes.shape[1]:
             return None
-        free = self.config.ask_owners(p.nodes.ravel(), self.free_of_owned.astype(float)).reshape(*p.nodes.shape, self.config.gdim)
+        nodes = np.maximum(p.nodes, 0).ravel()
+        free = self.config.ask_owners(nodes, self.free_of_owned.astype(float)).reshape(*p.nodes.shape, self.config.gdim)
         return np.abs(p.weights[:, :, None] * p.normal[:, None] * free).max(axis=(1, 2)) > MOSTLY_PRESCRIBED
 
 
