@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uem_dolfinx import compat
+from uem_dolfinx.geometry.candidates import candidate_pairs
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.search import MeshTarget, candidate_pairs
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 COMM = MPI.COMM_WORLD

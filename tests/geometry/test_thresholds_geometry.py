@@ -12,9 +12,10 @@ from helpers import at, box, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.geometry.candidates import candidate_pairs
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.search import MeshTarget, _nearest, candidate_pairs
+from uem_dolfinx.geometry.search import MeshTarget, _nearest
 from uem_dolfinx.geometry.shapes import facet_shape
 
 

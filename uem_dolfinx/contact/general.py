@@ -9,19 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from dolfinx import fem
-from dolfinx.mesh import exterior_facet_indices
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
-from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.results import Resultant, sum_up
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.errors import SurfaceError
@@ -34,31 +33,27 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
 
 
-class _Among:
-    """Tells the lists of neighbours which facets hold contactors; before a discretisation in the order of classes."""
+class AmongBodies(NodeToSurface):
+    """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
 
     target: Neighbour
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
-        super().__init__(config, nodes, target, **how)  # type: ignore[call-arg]
+        super().__init__(config, nodes, target, **how)
         self.ordered_by = target.neighbours.number
 
-    def place(self, points: Array, state: PairState) -> Kinematics:
+    def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
         self.target.hold(np.where(state.active, state.facet, -1))
-        return super().place(points, state)  # type: ignore[misc, no-any-return]
+        return super().place(points, state)
 
     def commit(self) -> None:
         """Nodes are in front of facets from where they are now."""
-        super().commit()  # type: ignore[misc]
+        super().commit()
         self.target.neighbours.commit()
 
 
-class AmongBodies(_Among, NodeToSurface):
-    """Implements ``Discretisation``: nodes against the facets of the bodies that they may touch."""
-
-
-class AmongQuadraticBodies(_Among, Bernstein):
+class AmongQuadraticBodies(AmongBodies, Bernstein):
     """The same with control gaps, of degree 2."""
 
 
@@ -185,7 +180,9 @@ class GeneralContact:
         alone = [one for one in self.exclude if not _is_pair(one)]
         pairs = [one for one in self.exclude if _is_pair(one)]
         pairs += [(c.contactor, c.target) for c in others if not hasattr(c.target, "project")]
-        surface = _surface(config, self.surfaces, [as_tag(p, config.mesh, (config.tdim - 1, config.tdim), "exclude") for p in alone])
+        surface = _surface(
+            config, self.surfaces, [as_tag(p, config.mesh, (config.tdim - 1, config.tdim), "exclude") for p in alone]
+        )
         self._skin = skin = Skin(config, surface)
         place = skin.order([_part(config, part, "order") for part in self.order])
         self._name_bodies()
@@ -198,8 +195,8 @@ class GeneralContact:
             itself |= self._bodies_of(_part(config, part, "self_contact"))
         if len(with_facets) < 2 and not itself.any() and not self.rigid:
             raise SurfaceError(
-                f"{self.name}: there is one body and no rigid surface: give rigid=..., self_contact=True for a body that touches itself, or "
-                "leave it out"
+                f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
+                "itself"
             )
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
@@ -298,7 +295,8 @@ class GeneralContact:
         """Numbers of contactors that touch, forces and moments on the first, by number of the first, and number and name of the second."""
         from uem_dolfinx.contact.results import moments
 
-        config, skin, found = self._config, self._skin, {}
+        config, skin = self._config, self._skin
+        found: dict[tuple[int, int, str], tuple[int, Array, Array]] = {}
         centre = np.zeros(config.gdim) if centre is None else centre
         for k, part in enumerate(self.parts):
             pair = part.pair
@@ -328,7 +326,9 @@ def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration
 
 def _is_pair(one: Any) -> bool:
     """Whether this is a pair of parts, rather than one."""
-    return isinstance(one, tuple) and len(one) == 2 and not hasattr(one[0], "indices") and not isinstance(one[0], int | np.integer)
+    return (
+        isinstance(one, tuple) and len(one) == 2 and not hasattr(one[0], "indices") and not isinstance(one[0], int | np.integer)
+    )
 
 
 def _part(config: Configuration, part: Part, role: str) -> Tag:
@@ -367,4 +367,3 @@ def _where(skin: Skin, part: Part) -> tuple[Bools, Bools]:
     links = config.mesh.topology.connectivity(config.tdim, tag.dim)
     facet: Ints = np.array([links.links(c)[s] for c, s in zip(skin.cells, skin.sides)], dtype=np.int64)
     return nodes, np.isin(facet, tag.entities)
-

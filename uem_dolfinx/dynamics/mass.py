@@ -23,8 +23,8 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.geometry.configuration import Configuration, configuration_of
-from uem_dolfinx.geometry.search import EQUALLY_NEAR
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 

@@ -37,7 +37,11 @@ class Crossings:
 
 
 def find_crossings(
-    start: tuple[Array, Array], end: tuple[Array, Array], sign: Array, reach: float, meet: Callable[[Ints, Ints], Bools] | None = None
+    start: tuple[Array, Array],
+    end: tuple[Array, Array],
+    sign: Array,
+    reach: float,
+    meet: Callable[[Ints, Ints], Bools] | None = None,
 ) -> Crossings:
     """Crossings of ``n`` points with ``m`` simplices of ``gdim`` nodes each, all of which move straight.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, pairwise
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -16,9 +16,10 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, balls_that_meet
 from uem_dolfinx.geometry.facets import FacetData
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.search import EQUALLY_NEAR, Feet, MeshTarget, balls_that_meet, box_distances
+from uem_dolfinx.geometry.search import Feet, MeshTarget, box_distances
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 from uem_dolfinx.geometry.skin import Skin
 from uem_dolfinx.log import timed
@@ -55,12 +56,14 @@ class Listing:
         exchange: with the ranks that have facets for this rank's nodes; its rows are places of nodes.
         node: places among the nodes received ``(k,)``.
         facet: of this rank ``(k,)``.
+        opened: sides of these behind which nothing is listed for the node ``(k, n_sides)``.
         empty: whether there is none on any rank.
     """
 
     exchange: Exchange
     node: Ints
     facet: Ints
+    opened: Bools
     empty: bool
 
 
@@ -159,25 +162,41 @@ class Neighbours:
         most = gathered(comm, float(ahead.max(initial=0.0)))
         near, _ = box_distances(comm, points, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
         exchange = Exchange(comm, [np.flatnonzero(near[r] <= reach + most[r]) for r in range(comm.size)])
-        sides = np.column_stack([a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)])
+        sides = np.column_stack(
+            [a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)]
+        )
         about = Asking(
             points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes), skin.cones(self.nodes),
             sides, self.held.T,
         )  # fmt: skip
         *told, rows = exchange.send(*about, np.arange(n))
         node, facet, distance = self._pairs(Asking(*told))
-        home, row, body = exchange.origins[node], rows[node], skin.body[facet]
-        # the bodies near each node, on its own rank, and which of them it may touch by which list
-        key = (home * (config.index_map.size_global + 1) + row) * skin.n_bodies + body
-        nearest = np.lexsort((distance, key))
-        _, first = np.unique(key[nearest], return_index=True)
-        some = nearest[first]
-        rows, bodies, distances = Exchange.to(comm, home[some]).send(row[some], body[some], distance[some])
-        self.body = self._shared_out(rows, bodies, distances)
-        (lists,) = exchange.send(self.body.T)
-        mine = [np.flatnonzero(lists[node, k] == body) for k in range(self._n)]
+        home, row = exchange.origins[node], rows[node]
+        # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
+        meeting, first = Exchange.to(comm, home), self.first[comm.rank]
+        pairs = meeting.send(row, skin.body[facet], distance, facet + first, skin.across[facet])
+        self.body = self._shared_out(*pairs[:3])
+        number, opened = np.full(len(row), -1), np.zeros((len(row), skin.across.shape[1]), bool)
+        which = np.where(self.body[:, pairs[0]] == pairs[1], np.arange(self._n)[:, None], -1).max(axis=0)
+        number[meeting.rows], opened[meeting.rows] = meeting.back(which, self._open_sides(pairs[0], *pairs[3:]))
+        opened |= skin.open_sides[facet]
+        mine = [np.flatnonzero(number == k) for k in range(self._n)]
         empty = reduced(comm, np.array([len(m) for m in mine])) == 0
-        self.lists = [self._list(home[m], row[m], facet[m], bool(e)) for m, e in zip(mine, empty)]
+        self.lists = [self._list(home[m], row[m], facet[m], opened[m], bool(e)) for m, e in zip(mine, empty)]
+
+    def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
+        """Sides of facets behind which no facet is listed for the same node, so that the foot lies past an end there ``(k, n_sides)``.
+
+        Args:
+            row: places of nodes ``(k,)``.
+            facet: numbers of the facets listed for them, over all ranks.
+            across: those of their neighbours ``(k, n_sides)``, -1 for none.
+        """
+        most = self.first[-1]
+        listed = np.sort(row * most + facet)
+        asked = np.where(across >= 0, row[:, None] * most + across, -1)
+        at = np.minimum(np.searchsorted(listed, asked), max(len(listed) - 1, 0))
+        return np.asarray(listed[at] != asked if len(listed) else np.ones(asked.shape, bool))
 
     def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array]:
         """Nodes and this rank's facets that may touch, and their distances, ``(k,)`` each."""
@@ -268,7 +287,7 @@ class Neighbours:
         (found[exchange.rows],) = exchange.back(self.skin.body[asked - self.first[self._config.comm.rank]])
         return found
 
-    def _list(self, home: Ints, row: Ints, facet: Ints, empty: bool) -> Listing:
+    def _list(self, home: Ints, row: Ints, facet: Ints, opened: Bools, empty: bool) -> Listing:
         """The list of pairs, whose nodes are ``row (k,)`` of the ranks ``home (k,)`` (collective)."""
         comm = self._config.comm
         n = len(self.nodes) if comm.size == 1 else int(reduced(comm, len(self.nodes), op=MPI.MAX))
@@ -277,7 +296,7 @@ class Neighbours:
         back = Exchange.to(comm, asked // max(n, 1))
         (rows,) = back.send(asked % max(n, 1))
         ends = np.searchsorted(back.origins, np.arange(comm.size + 1))
-        return Listing(Exchange(comm, [rows[a:b] for a, b in zip(ends, ends[1:])]), node.ravel(), facet, empty)
+        return Listing(Exchange(comm, [rows[a:b] for a, b in pairwise(ends)]), node.ravel(), facet, opened, empty)
 
 
 class Neighbour(MeshTarget):
@@ -318,7 +337,7 @@ class Neighbour(MeshTarget):
         if not listed.empty:
             data: FacetData = self.facets.current(corners=True)
             (p,) = listed.exchange.send(points)
-            feet = Feet._make(listed.exchange.back(*self._on_nearest(p, data, listed.node, listed.facet)))
+            feet = Feet._make(listed.exchange.back(*self._on_nearest(p, data, listed.node, listed.facet, listed.opened)))
             nearest, _ = self._nearest_foot(points, listed.exchange.rows, feet)
             rows = np.unique(listed.exchange.rows)
             found = found.with_rows(rows, {name: getattr(nearest, name) for name in found.__dataclass_fields__})

@@ -112,7 +112,7 @@ class Nodes:
         return Halo(self, nodes).take(lambda own: values[own])
 
     def send_to_owners(self, nodes: Ints, values: Array) -> tuple[Ints, Array]:
-        """Values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners: owned nodes, repeated or not, and values (collective)."""
+        """Values ``(m, k)`` at global ``nodes (m,)`` of all ranks, at their owners: owned nodes, repeated, and values (collective)."""
         there, arrived = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes, values)
         return there - self.first, arrived
 

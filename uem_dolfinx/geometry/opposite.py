@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.candidates import balls_that_meet
 from uem_dolfinx.geometry.overlaps import Planes
-from uem_dolfinx.geometry.search import MeshTarget, balls_that_meet
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import FacetShape
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange

@@ -14,10 +14,10 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
-from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: An averaged normal that leans further from the facet's no longer tells where the facet is.
@@ -26,9 +26,6 @@ LEAST_LEAN = 0.1
 #: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.
 #: [convention; reference coordinates, and lengths of a side; test_thresholds_geometry.py::test_points_on_a_side]
 ON_SIDE = 1e-10
-#: Facets whose distances differ by less are equally near, and those whose heights do are faced alike.
-#: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
-EQUALLY_NEAR = 1e-9
 #: A point whose height over a facet is less than this part of its distance from a corner at the surface's end lies past the end.
 #: [convention; the distance; test_thresholds_geometry.py::test_points_past_an_end]
 SIDEWAYS = 0.1
@@ -227,20 +224,34 @@ class MeshTarget:
             xi, _ = closest_point(self.shape, data.x[facet], points)
         return self._feet(facet, xi, data, np.zeros(len(points)))
 
-    def _on_nearest(self, points: Array, data: FacetData, pairs: Ints, candidates: Ints) -> Feet:
-        """Feet of points that have candidates, on the nearest of them: places ``pairs`` of points and facets, ``(k,)`` each."""
+    def _on_nearest(self, points: Array, data: FacetData, pairs: Ints, candidates: Ints, open_sides: Bools | None = None) -> Feet:
+        """Feet of points that have candidates, on the nearest of them.
+
+        Args:
+            points: ``(n, gdim)``.
+            data: of this rank's facets.
+            pairs: places of points ``(k,)``.
+            candidates: this rank's facets that may be nearest ``(k,)``.
+            open_sides: sides of these that bound the surface for their points ``(k, n_sides)``; None are those that bound it for all.
+        """
         xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
         tab = self.shape.tabulate(xi)
         away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
         facing = self._facing(tab, away, candidates, data)
         best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride)
-        return self._feet(candidates[best], xi[best], data, facing[best])
+        return self._feet(candidates[best], xi[best], data, facing[best], None if open_sides is None else open_sides[best])
 
-    def _feet(self, facet: Ints, xi: Array, data: FacetData, facing: Array) -> Feet:
+    def _feet(self, facet: Ints, xi: Array, data: FacetData, facing: Array, open_sides: Bools | None = None) -> Feet:
         of = self.facets
+        open_nodes = of.open_nodes[facet]
+        if open_sides is None:
+            open_sides = of.open_sides[facet]
+        else:
+            for s, (_, nodes, _, _) in enumerate(self.shape.edges()):
+                open_nodes[:, nodes] |= open_sides[:, s, None]
         return Feet(
             facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],
-            of.sign[facet], of.open_sides[facet], of.open_nodes[facet], facing,
+            of.sign[facet], open_sides, open_nodes, facing,
         )  # fmt: skip
 
     def _facing(self, tab: Tabulated, away: Array, facet: Ints, data: FacetData) -> Array:
@@ -381,68 +392,3 @@ def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, valu
         i = length <= within
         distance[i], found[i] = length[i], told[which[i]]
     return distance, found
-
-
-@timed("search")
-def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
-    """Indices ``(k,)`` of points and of facets that can be closest, from trees over the facets' middles, one per size class.
-
-    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
-    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
-    ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``.
-    """
-    if len(points) == 0 or len(x) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    from scipy.spatial import cKDTree
-
-    tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
-    middle = np.einsum("na,nag->ng", tab.N, x)
-    arm = x - middle[:, None]
-    radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
-    normal = unit_normals(tab, x)
-    bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
-    bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
-    i, f = balls_that_meet(points, bound, middle, radius)
-    # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
-    away = points[i] - middle[f]
-    height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
-    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
-    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
-    return i[~too_far], f[~too_far]
-
-
-def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) -> tuple[Ints, Ints]:
-    """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facets' middles ``(m, gdim)``, m > 0, that may meet.
-
-    There is a tree for each class of balls of like radius on either side.
-
-    Args:
-        points: middles of the first.
-        within: their radii ``(n,)``.
-        middle: of the facets.
-        radius: of the facets ``(m,)``.
-    """
-    from scipy.spatial import cKDTree
-
-    rows, facets = [], []
-    smallest = radius.min()
-    theirs = [(which, cKDTree(middle[which]), radius[which].max()) for which in _like(radius)]
-    for own in _like(np.maximum(within, smallest)):
-        tree, largest = cKDTree(points[own]), within[own].max()
-        for which, other, r in theirs:
-            found = tree.sparse_distance_matrix(other, largest + r, output_type="ndarray")
-            if not len(found):
-                continue
-            i, f = own[found["i"]], which[found["j"]]
-            near = found["v"] <= within[i] + r
-            rows.append(i[near])
-            facets.append(f[near])
-    none = np.zeros(0, np.int64)
-    return np.concatenate([none, *rows]), np.concatenate([none, *facets])
-
-
-def _like(sizes: Array) -> list[Ints]:
-    """Indices of positive sizes in classes that differ by less than a factor of two."""
-    size_class = np.floor(np.log2(sizes / sizes.max(initial=0.0)))
-    order = np.argsort(size_class, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(size_class[order])) + 1) if len(order) else []

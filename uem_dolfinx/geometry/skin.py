@@ -16,7 +16,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import reduced, sums_by_keys
+from uem_dolfinx.parallel import gathered, reduced, sums_by_keys
 
 #: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
 #: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
@@ -37,6 +37,7 @@ class Skin(TargetFacets):
         n_bodies: number of bodies of the mesh.
         body_of_node: body of each local node, numbered by the first cell in the mesh's input ``(n_local,)``.
         body: of each facet ``(m,)``.
+        across: number over all ranks of the neighbour across each side of each facet ``(m, n_sides)``, -1 for none.
         size: mean length of the sides of each body's facets, 0 where it has none ``(n_bodies,)``.
     """
 
@@ -93,11 +94,14 @@ class Skin(TargetFacets):
         corners = 1 if self.shape.dim == 1 else 2
         sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
         keys = np.stack(sides, axis=1).reshape(-1, corners)
-        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle]), len(sides), axis=0)
+        first = int(np.sum(gathered(self.config.comm, len(X))[: self.config.comm.rank]))
+        number = first + np.arange(len(X))
+        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), len(sides), axis=0)
         others = sums_by_keys(self.config.comm, keys, told) - told
         g, one = self.config.gdim, others[:, 0] == 1
+        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), -1)
         cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
-        falls = np.einsum("kg,kg->k", others[:, 1 + g :] - told[:, 1 + g :], told[:, 1 : 1 + g]) < 0
+        falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
         self.sharp_sides: Bools = (one & (cosine < SHARP)).reshape(len(X), -1)
         return (~one | (falls & (cosine < SHARP))).reshape(len(X), -1)
 

@@ -1,0 +1,78 @@
+"""Which facets can be nearest to points, and which balls about both can meet: trees over facets' middles. Pure geometry, on one rank."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.shapes import FacetShape, unit_normals
+from uem_dolfinx.log import timed
+
+#: Facets whose distances differ by less are equally near, and those whose heights do are faced alike.
+#: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
+EQUALLY_NEAR = 1e-9
+
+
+@timed("search")
+def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
+    """Indices ``(k,)`` of points and of facets that can be closest, from trees over the facets' middles, one per size class.
+
+    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
+    into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
+    ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``.
+    """
+    if len(points) == 0 or len(x) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    from scipy.spatial import cKDTree
+
+    tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
+    middle = np.einsum("na,nag->ng", tab.N, x)
+    arm = x - middle[:, None]
+    radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
+    normal = unit_normals(tab, x)
+    bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
+    bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
+    i, f = balls_that_meet(points, bound, middle, radius)
+    # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
+    away = points[i] - middle[f]
+    height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
+    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
+    return i[~too_far], f[~too_far]
+
+
+def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) -> tuple[Ints, Ints]:
+    """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facets' middles ``(m, gdim)``, m > 0, that may meet.
+
+    There is a tree for each class of balls of like radius on either side.
+
+    Args:
+        points: middles of the first.
+        within: their radii ``(n,)``.
+        middle: of the facets.
+        radius: of the facets ``(m,)``.
+    """
+    from scipy.spatial import cKDTree
+
+    rows, facets = [], []
+    smallest = radius.min()
+    theirs = [(which, cKDTree(middle[which]), radius[which].max()) for which in _like(radius)]
+    for own in _like(np.maximum(within, smallest)):
+        tree, largest = cKDTree(points[own]), within[own].max()
+        for which, other, r in theirs:
+            found = tree.sparse_distance_matrix(other, largest + r, output_type="ndarray")
+            if not len(found):
+                continue
+            i, f = own[found["i"]], which[found["j"]]
+            near = found["v"] <= within[i] + r
+            rows.append(i[near])
+            facets.append(f[near])
+    none = np.zeros(0, np.int64)
+    return np.concatenate([none, *rows]), np.concatenate([none, *facets])
+
+
+def _like(sizes: Array) -> list[Ints]:
+    """Indices of positive sizes in classes that differ by less than a factor of two."""
+    size_class = np.floor(np.log2(sizes / sizes.max(initial=0.0)))
+    order = np.argsort(size_class, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(size_class[order])) + 1) if len(order) else []
