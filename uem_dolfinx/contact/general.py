@@ -17,12 +17,10 @@ from dolfinx.mesh import exterior_facet_indices
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.bernstein import Bernstein
+from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.results import Resultant, sum_up
-from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
@@ -31,30 +29,6 @@ from uem_dolfinx.geometry.skin import Skin
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
-
-
-class AmongBodies(NodeToSurface):
-    """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
-
-    target: Neighbour
-
-    def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
-        super().__init__(config, nodes, target, **how)
-        self.ordered_by = target.neighbours.number
-
-    def place(self, points: Array, state: PairState) -> NodalKinematics:
-        """Project contactors (collective); see ``Discretisation``."""
-        self.target.hold(np.where(state.active, state.facet, -1))
-        return super().place(points, state)
-
-    def commit(self) -> None:
-        """Nodes are in front of facets from where they are now."""
-        super().commit()
-        self.target.neighbours.commit()
-
-
-class AmongQuadraticBodies(AmongBodies, Bernstein):
-    """The same with control gaps, of degree 2."""
 
 
 class RigidContact(Contact):

@@ -7,7 +7,8 @@ the last state that was kept. All that is not listed costs nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import count, pairwise
 from typing import NamedTuple
 
@@ -113,7 +114,10 @@ class Neighbours:
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
         self._apart, self._behind, self._itself = apart, overlap, itself
         config = self._config = skin.config
-        self._watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
+        watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
+        #: Nodes whose motion counts, body by body, and where those of each body begin.
+        self._watched = watched[np.argsort(skin.body_of_node[watched], kind="stable")]
+        self._bodies, self._begin = np.unique(skin.body_of_node[self._watched], return_index=True)
         self._committed = config.x.copy()
         self._last_motion = np.zeros(skin.n_bodies)
         #: Facets that hold nodes now, by list ``(n_lists, n)``, -1 for none.
@@ -131,7 +135,9 @@ class Neighbours:
     def _motion(self, since: Array) -> Array:
         """Largest motion of each body's surface on this rank ``(n_bodies,)``."""
         w, most = self._watched, np.zeros(self.skin.n_bodies)
-        np.maximum.at(most, self.skin.body_of_node[w], np.linalg.norm(self._config.x[w] - since[w], axis=1))
+        if len(w):
+            way = self._config.X[w] + self._config.displacement[w] - since[w]
+            most[self._bodies] = np.sqrt(np.maximum.reduceat(np.einsum("ng,ng->n", way, way), self._begin))
         return most
 
     def update(self) -> None:
@@ -316,6 +322,11 @@ class Neighbour(MeshTarget):
         """Take the facets that hold the contactors now ``(n,)``, -1 for none."""
         self.neighbours.held[self.number] = facet
 
+    def nothing_near(self) -> bool:
+        """Whether no contactor of any rank has anything near on this list (collective)."""
+        self.neighbours.update()
+        return self.neighbours.lists[self.number].empty
+
     def told(self, which: Ints) -> Ints:
         """Place of the contactors' bodies in the order; past the last for lists after the first, which tell of no passage."""
         n = self.neighbours
@@ -333,7 +344,7 @@ class Neighbour(MeshTarget):
             every = np.zeros((n, points.shape[1]))
             every[which] = points
             points = every
-        found = self._nothing(points)
+        found = self.nowhere(points)
         if not listed.empty:
             data: FacetData = self.facets.current(corners=True)
             (p,) = listed.exchange.send(points)
@@ -343,14 +354,17 @@ class Neighbour(MeshTarget):
             found = found.with_rows(rows, {name: getattr(nearest, name) for name in found.__dataclass_fields__})
         return found if which is None else found.take(which)
 
-    def _nothing(self, points: Array) -> FacetProjection:
-        """Of points that have nothing near: no facet, no normal, and a gap as large as the model."""
-        (n, g), nn, d = points.shape, self.n_nodes, self.shape.dim
-        facet = np.zeros((nn, g))
+    def nowhere(self, points: Array) -> FacetProjection:
+        """The projection of points that have nothing near: no facet, no normal, and a gap as large as the model."""
+        return replace(self._nowhere, foot=points)
+
+    @cached_property
+    def _nowhere(self) -> FacetProjection:
+        n, g, nn, d = len(self.neighbours.nodes), self.facets.config.gdim, self.n_nodes, self.shape.dim
+        facet, none = np.zeros((nn, g)), np.zeros((n, g))
         facet[:, :d] = self.stride * self.shape.nodes
-        none = np.zeros((n, g))
-        dN = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
+        tab = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
         return FacetProjection(
             np.full(n, self.facets.config.size), none, np.full((n, nn), -1), np.zeros((n, nn)), np.full(n, -1), none,
-            np.full(n, np.inf), np.zeros((n, d)), points, none, points[:, None] + facet, dN.dN, dN.ddN, np.zeros((n, d, g)),
+            np.full(n, np.inf), np.zeros((n, d)), none, none, np.tile(facet, (n, 1, 1)), tab.dN, tab.ddN, np.zeros((n, d, g)),
         )  # fmt: skip
