@@ -47,6 +47,14 @@ def test_couplings_that_cancel():
     assert np.abs(v).max() <= 1e-12 and COMM.allreduce(push.sum()) == pytest.approx(1.0)
 
 
+def test_rows_across_all_motions():
+    """A contactor in a corner has a row across the only motion that is open, which stops nothing but by rounding."""
+    R, B = csr_matrix([[0.0, 1.0], [1.0, 2.7e-16]]), csr_matrix([[0.0], [4.6]])
+    own = np.arange(2) % COMM.size == COMM.rank
+    v, push = least_motion(COMM, np.array([0.0, -1.0]), B, R[own], np.array([0.0, -5e-17])[own])
+    assert np.abs(v).max() <= 1e-12 and COMM.allreduce(push.sum()) == pytest.approx(1.0)
+
+
 def test_rows_that_contradict_each_other():
     """An overlap on both sides cannot be cured: nothing moves against either, and what is free moves on."""
     p, G = np.array([0.5, 1.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])

@@ -55,8 +55,8 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array) -> tuple[Ar
     # in the coordinates x it is the point of a polyhedron that is nearest to p
     p = x = np.asarray(B.T @ f)
     G, length = (R @ B).tocsr(), _lengths(R)
-    # rounding couples no bodies
-    G.data[np.abs(G.data) <= NEGLIGIBLE * np.repeat(_lengths(G), np.diff(G.indptr))] = 0.0
+    # rounding couples no bodies, and stops no motion
+    G.data[np.abs(G.data) <= NEGLIGIBLE * np.repeat(length, np.diff(G.indptr)) * _lengths(B.T)[G.indices]] = 0.0
     G.eliminate_zeros()
     chosen, alike = _lengths(G) == 0, _same_columns(R)
     rows, gaps, lam = G[:0], g[:0], np.zeros(0)
