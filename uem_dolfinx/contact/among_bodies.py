@@ -35,6 +35,10 @@ class AmongBodies(NodeToSurface):
             return NothingNear(self, points, p, p, p.gap, None, None)
         return super().place(points, state)
 
+    def look_farther(self) -> bool:
+        """Reach four times as far: whether that is not beyond the whole model yet."""
+        return self.target.number == 0 and self.target.neighbours.look_farther()
+
     def commit(self) -> None:
         """Nodes are in front of facets from where they are now."""
         super().commit()

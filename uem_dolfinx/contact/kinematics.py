@@ -233,6 +233,9 @@ class Discretisation(Protocol):
     def begin_step(self) -> None:
         """A step begins, for the first time or anew; contactors are placed again."""
 
+    def look_farther(self) -> bool:
+        """From the next placement on, find what is farther away, for bodies that fall: whether there may be more to be found."""
+
     def place(self, points: Array, state: PairState) -> Kinematics:
         """The only search: where contactors at ``points (n, gdim)`` stand (collective)."""
 

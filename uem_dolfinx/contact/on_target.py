@@ -76,6 +76,10 @@ class OnTarget:
         if self._renewing:
             self.let_go()
 
+    def look_farther(self) -> bool:
+        """Nothing that contactors might touch is farther away than they look: False."""
+        return False
+
     def let_go(self) -> None:
         """Keep no feet: the next placement finds them."""
         self.anchor, self._renewing = None, False

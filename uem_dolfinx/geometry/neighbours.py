@@ -125,7 +125,7 @@ class Neighbours:
         #: Number of the order that they keep.
         self.number = next(_orders)
         self._made_at: Array | None = None
-        self._kept = False
+        self._kept, self._farther = False, 0.0
         self._reach = np.zeros(skin.n_bodies)
         self.lists: list[Listing] = []
         #: How often lists have been made.
@@ -145,7 +145,7 @@ class Neighbours:
         if self._kept:
             self._last_motion, self._committed, self._kept = self._motion(self._committed), self._config.x.copy(), False
             # what was inside at the start has been taken out by now
-            self._behind = 0.0
+            self._behind = self._farther = 0.0
         stale = self._made_at is None or bool((self._motion(self._made_at) > self._reach).any())
         if reduced(self._config.comm, stale, op=MPI.LOR):
             self._make()
@@ -154,11 +154,18 @@ class Neighbours:
         """A step has been kept, or is gone back to: nodes are in front of facets from where they are when they are next looked at."""
         self._kept = True
 
+    def look_farther(self) -> bool:
+        """Reach four times as far from the next placement on, until a step is kept: whether that is not beyond the whole model yet."""
+        if self._farther > self._config.size:
+            return False
+        self._farther, self._made_at = 4.0 * max(self._farther, float(self._reach.max(initial=0.0))), None
+        return True
+
     @timed("search")
     def _make(self) -> None:
         skin, config, comm = self.skin, self._config, self._config.comm
         motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
-        self._reach = np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion)
+        self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), self._farther)
         self._made_at = config.x.copy()
         self.times_made += 1
         # what facets' ranks have to know of a node, which goes where a facet may be in reach

@@ -248,6 +248,8 @@ class FloatingBodies:
         # a step that no gap closes, nor takes a body out of an overlap, goes on for ever
         rate, some = R @ v, OPEN * np.abs(v).max()
         if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
+            if reduced(comm, any([pair.discretisation.look_farther() for pair in self._pairs]), op=MPI.LOR):
+                return np.zeros_like(v), took
             raise motions.error(v)
         return v, took
 
