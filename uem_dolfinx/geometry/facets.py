@@ -120,7 +120,7 @@ class TargetFacets:
 
     def normals(self) -> Array:
         """Outward unit normals of the facets at their nodes, each its own ``(m, nn, gdim)``."""
-        return _unit(self._area_vectors(self.x))
+        return unit(self._area_vectors(self.x))
 
     def _area_vectors(self, x: Array) -> Array:
         """Outward normals at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``, as long as the facets are large."""
@@ -131,11 +131,11 @@ class TargetFacets:
         x = self.x
         # every node sees its facet under the angle-free area weight
         vectors = self._area_vectors(x)
-        data = FacetData(x, self.nodes, _unit(self._summed(vectors)))
+        data = FacetData(x, self.nodes, unit(self._summed(vectors)))
         if not corners:
             return data
         angles = self.shape.corner_angles(x)
-        return replace(data, corner_normals=self._summed(angles[:, :, None] * _unit(vectors[:, : angles.shape[1]])))
+        return replace(data, corner_normals=self._summed(angles[:, :, None] * unit(vectors[:, : angles.shape[1]])))
 
     def _summed(self, vectors: Array) -> Array:
         """Sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, seen from each of them (collective)."""
@@ -156,7 +156,7 @@ class TargetFacets:
         return np.asarray(np.where(length > 0, sums[:, :, -1] / np.where(length > 0, length, 1.0), 1.0))
 
 
-def _unit(vectors: Array) -> Array:
+def unit(vectors: Array) -> Array:
     """The vectors ``(..., gdim)`` with length one; those without length stay."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0, length, 1.0))

@@ -32,16 +32,13 @@ AHEAD_AT_REST = 0.5
 #: Lists reach ahead of a body by so many times what it moves in a step.
 #: [convention; motion in a step; test_general_contact.py::test_lists_last]
 STEPS_AHEAD = 4.0
-#: A facet faces a node if the cosine of the angle between its normal and that of a facet around the node is smaller than minus this.
+#: A facet faces a node if the cosine of the angle between its normal and one around the node, see ``Skin.cones``, is below minus this.
 #: [convention; cosine; test_general_contact.py::test_who_faces_whom]
-FACING = 0.1
+FACING = 0.5
 #: Of two places of one body that meet, the nodes of that one follow whose normal in the reference configuration points more in this
 #: direction, or that lies farther in it: its slopes are irrational, so that no side of a body is likely to lie along it.
 #: [convention; direction; -]
 DIRECTION = np.array([0.6180339887, 1.0, 0.4142135624])
-#: Normals whose parts in it differ by less do not tell who follows, and places do.
-#: [convention; cosine; test_self_contact.py::test_who_follows_where_normals_are_alike]
-ALIKE = 0.1
 #: A node that was farther behind a facet than this is not in front of it.
 #: [convention; depth of the cell behind, or half a side of the facet; test_general_contact.py::test_through_a_thin_plate]
 BEHIND = 0.25
@@ -57,6 +54,7 @@ class Listing:
         exchange: with the ranks that have facets for this rank's nodes; its rows are places of nodes.
         node: places among the nodes received ``(k,)``.
         facet: of this rank ``(k,)``.
+        cosine: between the facet's normal and that around the node which it faces most squarely, when it was listed ``(k,)``.
         opened: sides of these behind which nothing is listed for the node ``(k, n_sides)``.
         empty: whether there is none on any rank.
     """
@@ -64,6 +62,7 @@ class Listing:
     exchange: Exchange
     node: Ints
     facet: Ints
+    cosine: Array
     opened: Bools
     empty: bool
 
@@ -183,7 +182,7 @@ class Neighbours:
             sides, self.held.T,
         )  # fmt: skip
         *told, rows = exchange.send(*about, np.arange(n))
-        node, facet, distance = self._pairs(Asking(*told))
+        node, facet, distance, cosine = self._pairs(Asking(*told))
         home, row = exchange.origins[node], rows[node]
         # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
         meeting, first = Exchange.to(comm, home), self.first[comm.rank]
@@ -195,7 +194,7 @@ class Neighbours:
         opened |= skin.open_sides[facet]
         mine = [np.flatnonzero(number == k) for k in range(self._n)]
         empty = reduced(comm, np.array([len(m) for m in mine])) == 0
-        self.lists = [self._list(home[m], row[m], facet[m], opened[m], bool(e)) for m, e in zip(mine, empty)]
+        self.lists = [self._list(home[m], row[m], facet[m], (cosine[m], opened[m]), bool(e)) for m, e in zip(mine, empty)]
 
     def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
         """Sides of facets behind which no facet is listed for the same node, so that the foot lies past an end there ``(k, n_sides)``.
@@ -211,13 +210,13 @@ class Neighbours:
         at = np.minimum(np.searchsorted(listed, asked), max(len(listed) - 1, 0))
         return np.asarray(listed[at] != asked if len(listed) else np.ones(asked.shape, bool))
 
-    def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array]:
-        """Nodes and this rank's facets that may touch, and their distances, ``(k,)`` each."""
+    def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array, Array]:
+        """Nodes and this rank's facets that may touch, their distances, and cosines between their normals, ``(k,)`` each."""
         assert self._made_at is not None
         skin, x, points = self.skin, self._made_at[self.skin.dofs], of.points
         none = np.zeros(0, np.int64)
         if not len(points) or not len(x):
-            return none, none, np.zeros(0)
+            return none, none, np.zeros(0), np.zeros(0)
         tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(x), 1)))
         middle = np.einsum("na,nag->ng", tab.N, x)
         radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
@@ -228,7 +227,8 @@ class Neighbours:
         i, f, same = i[follows], f[follows], same[follows]
         cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], unit_normals(tab, x)[f] * skin.sign[f, None])
         front = self._in_front(of.committed[i], f, same)
-        kept = (cosines.min(axis=1, initial=0.0) < -FACING) & front
+        cosine = cosines.min(axis=1, initial=0.0)
+        kept = (cosine < -FACING) & front
         kept[same] &= self._first_of_itself(of, i[same], f[same], cosines[same])
         kept |= (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
         for k, (_, a, _, b) in enumerate(self._apart):
@@ -236,7 +236,7 @@ class Neighbours:
         i, f = i[kept], f[kept]
         distance = np.sqrt(closest_point(skin.shape, x[f], points[i])[1])
         near = distance <= (of.reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
-        return i[near], f[near], distance[near]
+        return i[near], f[near], distance[near], cosine[kept][near]
 
     def _in_front(self, points: Array, facet: Ints, same: Bools) -> Bools:
         """Which nodes at ``points (k, gdim)`` were in front of this rank's facets, some of the nodes' own body."""
@@ -262,8 +262,8 @@ class Neighbours:
         normal, middle = unit_normals(tab, X) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, X)
         # the normal of that facet around the node that faces most squarely
         own = of.cones[node, cosines.argmin(axis=1), 1] if len(node) else np.zeros((0, len(d)))
-        turned, farther = (own - normal[facet]) @ d, (of.drawn[node] - middle[facet]) @ d
-        return np.where(np.abs(turned) > ALIKE, turned, farther) > 0
+        # where normals are alike, as on one side of a strip that is folded, places tell
+        return np.asarray((own - normal[facet] + (of.drawn[node] - middle[facet]) / self._config.size) @ d > 0)
 
     def _shared_out(self, row: Ints, body: Ints, distance: Array) -> Ints:
         """The body that each node may touch by each list, -1 for none ``(n_lists, n)``: that which holds it now, then the nearest.
@@ -300,7 +300,7 @@ class Neighbours:
         (found[exchange.rows],) = exchange.back(self.skin.body[asked - self.first[self._config.comm.rank]])
         return found
 
-    def _list(self, home: Ints, row: Ints, facet: Ints, opened: Bools, empty: bool) -> Listing:
+    def _list(self, home: Ints, row: Ints, facet: Ints, more: tuple[Array, Bools], empty: bool) -> Listing:
         """The list of pairs, whose nodes are ``row (k,)`` of the ranks ``home (k,)`` (collective)."""
         comm = self._config.comm
         n = len(self.nodes) if comm.size == 1 else int(reduced(comm, len(self.nodes), op=MPI.MAX))
@@ -309,7 +309,7 @@ class Neighbours:
         back = Exchange.to(comm, asked // max(n, 1))
         (rows,) = back.send(asked % max(n, 1))
         ends = np.searchsorted(back.origins, np.arange(comm.size + 1))
-        return Listing(Exchange(comm, [rows[a:b] for a, b in pairwise(ends)]), node.ravel(), facet, opened, empty)
+        return Listing(Exchange(comm, [rows[a:b] for a, b in pairwise(ends)]), node.ravel(), facet, *more, empty)
 
 
 class Neighbour(MeshTarget):
@@ -355,7 +355,9 @@ class Neighbour(MeshTarget):
         if not listed.empty:
             data: FacetData = self.facets.current(corners=True)
             (p,) = listed.exchange.send(points)
-            feet = Feet._make(listed.exchange.back(*self._on_nearest(p, data, listed.node, listed.facet, listed.opened)))
+            feet = Feet._make(
+                listed.exchange.back(*self._on_nearest(p, data, listed.node, listed.facet, listed.cosine, listed.opened))
+            )
             nearest, _ = self._nearest_foot(points, listed.exchange.rows, feet)
             rows = np.unique(listed.exchange.rows)
             found = found.with_rows(rows, {name: getattr(nearest, name) for name in found.__dataclass_fields__})

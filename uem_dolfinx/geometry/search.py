@@ -45,6 +45,7 @@ class Feet(NamedTuple):
         open_sides: which sides bound the surface ``(n, n_sides)``.
         open_nodes: which nodes lie on such a side ``(n, nn)``.
         facing: how squarely the point is in front of the facet, or behind it, a length ``(n,)``; not known of facets that were asked for.
+        cosine: between the facet's normal and that around the point which it faces most squarely, where this is known, else 0 ``(n,)``.
     """
 
     facet: Ints
@@ -57,6 +58,7 @@ class Feet(NamedTuple):
     open_sides: Bools
     open_nodes: Bools
     facing: Array
+    cosine: Array
 
 
 class MeshTarget:
@@ -213,7 +215,7 @@ class MeshTarget:
         """The nearest of several feet of ``points (n, gdim)``, of places ``rows (k,)``, in the order of those that have any."""
         answer = self._evaluate(points[rows], feet)
         distance = np.linalg.norm(points[rows] - answer.foot, axis=1)
-        best = _nearest(rows, distance, feet.facing, feet.key, ON_SIDE * self.stride)
+        best = _nearest(rows, distance, feet.facing, feet.key, ON_SIDE * self.stride, feet.cosine)
         return answer.take(best), Feet._make(a[best] for a in feet)
 
     def _project_here(self, points: Array, data: FacetData, facet: Ints | None = None, xi: Array | None = None) -> Feet:
@@ -222,9 +224,18 @@ class MeshTarget:
             return self._on_nearest(points, data, *candidate_pairs(self.shape, data.x, points))
         if xi is None:
             xi, _ = closest_point(self.shape, data.x[facet], points)
-        return self._feet(facet, xi, data, np.zeros(len(points)))
+        none = np.zeros(len(points))
+        return self._feet(facet, xi, data, none, none)
 
-    def _on_nearest(self, points: Array, data: FacetData, pairs: Ints, candidates: Ints, open_sides: Bools | None = None) -> Feet:
+    def _on_nearest(
+        self,
+        points: Array,
+        data: FacetData,
+        pairs: Ints,
+        candidates: Ints,
+        cosine: Array | None = None,
+        open_sides: Bools | None = None,
+    ) -> Feet:
         """Feet of points that have candidates, on the nearest of them.
 
         Args:
@@ -232,16 +243,21 @@ class MeshTarget:
             data: of this rank's facets.
             pairs: places of points ``(k,)``.
             candidates: this rank's facets that may be nearest ``(k,)``.
+            cosine: as of ``Feet``, which tells where points are as near to several and faced alike ``(k,)``; None where it is not known.
             open_sides: sides of these that bound the surface for their points ``(k, n_sides)``; None are those that bound it for all.
         """
         xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
         tab = self.shape.tabulate(xi)
         away = points[pairs] - np.einsum("na,nag->ng", tab.N, x)
         facing = self._facing(tab, away, candidates, data)
-        best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride)
-        return self._feet(candidates[best], xi[best], data, facing[best], None if open_sides is None else open_sides[best])
+        cosine = np.zeros(len(pairs)) if cosine is None else cosine
+        best = _nearest(pairs, np.sqrt(d2), facing, self.facets.keys[candidates], ON_SIDE * self.stride, cosine)
+        opened = None if open_sides is None else open_sides[best]
+        return self._feet(candidates[best], xi[best], data, facing[best], cosine[best], opened)
 
-    def _feet(self, facet: Ints, xi: Array, data: FacetData, facing: Array, open_sides: Bools | None = None) -> Feet:
+    def _feet(
+        self, facet: Ints, xi: Array, data: FacetData, facing: Array, cosine: Array, open_sides: Bools | None = None
+    ) -> Feet:
         of = self.facets
         open_nodes = of.open_nodes[facet]
         if open_sides is None:
@@ -251,7 +267,7 @@ class MeshTarget:
                 open_nodes[:, nodes] |= open_sides[:, s, None]
         return Feet(
             facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],
-            of.sign[facet], open_sides, open_nodes, facing,
+            of.sign[facet], open_sides, open_nodes, facing, cosine,
         )  # fmt: skip
 
     def _facing(self, tab: Tabulated, away: Array, facet: Ints, data: FacetData) -> Array:
@@ -325,13 +341,13 @@ class MeshTarget:
         )
 
 
-def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: float) -> Ints:
+def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: float, cosine: Array | None = None) -> Ints:
     """The nearest of several candidates for each point, as indices.
 
     The facets that share an edge are equally near to a point outside a convex edge, and to one behind a concave edge. The one that the
-    point faces most squarely counts: no point hovers in the plane of another one, and none is hidden there. What is still tied goes by
-    the facets' keys, which no partition changes. Lengths that differ by no more than ``rounding``, or by a small part of the distance,
-    are equal.
+    point faces most squarely counts: no point hovers in the plane of another one, and none is hidden there. Then that counts which faces
+    the point's own surface most squarely, that of the smallest ``cosine``. What is still tied goes by the facets' keys, which no
+    partition changes. Lengths that differ by no more than ``rounding``, or by a small part of the distance, are equal.
     """
     n = points.max(initial=-1) + 1
     closest, most = np.full(n, np.inf), np.full(n, -np.inf)
@@ -340,7 +356,10 @@ def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: 
     farther = distance > closest[points] + band
     np.maximum.at(most, points, np.where(farther, -np.inf, facing))
     aslant = facing < most[points] - band
-    order = np.lexsort((key, aslant, farther, points))
+    cosine = np.zeros(len(points)) if cosine is None else cosine
+    least = np.full(n, np.inf)
+    np.minimum.at(least, points, np.where(farther | aslant, np.inf, cosine))
+    order = np.lexsort((key, cosine > least[points] + EQUALLY_NEAR, aslant, farther, points))
     _, first = np.unique(points[order], return_index=True)
     return order[first]
 

@@ -13,7 +13,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import FacetData, TargetFacets
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets, unit
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import gathered, reduced, sums_by_keys
@@ -119,18 +119,20 @@ class Skin(TargetFacets):
         return replace(data, nodal_normals=np.where(self._sharp_nodes[:, :, None], own, data.nodal_normals))
 
     def cones(self, nodes: Indices) -> Array:
-        """Normals of the facets around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
+        """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
 
-        They are those of the facets at the node, zero where there are no more.
+        They are those of the facets at the node, and first their mean: one that pushes on the node from without, along whatever
+        direction between the normals, faces one of these by less than 60 degrees. Zero where there are no more.
         """
         config, g = self.config, self.config.gdim
         drawn = self._area_vectors(config.X[self.dofs])
-        normals = np.stack([self.normals(), drawn / np.linalg.norm(drawn, axis=2, keepdims=True)], axis=2)
+        normals = np.stack([self.normals(), unit(drawn)], axis=2)
         there, arrived = config.send_to_owners(self.nodes.ravel(), normals.reshape(-1, 2 * g))
         order = np.argsort(there, kind="stable")
         there, arrived = there[order], arrived[order]
         place = np.arange(len(there)) - np.searchsorted(there, there)
         most = int(reduced(config.comm, int(place.max(initial=0)), op=MPI.MAX)) + 1
-        cones = np.zeros((config.n_owned, most, 2, g))
-        cones[there, place] = arrived.reshape(-1, 2, g)
+        cones = np.zeros((config.n_owned, most + 1, 2, g))
+        cones[there, place + 1] = arrived.reshape(-1, 2, g)
+        cones[:, 0] = unit(cones.sum(axis=1))
         return cones[nodes]
