@@ -175,7 +175,7 @@ class GeneralContact:
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
             body = skin.body_of_node[nodes]
-            own = nodes[(place[body] < with_facets.max()) | itself[body]]
+            own = nodes[(place[body] < with_facets.max()) | itself[body] | skin.corners[nodes]]
             apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
             bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
             neighbours = Neighbours(skin, own, place, apart, bound, config.gdim, itself)

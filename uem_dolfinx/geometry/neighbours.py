@@ -1,7 +1,8 @@
 """Which facets of which bodies each surface node may touch: lists that are made anew only when something has moved far enough.
 
 A facet may hold a node if it belongs to a body that the node's own follows, if it faces the node, and if the node was in front of it in
-the last state that was kept. All that is not listed costs nothing.
+the last state that was kept. Nodes at sharp edges follow in both directions: between the nodes of a surface they would else pass into it.
+All that is not listed costs nothing.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ class Asking(NamedTuple):
         reach: how far ahead of them is looked ``(n,)``.
         body: of each ``(n,)``.
         node: global number ``(n,)``.
+        corner: whether it lies on a sharp convex edge ``(n,)``.
         cones: normals of the facets around them, now and in the reference configuration ``(n, c, 2, gdim)``.
         sides: whether they are in sets of facets that never touch each other ``(n, s)``.
         held: facets that hold them ``(n, n_lists)``.
@@ -88,6 +90,7 @@ class Asking(NamedTuple):
     reach: Array
     body: Ints
     node: Ints
+    corner: Bools
     cones: Array
     sides: Bools
     held: Ints
@@ -178,8 +181,8 @@ class Neighbours:
             [a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)]
         )
         about = Asking(
-            points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes), skin.cones(self.nodes),
-            sides, self.held.T,
+            points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes),
+            skin.corners[self.nodes], skin.cones(self.nodes), sides, self.held.T,
         )  # fmt: skip
         *told, rows = exchange.send(*about, np.arange(n))
         node, facet, distance, cosine = self._pairs(Asking(*told))
@@ -223,13 +226,14 @@ class Neighbours:
         i, f = balls_that_meet(points, of.reach, middle, radius + self._reach[skin.body])
         own, its = of.body[i], skin.body[f]
         same = (own == its) & self._itself[own]
-        follows = (self.place[its] > self.place[own]) | (same & (skin.nodes[f] != of.node[i, None]).all(axis=1))
+        follows = (self.place[its] > self.place[own]) | (of.corner[i] & (its != own))
+        follows |= same & (skin.nodes[f] != of.node[i, None]).all(axis=1)
         i, f, same = i[follows], f[follows], same[follows]
         cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], unit_normals(tab, x)[f] * skin.sign[f, None])
         front = self._in_front(of.committed[i], f, same)
         cosine = cosines.min(axis=1, initial=0.0)
         kept = (cosine < -FACING) & front
-        kept[same] &= self._first_of_itself(of, i[same], f[same], cosines[same])
+        kept[same] &= of.corner[i[same]] | self._first_of_itself(of, i[same], f[same], cosines[same])
         kept |= (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
         for k, (_, a, _, b) in enumerate(self._apart):
             kept &= ~((of.sides[i, k] & b[f]) | (of.sides[i, len(self._apart) + k] & a[f]))

@@ -103,14 +103,24 @@ class Skin(TargetFacets):
         cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
         falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
         self.sharp_sides: Bools = (one & (cosine < SHARP)).reshape(len(X), -1)
-        return (~one | (falls & (cosine < SHARP))).reshape(len(X), -1)
+        self._rims: Bools = (one & falls & (cosine < SHARP)).reshape(len(X), -1)
+        return ~one.reshape(len(X), -1) | self._rims
+
+    def _on_sides(self, which: Bools) -> Bools:
+        """Local nodes on some of the facets' sides, of any rank ``(n_local,)``; ``which (m, n_sides)`` are those (collective)."""
+        sides = enumerate(self.shape.edges())
+        dofs = np.concatenate([self.dofs[which[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
+        return self.config.to_owners(dofs, np.ones(len(dofs))) > 0
 
     @cached_property
     def _sharp_nodes(self) -> Bools:
         """Which nodes of facets lie on a sharp edge, of any facet ``(m, nn)`` (first time: collective)."""
-        sides = enumerate(self.shape.edges())
-        dofs = np.concatenate([self.dofs[self.sharp_sides[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
-        return self.config.to_owners(dofs, np.ones(len(dofs)))[self.dofs] > 0
+        return self._on_sides(self.sharp_sides)[self.dofs]
+
+    @cached_property
+    def corners(self) -> Bools:
+        """Which owned nodes lie on a sharp convex edge ``(n_owned,)`` (first time: collective)."""
+        return self._on_sides(self._rims)[: self.config.n_owned]
 
     def current(self, corners: bool = False) -> FacetData:
         """Facets where they are now; at sharp edges normals are the facets' own (collective)."""
