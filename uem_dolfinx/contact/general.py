@@ -1,7 +1,7 @@
 """General contact: the surfaces of all bodies against each other and against rigid ones, by one declaration.
 
 Of two bodies the nodes of one follow the facets of the other; an order of all bodies tells which, so that none follow each other in a
-ring. A node may touch as many bodies at once as there are directions to hold it in, each by a contact of its own.
+ring. A node may touch as many bodies at once as others meet it in a corner of a grid of blocks, each by a contact of its own.
 """
 
 from __future__ import annotations
@@ -178,8 +178,10 @@ class GeneralContact:
             own = nodes[(place[body] < with_facets.max()) | itself[body] | skin.corners[nodes]]
             apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
             bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
-            neighbours = Neighbours(skin, own, place, apart, bound, config.gdim, itself)
-            parts += [AmongContact(self, neighbours, k, normals=self.normals, **options) for k in range(config.gdim)]
+            # as many bodies as others meet one in a corner of a grid of blocks
+            n_lists = 2**config.gdim - 1
+            neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
+            parts += [AmongContact(self, neighbours, k, normals=self.normals, **options) for k in range(n_lists)]
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""

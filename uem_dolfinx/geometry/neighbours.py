@@ -28,20 +28,20 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: Lists reach so far ahead of every body, if it hardly moves.
-#: [convention; mean length of the sides of its facets; test_general_contact.py::test_lists_last]
+#: [convention; mean length of the sides of its facets; test_neighbours.py::test_lists_last]
 AHEAD_AT_REST = 0.5
 #: Lists reach ahead of a body by so many times what it moves in a step.
-#: [convention; motion in a step; test_general_contact.py::test_lists_last]
+#: [convention; motion in a step; test_neighbours.py::test_lists_last]
 STEPS_AHEAD = 4.0
 #: A facet faces a node if the cosine of the angle between its normal and one around the node, see ``Skin.cones``, is below minus this.
-#: [convention; cosine; test_general_contact.py::test_who_faces_whom]
-FACING = 0.5
+#: [convention; cosine; test_neighbours.py::test_who_faces_whom]
+FACED = 0.5
 #: Of two places of one body that meet, the nodes of that one follow whose normal in the reference configuration points more in this
 #: direction, or that lies farther in it: its slopes are irrational, so that no side of a body is likely to lie along it.
 #: [convention; direction; -]
 DIRECTION = np.array([0.6180339887, 1.0, 0.4142135624])
 #: A node that was farther behind a facet than this is not in front of it.
-#: [convention; depth of the cell behind, or half a side of the facet; test_general_contact.py::test_through_a_thin_plate]
+#: [convention; depth of the cell behind, or half a side of the facet; test_neighbours.py::test_through_a_thin_plate]
 BEHIND = 0.25
 
 _orders = count()
@@ -114,7 +114,7 @@ class Neighbours:
         itself: Bools,
     ):  # fmt: skip
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
-        self._apart, self._behind, self._itself = apart, overlap, itself
+        self._apart, self._overlap, self._itself = apart, overlap, itself
         config = self._config = skin.config
         watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
         #: Nodes whose motion counts, body by body, and where those of each body begin.
@@ -129,6 +129,7 @@ class Neighbours:
         self._made_at: Array | None = None
         self._kept, self._farther = False, 0.0
         self._reach = np.zeros(skin.n_bodies)
+        self._lasts = self._reach
         self.lists: list[Listing] = []
         #: How often lists have been made.
         self.times_made = 0
@@ -147,8 +148,10 @@ class Neighbours:
         if self._kept:
             self._last_motion, self._committed, self._kept = self._motion(self._committed), self._config.x.copy(), False
             # what was inside at the start has been taken out by now
-            self._behind = self._farther = 0.0
-        stale = self._made_at is None or bool((self._motion(self._made_at) > self._reach).any())
+            if (self._reach < self._overlap).any():
+                self._made_at = None
+            self._overlap = self._farther = 0.0
+        stale = self._made_at is None or bool((self._motion(self._made_at) > self._lasts).any())
         if reduced(self._config.comm, stale, op=MPI.LOR):
             self._make()
 
@@ -167,7 +170,7 @@ class Neighbours:
     def _make(self) -> None:
         skin, config, comm = self.skin, self._config, self._config.comm
         motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
-        self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), self._farther)
+        self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), max(self._farther, self._overlap))
         self._made_at = config.x.copy()
         self.times_made += 1
         # what facets' ranks have to know of a node, which goes where a facet may be in reach
@@ -185,19 +188,57 @@ class Neighbours:
             skin.corners[self.nodes], skin.cones(self.nodes), sides, self.held.T,
         )  # fmt: skip
         *told, rows = exchange.send(*about, np.arange(n))
-        node, facet, distance, cosine = self._pairs(Asking(*told))
+        node, facet, cosine, *about_pairs = self._pairs(Asking(*told))
         home, row = exchange.origins[node], rows[node]
         # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
         meeting, first = Exchange.to(comm, home), self.first[comm.rank]
-        pairs = meeting.send(row, skin.body[facet], distance, facet + first, skin.across[facet])
-        self.body = self._shared_out(*pairs[:3])
+        pairs = meeting.send(row, skin.body[facet], facet + first, skin.across[facet], skin.keys[facet], *about_pairs)
+        seen = self._on_this_side(pairs[0], pairs[1], *pairs[4:])
+        rows, bodies, facets, across, _, distance = (a[seen] for a in pairs[:6])
+        self.body = self._shared_out(rows, bodies, distance)
         number, opened = np.full(len(row), -1), np.zeros((len(row), skin.across.shape[1]), bool)
-        which = np.where(self.body[:, pairs[0]] == pairs[1], np.arange(self._n)[:, None], -1).max(axis=0)
-        number[meeting.rows], opened[meeting.rows] = meeting.back(which, self._open_sides(pairs[0], *pairs[3:]))
+        which, ends = np.full(len(seen), -1), np.ones((len(seen), skin.across.shape[1]), bool)
+        which[seen] = np.where(self.body[:, rows] == bodies, np.arange(self._n)[:, None], -1).max(axis=0)
+        ends[seen] = self._open_sides(rows, facets, across)
+        # bodies that are in reach, but on no list, may not be met before lists are made anew
+        left, lasts = which[seen] < 0, self._reach.copy()
+        for body in (own[rows[left]], bodies[left]):
+            np.minimum.at(lasts, body, 0.5 * distance[left])
+        self._lasts = reduced(comm, lasts, op=MPI.MIN)
+        number[meeting.rows], opened[meeting.rows] = meeting.back(which, ends)
         opened |= skin.open_sides[facet]
         mine = [np.flatnonzero(number == k) for k in range(self._n)]
         empty = reduced(comm, np.array([len(m) for m in mine])) == 0
         self.lists = [self._list(home[m], row[m], facet[m], (cosine[m], opened[m]), bool(e)) for m, e in zip(mine, empty)]
+
+    def _on_this_side(
+        self, row: Ints, body: Ints, key: Ints, distance: Array, faces: Bools, front: Bools, normal: Array
+    ) -> Bools:
+        """Which facets may hold nodes ``(k,)``: those that the nodes are in front of, and of the same body those on the same side.
+
+        A node outside a round body is behind the planes of facets that it may slide to next. They are turned by a right angle or less
+        from the nearest of the facets that it is in front of; the back of a plate is turned away. Of a node that is inside a body at
+        the start the nearest facet of all counts.
+
+        Args:
+            row: places of nodes ``(k,)``.
+            body: of the facets.
+            key: of the facets, alike in any partition.
+            distance: of nodes from them.
+            faces: whether they face the nodes; the others are here at the start alone.
+            front: whether the nodes are in front of them.
+            normal: of the facets ``(k, gdim)``.
+        """
+        known, pair = np.unique(row * self.skin.n_bodies + body, return_inverse=True)
+        closest = np.full(len(known), np.inf)
+        np.minimum.at(closest, pair, distance)
+        inside = np.ones(len(known), bool)
+        inside[pair[front & (distance <= closest[pair] * (1 + EQUALLY_NEAR))]] = False
+        inside &= self._overlap > 0.0
+        order = np.lexsort((key, distance, ~((front & faces) | inside[pair]), pair))
+        nearest = order[np.searchsorted(pair[order], np.arange(len(known)))][pair]
+        beside = np.einsum("kg,kg->k", normal, normal[nearest]) > -FACED
+        return np.asarray(faces & np.where(inside[pair], beside, front | (beside & (front & faces)[nearest])))
 
     def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
         """Sides of facets behind which no facet is listed for the same node, so that the foot lies past an end there ``(k, n_sides)``.
@@ -213,13 +254,18 @@ class Neighbours:
         at = np.minimum(np.searchsorted(listed, asked), max(len(listed) - 1, 0))
         return np.asarray(listed[at] != asked if len(listed) else np.ones(asked.shape, bool))
 
-    def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array, Array]:
-        """Nodes and this rank's facets that may touch, their distances, and cosines between their normals, ``(k,)`` each."""
+    def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array, Array, Bools, Bools, Array]:
+        """Nodes and this rank's facets that may touch.
+
+        Returns:
+            Places of nodes, facets, least cosines between their normals, distances, whether they face each other, whether the nodes are
+            in front ``(k,)``, and the facets' normals ``(k, gdim)``.
+        """
         assert self._made_at is not None
         skin, x, points = self.skin, self._made_at[self.skin.dofs], of.points
         none = np.zeros(0, np.int64)
         if not len(points) or not len(x):
-            return none, none, np.zeros(0), np.zeros(0)
+            return none, none, *np.zeros((2, 0)), *np.zeros((2, 0), bool), np.zeros((0, points.shape[1]))
         tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(x), 1)))
         middle = np.einsum("na,nag->ng", tab.N, x)
         radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
@@ -229,27 +275,29 @@ class Neighbours:
         follows = (self.place[its] > self.place[own]) | (of.corner[i] & (its != own))
         follows |= same & (skin.nodes[f] != of.node[i, None]).all(axis=1)
         i, f, same = i[follows], f[follows], same[follows]
-        cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], unit_normals(tab, x)[f] * skin.sign[f, None])
-        front = self._in_front(of.committed[i], f, same)
-        cosine = cosines.min(axis=1, initial=0.0)
-        kept = (cosine < -FACING) & front
+        normal = unit_normals(tab, x)[f] * skin.sign[f, None]
+        cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], normal)
+        front, cosine = self._in_front(of.committed[i], f), cosines.min(axis=1, initial=0.0)
+        faces = cosine < -FACED
+        # at the start facets that look away tell as well whether a node is inside a body
+        kept = np.where(same, faces & front, faces | (self._overlap > 0.0))
         kept[same] &= of.corner[i[same]] | self._first_of_itself(of, i[same], f[same], cosines[same])
-        kept |= (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
+        holds = (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
+        kept, faces, front = kept | holds, faces | holds, front | holds
         for k, (_, a, _, b) in enumerate(self._apart):
             kept &= ~((of.sides[i, k] & b[f]) | (of.sides[i, len(self._apart) + k] & a[f]))
-        i, f = i[kept], f[kept]
+        i, f, faces, front, normal = i[kept], f[kept], faces[kept], front[kept], normal[kept]
         distance = np.sqrt(closest_point(skin.shape, x[f], points[i])[1])
         near = distance <= (of.reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
-        return i[near], f[near], distance[near], cosine[kept][near]
+        return i[near], f[near], cosine[kept][near], distance[near], faces[near], front[near], normal[near]
 
-    def _in_front(self, points: Array, facet: Ints, same: Bools) -> Bools:
-        """Which nodes at ``points (k, gdim)`` were in front of this rank's facets, some of the nodes' own body."""
+    def _in_front(self, points: Array, facet: Ints) -> Bools:
+        """Which nodes at ``points (k, gdim)`` were in front of this rank's facets ``(k,)``."""
         skin, y = self.skin, self._committed[self.skin.dofs]
         tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(y), 1)))
         normal, middle = unit_normals(tab, y) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, y)
         height = np.einsum("kg,kg->k", points - middle[facet], normal[facet])
-        depth = BEHIND * np.minimum(skin.depth, skin.radius)[facet]
-        return np.asarray(height >= -np.where(same, depth, np.maximum(depth, self._behind)))
+        return np.asarray(height >= -BEHIND * np.minimum(skin.depth, skin.radius)[facet])
 
     def _first_of_itself(self, of: Asking, node: Ints, facet: Ints, cosines: Array) -> Bools:
         """Which nodes ``(k,)`` of a body follow its facets rather than these those.

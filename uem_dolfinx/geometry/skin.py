@@ -20,10 +20,11 @@ from uem_dolfinx.parallel import gathered, reduced, sums_by_keys
 
 #: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
 #: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
-SHARP = 0.7
-#: Bodies whose facets differ by less than this factor are alike in size, and the order of the mesh's input tells who follows.
+SHARP_EDGE = 0.7
+#: Classes of bodies by the size of their facets, which differs by less than this factor in a class: there the order of the mesh's
+#: input tells who follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
-ALIKE = 1.5
+ALIKE_IN_SIZE = 1.5
 
 
 class Skin(TargetFacets):
@@ -59,8 +60,8 @@ class Skin(TargetFacets):
         self.size: Array = total[:, 0] / np.maximum(total[:, 1], 1.0)
 
     def _sides(self) -> Array:
-        corners = self.config.X[self.dofs[:, : len(self.shape.topology[0])]]
-        return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        x, ends = self.config.X[self.dofs], np.array(self.shape.topology[1])
+        return np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
 
     def order(self, first: list[Tag]) -> Ints:
         """Place of each body in the order in which they follow each other, each those behind it ``(n_bodies,)`` (collective).
@@ -72,7 +73,7 @@ class Skin(TargetFacets):
         for k, tag in reversed(list(enumerate(first))):
             named[self.bodies_of(surface_nodes(self.config, tag))] = k
         with np.errstate(divide="ignore"):
-            fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE))
+            fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE_IN_SIZE))
         place = np.empty(self.n_bodies, np.int64)
         place[np.lexsort((np.arange(self.n_bodies), fine, named))] = np.arange(self.n_bodies)
         return place
@@ -99,12 +100,12 @@ class Skin(TargetFacets):
         told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), len(sides), axis=0)
         others = sums_by_keys(self.config.comm, keys, told) - told
         g, one = self.config.gdim, others[:, 0] == 1
-        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), -1)
+        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), len(sides))
         cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
         falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
-        self.sharp_sides: Bools = (one & (cosine < SHARP)).reshape(len(X), -1)
-        self._rims: Bools = (one & falls & (cosine < SHARP)).reshape(len(X), -1)
-        return ~one.reshape(len(X), -1) | self._rims
+        self.sharp_sides: Bools = (one & (cosine < SHARP_EDGE)).reshape(len(X), len(sides))
+        self._rims: Bools = (one & falls & (cosine < SHARP_EDGE)).reshape(len(X), len(sides))
+        return ~one.reshape(len(X), len(sides)) | self._rims
 
     def _on_sides(self, which: Bools) -> Bools:
         """Local nodes on some of the facets' sides, of any rank ``(n_local,)``; ``which (m, n_sides)`` are those (collective)."""
