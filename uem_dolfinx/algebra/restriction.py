@@ -325,6 +325,12 @@ class Restriction:
         along = np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
         return along if self.rings is None else self.rings.forces(along)
 
+    def read_back(self, weights: Array) -> PETSc.Vec:
+        """The transpose of ``multipliers`` of ``pass_on``: ``S L w`` for weights of the equations ``(m,)`` (collective)."""
+        w = weights if self.rings is None else self.rings.forces(weights, back=True)
+        v = self.space.vector(sums_of_rows(self.equations.node.astype(np.int64), self.lift * w[:, None], self.space.n_owned))
+        return self._series(v)
+
     def _series(self, v: PETSc.Vec) -> PETSc.Vec:
         """``(1 + M + M^2 + ...) v`` (collective)."""
         part = v.array_r.reshape(-1, self.space.block)

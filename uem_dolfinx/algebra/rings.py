@@ -165,12 +165,12 @@ class Rings:
             ring.rows = dependent
             raise
 
-    def forces(self, multipliers: Array) -> Array:
-        """Forces of the given equations ``(m,)`` from those of the closed ones (collective)."""
+    def forces(self, multipliers: Array, back: bool = False) -> Array:
+        """Forces of the given equations ``(m,)`` from those of the closed ones, or the transpose of this map (collective)."""
         (mu,) = self._exchange.send(multipliers[self._mine])
         lam = np.zeros(len(mu))
         for ring in self._rings:
-            lam[ring.rows] = ring.factor.solve(mu[ring.rows], "T")
+            lam[ring.rows] = ring.factor.solve(mu[ring.rows], "N" if back else "T")
         given = multipliers.copy()
         (given[self._mine[self._exchange.rows]],) = self._exchange.back(lam)
         return given

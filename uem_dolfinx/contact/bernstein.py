@@ -167,6 +167,25 @@ class ControlGaps:
         areas = areas + self._handed_on(areas, self.shared & self.family.of_facet)
         return self.scale * (areas + self._handed_on(areas, self.shared & ~self.family.of_facet))
 
+    def forces_back(self, weights: Array, active: Bools) -> Array:
+        """The transpose of the map from multipliers to control forces, for weights of these ``(n,)`` (collective)."""
+        dropped, of_facet = self.shared & self.closed, self.family.of_facet
+        weights = self.scale * weights
+        weights = weights + self._handed_back(active * weights, dropped & ~of_facet)
+        return np.where(active, weights + self._handed_back(active * weights, dropped & of_facet), 0.0)
+
+    def areas_back(self, weights: Array) -> Array:
+        """The transpose of ``areas`` (collective)."""
+        weights = self.scale * weights
+        weights = weights + self._handed_back(weights, self.shared & ~self.family.of_facet)
+        return weights + self._handed_back(weights, self.shared & self.family.of_facet)
+
+    def _handed_back(self, values: Array, terms: Bools) -> Array:
+        """The transpose of ``_handed_on`` (collective)."""
+        f = self.family
+        at_parent = f.config.from_owners(f.nodes, values[:, None], f.parent)[:, 0]
+        return np.asarray(np.bincount(f.child, np.where(terms, f.weight * at_parent, 0.0), minlength=len(f.nodes)), dtype=float)
+
     def _handed_on(self, values: Array, terms: Bools) -> Array:
         """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
         f = self.family
@@ -245,6 +264,18 @@ class ControlKinematics(NodalKinematics):
     def areas(self, areas: Array, current: bool) -> Array:
         """Integrals of Bernstein's basis (collective)."""
         return self.control.areas(areas)
+
+    def areas_along(self, areas: Array) -> Array:
+        """Of Bernstein's basis (collective)."""
+        return self.control.areas(areas)
+
+    def areas_back(self, weights: Array) -> Array:
+        """From Bernstein's basis (collective)."""
+        return self.control.areas_back(weights)
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """From control forces (collective)."""
+        return self.control.forces_back(weights, state.active)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:

@@ -185,7 +185,7 @@ class Contact:
         """
         self.config, facets = config, config.tdim - 1
         # of a problem that could not be made
-        self._fields, _ = {}, self.__dict__.pop("_surface", None)
+        self._fields, _ = {}, self.__dict__.pop("surface", None)
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
@@ -219,7 +219,7 @@ class Contact:
             from uem_dolfinx.contact.sliding import Sliding
 
             friction = Sliding(
-                config, nodes, discretisation, law=law, value=value, areas=lambda: self._surface.reference[nodes], free=free[nodes],
+                config, nodes, discretisation, law=law, value=value, areas=lambda: self.surface.reference[nodes], free=free[nodes],
                 keeps_feet=self.sliding != "finite",
             )  # fmt: skip
         self._pair = Interface(config, nodes, discretisation, friction, **of)
@@ -293,19 +293,19 @@ class Contact:
         return self.pair.largest_gap()
 
     @cached_property
-    def _surface(self) -> Areas:
+    def surface(self) -> Areas:
         """Integrals of the shape functions over the contactor."""
         return Areas(self.config, self.contactor)
 
     @property
     def _areas(self) -> Array:
         """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (first time: collective)."""
-        return self._surface.reference[self.pair.nodes]
+        return self.surface.reference[self.pair.nodes]
 
-    def _measured(self) -> Array:
+    def measured_areas(self) -> Array:
         """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
         current = self.measure == "current"
-        areas = self._surface.current[self.pair.nodes] if current else self._areas
+        areas = self.surface.current[self.pair.nodes] if current else self._areas
         return self.pair.kinematics.areas(areas, current)
 
     @property
@@ -325,7 +325,7 @@ class Contact:
         The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
         whether of the reference or of the current surface.
         """
-        areas = self._measured()
+        areas = self.measured_areas()
         return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
@@ -364,7 +364,7 @@ class Contact:
     @property
     def traction(self) -> fem.Function:
         """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
-        pair, areas = self.pair, self._measured()[:, None]
+        pair, areas = self.pair, self.measured_areas()[:, None]
         tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 

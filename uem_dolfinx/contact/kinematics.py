@@ -191,6 +191,30 @@ class Kinematics(Protocol):
             current: which of the two.
         """
 
+    # -- derivatives of pressures ----------------------------------------------------------------------------------------
+
+    def areas_along(self, areas: Array) -> Array:
+        """What changes of the ``areas (n,)`` given to :meth:`areas` make of what it returns ``(n,)`` (collective)."""
+
+    def areas_back(self, weights: Array) -> Array:
+        """The transpose of :meth:`areas_along` (collective)."""
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """The transpose of the map from the multipliers of equations along normals to ``lam``, ``(n,)`` each (collective)."""
+
+    def stretching(self, current: bool) -> Stretching | None:
+        """How pressures change with the facets around contactors beside; ``current`` as of :meth:`areas`; None if they do not."""
+
+
+class Stretching(Protocol):
+    """Relative changes of pressures with the areas of facets, forces and all else being the same."""
+
+    def along(self, now: Array, drawn: Array) -> Array:
+        """Of contactors ``(n,)`` whose nodes move where they are and where they were drawn ``(n_local, gdim)`` each (collective)."""
+
+    def back(self, weights: Array) -> tuple[Array, Array]:
+        """The transpose of :meth:`along`, for weights ``(n,)``: of the owned nodes ``(n_owned, gdim)`` each (collective)."""
+
 
 class Discretisation(Protocol):
     """Ties contactors to a target. It keeps the feet or segments of a contact with small sliding, and what holds for one step."""

@@ -320,6 +320,22 @@ class NodalKinematics:
         """A nodal force is the integral of the pressure over the node's shape function."""
         return areas
 
+    def areas_along(self, areas: Array) -> Array:
+        """The same."""
+        return areas
+
+    def areas_back(self, weights: Array) -> Array:
+        """The same."""
+        return weights
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """The same."""
+        return weights
+
+    def stretching(self, current: bool) -> None:
+        """Pressures change with the areas alone."""
+        return None
+
 
 def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
     """Contactors that are past an open end of the target in a direction in which they can move ``(n,)``.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, cross_products
 from uem_dolfinx.contact.duals import Basis, basis_of
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
 from uem_dolfinx.contact.mortar_ends import curvature
@@ -64,6 +64,20 @@ class Contactors(OnTarget):
     def sizes(self, x: Array) -> Array:
         """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
         return Planes.of(self.surface.shape, x, self.surface.sign).size
+
+    def growth(self, facets: Ints, x: Array) -> Array:
+        """Derivatives of ``sizes`` of some facets by their nodes at ``x (m, nn, gdim)``: ``(m, nn, gdim)``."""
+        planes, out = Planes.of(self.surface.shape, x, self.surface.sign[facets]), np.zeros(x.shape)
+        if self.surface.shape.dim == 1:
+            out[:, 1] = planes.axes[:, 0]
+            out[:, 0] = -out[:, 1]
+            return out
+        # twice the area vector of a ring of corners is the sum of the products of each with the next
+        ring, n = self.surface.shape.ring, planes.normal * self.surface.sign[facets, None]
+        corners = x[:, ring]
+        across = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
+        out[:, ring] = 0.5 * cross_products(across, n[:, None])
+        return out
 
     def stretch(self, facets: Ints, size: Array) -> Array:
         """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
@@ -250,3 +264,68 @@ class MortarKinematics:
         if current and of.sliding != "finite":
             own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
         return np.where(rows.covered, own, areas)
+
+    def areas_along(self, areas: Array) -> Array:
+        """Of contactors that nothing covers; others see their facets, as ``stretching`` tells."""
+        return np.where(self.rows.covered, 0.0, areas)
+
+    def areas_back(self, weights: Array) -> Array:
+        """The same."""
+        return np.where(self.rows.covered, 0.0, weights)
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """From pressures times areas, which are the same in ``areas``."""
+        return weights * self.rows.share / self.rows.length
+
+    def stretching(self, current: bool) -> MortarStretching | None:
+        """Multipliers are pressures where the surface is now, and forces over kept areas with small and fixed sliding."""
+        of, finite = self.of, self.of.sliding == "finite"
+        if current == finite:
+            return None
+        facets = self.rows.facets if finite else np.arange(len(of.surface.dofs))
+        return MortarStretching(of, np.where(self.rows.covered, 1.0 if finite else -1.0, 0.0), facets)
+
+
+@dataclass(frozen=True)
+class MortarStretching:
+    """Implements ``Stretching``: of pressures that are as a power of the stretch of the facets around their contactor.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        power: ``(n,)``.
+        facets: numbers of the contactor's facets that count ``(m,)``.
+    """
+
+    of: Contactors
+    power: Array
+    facets: Ints
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[Array, Array], ...]:
+        """Derivatives of the areas of facets ``(m, nn, gdim)``, and powers over their sums ``(n,)``: now and as drawn (collective)."""
+        of, parts = self.of, []
+        dofs = of.surface.dofs[self.facets]
+        for x, sign in ((of.config.x[dofs], 1.0), (of.config.X[dofs], -1.0)):
+            size = Planes.of(of.surface.shape, x, of.surface.sign[self.facets]).size
+            whole = of.config.to_owners(dofs.ravel(), (size[:, None] * of.basis.mean).ravel())[of.nodes]
+            parts.append((of.growth(self.facets, x), sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
+        return tuple(parts)
+
+    def along(self, now: Array, drawn: Array) -> Array:
+        """Areas of the facets change, and their sums at the contactors (collective)."""
+        of, found = self.of, np.zeros(len(self.power))
+        dofs = of.surface.dofs[self.facets]
+        for (slopes, over), moved in zip(self._parts, (now, drawn)):
+            change = np.einsum("mag,mag->m", slopes, moved[dofs])[:, None] * of.basis.mean
+            found += over * of.config.to_owners(dofs.ravel(), change.ravel())[of.nodes]
+        return found
+
+    def back(self, weights: Array) -> tuple[Array, Array]:
+        """The same backwards (collective)."""
+        of, found = self.of, []
+        dofs = of.surface.dofs[self.facets]
+        for slopes, over in self._parts:
+            at = of.config.from_owners(of.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
+            values = (at @ of.basis.mean)[:, None, None] * slopes
+            found.append(of.config.add_at_owners(of.config.to_global(dofs.ravel()), values.reshape(-1, slopes.shape[2])))
+        return found[0], found[1]

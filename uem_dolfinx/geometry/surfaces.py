@@ -37,10 +37,20 @@ class Areas:
     def __init__(self, config: Configuration, tag: Tag):
         self._config, self._tag = config, tag
 
-    def _integrals(self, stretch: Any, metadata: dict[str, int] | None = None) -> Any:
-        """Integrals of the shape functions times a factor, compiled."""
-        v = ufl.TestFunction(compat.function_space(self._config.mesh, self._config.degree))
-        return forms.form(v * stretch * forms.surface_measure(self._config.mesh, self._tag.entities, metadata))
+    def integral(self, q: Any, current: bool) -> ufl.Form:
+        """Of a scalar q over the surface of facets, where it is now or as it was drawn, in UFL."""
+        stretch, metadata = 1.0, None
+        if current:
+            F = ufl.Identity(self._config.gdim) + ufl.grad(self._config.u)
+            # an area turns and stretches by the cofactors of F (Nanson)
+            n = ufl.cofac(F) * ufl.FacetNormal(self._config.mesh)
+            # which is no polynomial
+            stretch, metadata = ufl.sqrt(ufl.dot(n, n)), {"quadrature_degree": 2 * self._config.degree + 1}
+        return q * stretch * forms.surface_measure(self._config.mesh, self._tag.entities, metadata)
+
+    def _integrals(self, current: bool) -> Any:
+        """Integrals of the shape functions, compiled."""
+        return forms.form(self.integral(ufl.TestFunction(compat.function_space(self._config.mesh, self._config.degree)), current))
 
     def _assembled(self, form: Any) -> Array:
         b = compat.create_vector(compat.function_space(self._config.mesh, self._config.degree))
@@ -54,15 +64,11 @@ class Areas:
         """Over the reference surface, per local node ``(n_local,)`` (first call: collective)."""
         if self._tag.dim == 0:
             return np.zeros(self._config.n_local)
-        return self._assembled(self._integrals(1.0))
+        return self._assembled(self._integrals(False))
 
     @cached_property
     def _stretched(self) -> Any:
-        F = ufl.Identity(self._config.gdim) + ufl.grad(self._config.u)
-        # an area turns and stretches by the cofactors of F (Nanson)
-        n = ufl.cofac(F) * ufl.FacetNormal(self._config.mesh)
-        # which is no polynomial
-        return self._integrals(ufl.sqrt(ufl.dot(n, n)), {"quadrature_degree": 2 * self._config.degree + 1})
+        return self._integrals(True)
 
     @property
     def current(self) -> Array:

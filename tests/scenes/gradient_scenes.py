@@ -1,0 +1,129 @@
+"""A scene whose state depends on everything that there are derivatives by, and Taylor's test of functionals of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import numpy as np
+import ufl
+from block_scenes import blocks, run
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+COMM = MPI.COMM_WORLD
+SCENES = [
+    ("triangle", 1, "node_to_surface", False, "neo"),
+    ("triangle", 1, "mortar", False, "neo"),
+    ("triangle", 1, "node_to_surface", True, "neo"),
+    ("quadrilateral", 1, "mortar", True, "neo"),
+    ("triangle", 2, "node_to_surface", False, "neo"),
+    ("quadrilateral", 2, "mortar", False, "linear"),
+    ("tetrahedron", 1, "mortar", False, "linear"),
+    ("hexahedron", 1, "node_to_surface", False, "neo"),
+]
+
+
+def wave(V, size=1.0):
+    """A smooth Function, the same on any partition."""
+    f = fem.Function(V)
+    g = f.ufl_shape[0] if f.ufl_shape else 1
+    f.interpolate(lambda x: np.squeeze(np.stack([size * np.sin(3 * x[0] + 2 * x[1] + i + x[2]) for i in range(g)])))
+    f.x.scatter_forward()
+    return f
+
+
+def dot(a, b):
+    """Product of the entries of two Functions (collective)."""
+    V = a.function_space
+    n = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+    return V.mesh.comm.allreduce(float(a.x.array[:n] @ b.x.array[:n]))
+
+
+def pressed(
+    cell, degree=1, coupling="node_to_surface", rigid=False, law="neo", measure="reference", comm=COMM, overhang=0.25, **options
+):
+    """A block with a bulging face, loaded and pressed onto another or onto a rigid ball, and all that its solution may depend on."""
+    bulge = 0.1 if degree == 1 else 0.0
+    b = blocks(
+        comm, cell, *((4, 6) if cell in ("triangle", "quadrilateral") else (2, 3)), overhang=overhang, degree=degree,
+        pose=lambda x: x + np.where(x[:, -1:] > 0, bulge * (x[:, :1] - 0.5) ** 2, 0.0) * np.eye(x.shape[1])[-1],
+    )  # fmt: skip
+    mesh, g = b.scene.mesh, b.gdim
+    u, v = b.u, ufl.TestFunction(b.V)
+    E, load, top = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.full(g, 0.01)), fem.Constant(mesh, np.zeros(g))
+    field = fem.Function(compat.function_space(mesh, ("DG", 0)))
+    field.interpolate(lambda x: 1.0 + 0.2 * np.sin(5 * x[0] + x[1]))
+    top.value[:] = [0.02, *[0.0] * (g - 2), -0.05]
+    kind = "plane_strain" if g == 2 else "3d"
+    material = uem.NeoHooke(E, 0.3, kind=kind) if law == "neo" else uem.LinearElastic(E, 0.3, kind=kind)
+    F = field * material.residual(u, v) * ufl.dx - ufl.inner(load, v) * ufl.dx
+    sides = fem.Function(b.V)
+    sides.x.array[:] = wave(b.V, 1e-3).x.array
+    bcs = [uem.dirichlet(b.V, b.bottom, value=sides)]
+    bcs.append(fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V))
+    target = uem.RigidSphere([0.4] * (g - 1) + [-3.0], 3.0) if rigid else b.low
+
+    def solve():
+        u.x.array[:] = 0.0
+        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure)
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], rtol=1e-13, **options)
+        run(problem)
+        return problem
+
+    def of_pressures(problem):
+        """A functional of the pressure of its contact, places and displacement."""
+        p = problem.contacts[0].pressure
+        return (50 * p**3 + (1 + X[0]) * p**2 + p * u[g - 1]) * uem.ds(b.high) + 0.1 * E * p * ufl.ds + u[0] ** 2 * ufl.dx
+
+    X = ufl.SpatialCoordinate(mesh)
+    J = ufl.inner(u, u) * ufl.dx + E * field * u[g - 1] * ufl.dx
+    return SimpleNamespace(
+        b=b, F=F, J=J, of_pressures=of_pressures, E=E, load=load, top=top, field=field, sides=sides, X=X, solve=solve, u=u, v=v
+    )
+
+
+def along(by, changes):
+    """The derivative along changes of the controls that it is by (collective)."""
+    return sum(dot(b, d) if isinstance(b, fem.Function) else float(np.sum(b * d)) for b, d in zip(by, changes))
+
+
+def move(s, change, h):
+    """Move the nodes of a scene of degree 1."""
+    at = np.zeros(len(s.b.scene.mesh.geometry.x), dtype=np.int64)
+    at[compat.geometry_dofs(s.b.scene.mesh).ravel()] = compat.cell_dofs(s.b.V).ravel()
+    s.b.scene.mesh.geometry.x[:, : s.b.gdim] += h * change.x.array.reshape(-1, s.b.gdim)[at]
+
+
+def orders(s, functional, *names):
+    """Taylor's test of a functional of the problem by the controls of a scene, all or those named: the order for each, by name."""
+    g = s.b.gdim
+    changes = {"E": 1.0, "load": np.eye(g)[-1], "top": np.linspace(1.0, -1.0, g), "field": wave(s.field.function_space)}
+    changes |= {"sides": wave(s.b.V, 0.1)} | ({"X": wave(s.b.V, 0.05)} if compat.lagrange_degree(s.b.V) == 1 else {})
+    changes = {name: change for name, change in changes.items() if name in (names or changes)}
+    controls = [getattr(s, name) for name in changes]
+    problem = s.solve()
+    found, told = uem.gradient(problem, functional(problem), controls), {}
+    for (name, change), control, by in zip(changes.items(), controls, found):
+        if name == "X":
+            values, slope = s.b.scene.mesh.geometry.x, dot(by, change)
+        elif isinstance(control, fem.Function):
+            values, slope = control.x.array, dot(by, change)
+        else:
+            values, slope = control.value, float(np.sum(by * change))
+        before = np.array(values)
+
+        def at(h, name=name, change=change, control=control, values=values, before=before):
+            if name == "X":
+                values[:] = before
+                move(s, change, h)
+            else:
+                values[...] = before + h * (change.x.array if isinstance(change, fem.Function) else change)
+            return uem.integrate(functional(s.solve()))
+
+        told[name] = uem.taylor_test(at, slope, 1e-3, 2)
+        values[...] = before
+    return told

@@ -1,0 +1,329 @@
+"""The united problem linearised at a state of equilibrium, forwards along changes of controls, and backwards from a functional.
+
+With the residual F of the bodies, contact forces ``T' lam`` and gaps g, a change m' of the controls moves the bodies by
+
+    du = P dq + c(m'),    P'(K + G)P dq = -P' [ dF/dm m' + (K + G) c(m') ]
+
+where G is the curvature of the contact, and c what the Dirichlet values ask for. A functional J of u and m therefore has
+
+    P'(K + G)P mu = P' dJ/du,    a = P mu                                              the adjoint problem
+    dJ/dm m' = dJ/dm|u m' - a' dF/dm m' + [ dJ/du - (K + G)' a ]' c(m')
+
+Gaps see the places X of the nodes as they see u: with ``x' = du + X'`` in place of du,
+
+    x' = P dq + c(X'),    P'(K + G)P dq = -P' [ (dF/dX - K) X' + (K + G) c(X') ]
+    dJ/dX = dJ/dX|u - dJ/du - (dF/dX - K)' a + [ dJ/du - (K + G)' a ]' c
+
+Contact forces are read from the residual at the contactors, by L and the series S of P, and so are their changes. A functional of lam, too,
+has a further load that moves contactors against their targets, by which the forces of the adjoint problem are those that J asks for:
+
+    lam' = L'S' [ (K + G) du + dF/dm m' ],    w = S L dJ/dlam
+    dJ/du + (K + G) w in place of dJ/du,    a - w in place of a where it meets dF/dm or dF/dX - K
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pressure_slopes import PressureSlopes
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.rows import BodyState
+from uem_dolfinx.solve.system import CLOSED, BodySystem
+
+#: What a functional may be differentiated by.
+Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
+
+
+class Motion(NamedTuple):
+    """What moves with changes of controls.
+
+    Attributes:
+        du: change of the displacement.
+        shape: of the places of the nodes where they were drawn.
+        reactions: of the forces that contacts and Dirichlet conditions bear, on the bodies.
+    """
+
+    du: fem.Function
+    shape: fem.Function
+    reactions: PETSc.Vec
+
+
+class Linearised:
+    """The united problem linearised at the state of equilibrium, which is left as it was in the end (collective).
+
+    Attributes:
+        F: the residual in UFL, and ``test`` its test function.
+        P: restriction matrix of the active contactors.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        self.problem, self.config = problem, problem.config
+        self.F = problem.bodies.F
+        self.test = self.F.arguments()[0]
+
+    def __enter__(self) -> Linearised:
+        try:
+            self._linearise()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def _linearise(self) -> None:
+        bodies, system = self.problem.bodies, self.problem.system
+        assert isinstance(system, BodySystem)
+        bodies.wanted[:] = self.config.displacement
+        system.place()
+        bodies.assemble()
+        state = system.assemble_constraints(lambda norm, scale, rounding: True)
+        # no step begins: a factorisation of the same matrix goes on serving
+        system.linearise(state, 1)
+        assert isinstance(state, BodyState)
+        self.P, self.K, self.G, self._rows = state.trial, bodies.tangent.K, system.curvature, state.rows
+        idle = 0
+        for pair in system.pairs:
+            now, rounding = pair.trial, bodies.rounding_at(pair.nodes)
+            touches = ~now.active & ~pair.off & (np.abs(pair.gap) <= CLOSED * self.config.size)
+            idle += int(((now.active & (now.lam <= rounding)) | touches).sum())
+        if idle := reduced(self.config.comm, idle):
+            logger.warning(
+                "%d contactor(s) have neither force nor gap: the functional has another gradient on either side, and this is that of "
+                "the contactors that are active now", idle,
+            )  # fmt: skip
+
+    def __exit__(self, *error: object) -> None:
+        solver = self.problem.solver
+        # multigrid learns from one matrix for the next, and steps may not depend on whether a gradient was asked for
+        if solver.iterative or not solver.lasting:
+            self.problem.system.forget()
+        self.problem.restore()
+
+    def pressures(self, contact: Contact) -> PressureSlopes:
+        """Derivatives of a contact's pressures (collective).
+
+        Raises:
+            InputError: where they have none.
+        """
+        if self._rows.independent is not None and self._rows.independent.found:
+            raise InputError(
+                f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "
+                "replaced by others, so that pressures have no derivatives here; let nodes be contactors of one contact, with free normals"
+            )
+        return PressureSlopes(contact, self._rows.equations[self.problem.contacts.index(contact)])
+
+    def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
+        """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective)."""
+        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self._rows.equations)]
+        return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
+
+    def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
+        """``P dq`` under forces: symmetric, since P is Q without friction (collective)."""
+        # as accurately as an iterative solver can
+        dq, _ = self.problem.solver.solve(self.P.transpose(forces))
+        return self.P.expand(dq)
+
+    def held(self, v: PETSc.Vec) -> PETSc.Vec:
+        """Without what bodies that contact alone holds move along it, where steps leave them; its own transpose (collective)."""
+        assert isinstance(self.problem.system, BodySystem)
+        return self.config.vector(self.problem.system.floating.without_open_motions(np.array(v.array_r)))
+
+    def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G) du`` (collective)."""
+        forces = self.K * du
+        if self.G is not None:
+            forces.axpy(1.0, self.G * du)
+        return forces
+
+    def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
+        """What moves with changes of controls (collective)."""
+        config = self.config
+        forces, prescribed, shape = config.vector(), np.zeros((config.n_owned, config.gdim)), fem.Function(config.V)
+        for m, change in direction:
+            if isinstance(m, ufl.SpatialCoordinate):
+                shape.x.array[:] += change.x.array
+                if (form := _expanded(ufl.derivative(self.F, m, change))) is not None:
+                    forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
+                continue
+            if (form := _along(self.F, m, change)) is not None:
+                forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
+            values = change.x.array if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
+            prescribed += self.prescribed_by(m, values)
+        shape.x.scatter_forward()
+        drawn = config.vector(shape.x.array[: config.n_owned * config.gdim])
+        forces.axpy(1.0, self.K * drawn)
+        held = ~self.problem.bodies.free[: config.n_owned]
+        c = self.P.carried(prescribed + np.where(held, drawn.array_r.reshape(-1, config.gdim), 0.0))
+        way = self.solve(forces - self.stiffness(c))
+        way.axpy(1.0, c)
+        reactions = self.stiffness(way) - forces
+        return Motion(self.function(self.held(way - drawn)), shape, reactions)
+
+    def function(self, v: PETSc.Vec) -> fem.Function:
+        """A Function of the displacement's space with these values (collective)."""
+        f = fem.Function(self.config.V)
+        f.x.array[: len(v.array_r)] = v.array_r
+        f.x.scatter_forward()
+        return f
+
+    def pressed(self, contact: Contact, motion: Motion) -> fem.Function:
+        """How a contact's pressure changes with a motion (collective)."""
+        slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
+        multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
+        ends = np.cumsum([len(own) for own in self._rows.equations])
+        found = fem.Function(contact.pressure.function_space)
+        part = multipliers[ends[k] - len(self._rows.equations[k]) : ends[k]]
+        found.x.array[contact.nodes] = slopes.along(part, motion.du, motion.shape)
+        found.x.scatter_forward()
+        return found
+
+    def prescribed_by(self, m: Any, values: Array) -> Array:
+        """What the ``values`` of a control make of the Dirichlet values of the owned components, zero where free ``(n_owned, gdim)``."""
+        bodies, config, found = self.problem.bodies, self.config, []
+        before = np.array(m.x.array if isinstance(m, fem.Function) else m.value)
+        for now in (values, 0.0 * values):
+            out = np.zeros(len(self.problem.u.x.array))
+            _set(m, now)
+            compat.set_bc_values(out, bodies.bcs)
+            found.append(out)
+        _set(m, before)
+        return np.where(bodies.free, 0.0, (found[0] - found[1]).reshape(-1, config.gdim))[: config.n_owned]
+
+
+class Adjoint:
+    """The adjoint problem of one functional (collective).
+
+    Args:
+        at: the problem, linearised.
+        J: the functional.
+        pressing: contacts whose pressures it holds.
+
+    Attributes:
+        a: what forces do to J, less what they do to contact forces by themselves, a Function of the displacement's space.
+        by_values: derivative of J by the prescribed displacement of every owned component, zero where free ``(n_owned, gdim)``.
+    """
+
+    def __init__(self, at: Linearised, J: ufl.Form, pressing: Sequence[Contact] = ()):
+        self.at, self.config = at, at.config
+        config, functionals, weights = at.config, [J], {}
+        now, drawn = config.vector(), config.vector()
+        for contact in pressing:
+            p = contact.pressure
+            of_p = _derivative(J, p, ufl.TestFunction(p.function_space))
+            of_nodes = np.zeros(len(contact.nodes))
+            if of_p is not None:
+                of_nodes = forms.assemble_array(p.function_space, forms.form(of_p))[contact.nodes]
+            found = at.pressures(contact).back(of_nodes)
+            weights[contact] = found.multipliers
+            functionals += [] if found.areas is None else [found.areas]
+            now.array[:] += found.now.ravel()
+            drawn.array[:] += found.drawn.ravel()
+        of_u = config.vector()
+        for functional in functionals:
+            if (part := _derivative(functional, at.problem.u, at.test)) is not None:
+                of_u.array[:] += forms.assemble_array(config.V, forms.form(part))
+        of_u = at.held(of_u)
+        lift = at.lift(weights)
+        drive = of_u + at.stiffness(lift) + now
+        along = at.solve(drive)
+        left = along - lift
+        self.a = at.function(left)
+        #: J with its areas, and the work of the residual along a, with their signs.
+        self._forms = *((functional, 1.0) for functional in functionals), (ufl.replace(at.F, {at.test: self.a}), -1.0)
+        held = ~at.problem.bodies.free[: config.n_owned]
+        self.by_values = np.where(held, at.P.carried_back(drive - at.stiffness(along)), 0.0)
+        #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
+        self._by_places = (at.K * left - of_u + drawn).array_r + self.by_values.ravel()
+
+    def by(self, m: Control) -> Array | fem.Function:
+        """Derivative by a control."""
+        if isinstance(m, fem.Constant):
+            return self._by_constant(m)
+        return self._by_function(m) if isinstance(m, fem.Function) else self._by_shape(m)
+
+    def _by_constant(self, m: fem.Constant) -> Array:
+        """An array of its shape."""
+        comm, shape = self.config.comm, np.shape(m.value)
+        found = np.zeros(shape)
+        for entry in np.ndindex(shape):
+            unit = np.zeros(shape)
+            unit[entry] = 1.0
+            for form, sign in self._forms:
+                if (part := _along(form, m, unit)) is not None:
+                    found[entry] += sign * forms.assemble_scalar(forms.form(part), comm)
+            found[entry] += float(reduced(comm, float((self.by_values * self.at.prescribed_by(m, unit)).sum())))
+        return found
+
+    def _by_function(self, m: fem.Function) -> fem.Function:
+        """A Function of its space."""
+        V = m.function_space
+        found = fem.Function(V)
+        self._assemble(found, lambda form: _derivative(form, m, ufl.TestFunction(V)))
+        # conditions that take its values tell which
+        which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
+        own, added = which > 0.5, fem.Function(V)
+        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.by_values[own])
+        forms.sum_ghosts(added)
+        found.x.array[:] += added.x.array
+        return found
+
+    def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
+        """A Function of the displacement's space."""
+        found = fem.Function(self.config.V)
+        self._assemble(found, lambda form: _expanded(ufl.derivative(form, X, ufl.TestFunction(self.config.V))))
+        found.x.array[: len(self._by_places)] += self._by_places
+        found.x.scatter_forward()
+        return found
+
+    def _assemble(self, found: fem.Function, derivative: Callable[[ufl.Form], ufl.Form | None]) -> None:
+        """Add up the derivatives of both forms."""
+        for form, sign in self._forms:
+            if (part := derivative(form)) is not None:
+                values = forms.assemble_array(found.function_space, forms.form(part))
+                found.x.array[: len(values)] += sign * values
+        found.x.scatter_forward()
+
+
+def _derivative(form: ufl.Form, m: fem.Function, direction: Any) -> ufl.Form | None:
+    """Derivative of a form by a Function; None where it does not depend on it."""
+    return _expanded(ufl.derivative(form, m, direction)) if m in form.coefficients() else None
+
+
+def _along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.Form | None:
+    """Derivative of a form along a change of a Constant or a Function; None where it does not depend on it."""
+    if isinstance(m, fem.Function):
+        return _derivative(form, m, change)
+    if m not in form.constants():
+        return None
+    v, integrals = ufl.variable(m), []
+    for integral in form.integrals():
+        by, shape = ufl.diff(ufl.replace(integral.integrand(), {m: v}), v), np.shape(m.value)
+        parts = [float(np.asarray(change)[i]) * (by[i] if i else by) for i in np.ndindex(shape) if np.asarray(change)[i] != 0.0]
+        integrals += [integral.reconstruct(integrand=sum(parts[1:], parts[0]))] if parts else []
+    return _expanded(ufl.Form(integrals))
+
+
+def _expanded(form: ufl.Form) -> ufl.Form | None:
+    """A form with its derivatives taken; None where nothing is left."""
+    found = ufl.algorithms.expand_derivatives(form)
+    return None if found.empty() else found
+
+
+def _set(m: Any, values: npt.ArrayLike) -> None:
+    """Give a Constant or a Function other values."""
+    if isinstance(m, fem.Function):
+        m.x.array[:] = values
+    else:
+        m.value[...] = values
