@@ -22,6 +22,8 @@ class AmongBodies(NodeToSurface):
     """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
 
     target: Neighbour
+    #: Of two edges that meet, the one that is over the other's facet follows it.
+    ends_hold = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)

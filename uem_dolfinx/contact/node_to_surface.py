@@ -43,6 +43,8 @@ class NodeToSurface(OnTarget):
 
     chained, two_pass = False, True
     pointwise = at_feet = True
+    #: Whether an end of the target holds contactors that came to it there.
+    ends_hold = True
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -216,7 +218,7 @@ class NodalKinematics:
 
         One that let go of the target as soon as it is the least bit past the end would sink into it, and come back with a blow.
         """
-        near = (self.projection.from_end <= END_HOLDS) & ~self.off(state)
+        near = (self.projection.from_end <= END_HOLDS) & ~self.off(state) & self.of.ends_hold
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
     def near(self, state: PairState) -> Bools:
