@@ -256,7 +256,10 @@ class GeneralContact:
             InputError: for an unknown name.
         """
         g = self._config.gdim
-        given.word("first", first, tuple(self._names))
+        names = (*self._names, *(self._rigid_name(part) for part in self.parts if isinstance(part, RigidContact)))
+        given.word("first", first, names)
+        if second is not None:
+            given.word("second", second, names)
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         total = sum_up(self._config.comm, np.zeros((0, g)), np.zeros((0, g)))
         force, moment = total.force * np.ones(g), total.moment * 1.0
@@ -288,10 +291,16 @@ class GeneralContact:
             np.add.at(sums, inverse.ravel(), rows)
             for key, row in (item for own in config.comm.allgather(list(zip(keys.tolist(), sums))) for item in own):
                 a, b = divmod(key, skin.n_bodies + len(self.parts))
-                name = self._names[b] if b < skin.n_bodies else part.name.removeprefix(f"{self.name} on ")
+                # nodes of either of two bodies may follow the other
+                a, b, sign = (a, b, 1.0) if a <= b else (b, a, -1.0)
+                name = self._names[b] if b < skin.n_bodies else self._rigid_name(part)
                 n, f, m = found.get((a, b, name), (0, 0.0, 0.0))
-                found[a, b, name] = n + int(row[0]), f + row[1 : 1 + config.gdim], m + row[1 + config.gdim :]
+                found[a, b, name] = n + int(row[0]), f + sign * row[1 : 1 + config.gdim], m + sign * row[1 + config.gdim :]
         return found
+
+    def _rigid_name(self, part: Contact) -> str:
+        """What ``touching`` calls the rigid surface of one of the contacts."""
+        return part.name.removeprefix(f"{self.name} on ")
 
 
 def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration) -> list[Contact]:
