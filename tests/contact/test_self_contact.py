@@ -1,0 +1,158 @@
+"""Bodies that touch themselves: nothing is found on bodies at rest, prongs of a fork that close, in any pose and on any ranks, in 2D and 3D.
+
+Read first: ``test_prongs_in_any_pose``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from body_scenes import skin_of
+from dolfinx import fem
+from helpers import Body, at, box, refused, run, scene, slow
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
+
+COMM = MPI.COMM_WORLD
+
+
+def without(body: Body, hole) -> Body:
+    """A body without the cells whose middles ``hole`` tells, and without nodes that no cell has."""
+    cells = body.cells[~hole(body.x[body.cells].mean(axis=1))]
+    used = np.unique(cells)
+    place = np.full(len(body.x), -1)
+    place[used] = np.arange(len(used))
+    return Body(body.x[used], place[cells])
+
+
+def fork(cell, n=1, more=0.0):
+    """A fork of two prongs of thickness 0.4 that are 0.1 apart, the lower one longer by ``more``."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    whole = box(cell, [-0.4, -0.45, 0.0][:g], [2.4, 0.45, 0.4][:g], [28 * n, 18 * n, 2][:g])
+
+    def hole(x):
+        return (x[:, 0] > 0) & (np.abs(x[:, 1]) < 0.05) | (x[:, 0] > 2) & (x[:, 1] > 0) | (x[:, 0] > 2 + more) & (x[:, 1] < 0)
+
+    return without(whole, hole)
+
+
+def closed(cell, angle=0.0, load=4e-3, steps=4, degree=1, more=0.0, normals="facet", **how):
+    """A fork turned by an angle whose prongs are pressed together: its contact, displacements in its own axes, and iterations."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    R = np.eye(g)
+    R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    s = scene(COMM, cell, [fork(cell, more=more)], pose=lambda x: x @ R.T, **how)
+    V = compat.function_space(s.mesh, degree, (g,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    push = fem.Constant(s.mesh, 0.0)
+    across = ufl.as_vector([float(c) for c in R[:, 1]])
+    law = uem.NeoHooke(1.0, 0.3, kind="plane_strain" if g == 2 else "3d")
+    F = law.residual(u, v) * ufl.dx
+    for side in (1, -1):
+        F += side * push * ufl.inner(across, v) * uem.ds(s.tag(f"outer{side}", 0, at(1, 0.45 * side)))
+    contact = uem.GeneralContact(self_contact=True, normals=normals)
+    bcs = [uem.dirichlet(V, s.tag("root", 0, at(0, -0.4)))]
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load={push: load}, rtol=1e-10)
+    history = run(problem, steps)
+    X, U = (a @ R for a in (problem.config.X, problem.config.displacement))
+    own = slice(problem.config.n_owned)
+    return contact, X[own], U[own], [step.newton_iterations for step in history]
+
+
+def farthest(U):
+    """The longest displacement."""
+    return COMM.allreduce(float(np.linalg.norm(U, axis=1).max(initial=0.0)), op=MPI.MAX)
+
+
+def resting(cell, bodies, reach=10.0):
+    """Number of nodes of bodies at rest that facets of their own body may hold, which are looked for all over.
+
+    Those that have their foot past the last facet listed are held by none.
+    """
+    _, skin = skin_of(cell, bodies)
+    nodes = np.unique(skin.dofs[skin.dofs < skin.config.n_owned]).astype(np.int32)
+    lists = Neighbours(skin, nodes, np.arange(skin.n_bodies), [], 0.0, 1, np.ones(skin.n_bodies, bool))
+    lists._farther = reach
+    found = Neighbour(lists, 0).project(skin.config.X[nodes])
+    return COMM.allreduce(int(((found.facet >= 0) & (found.beyond == 0.0).all(axis=1)).sum()))
+
+
+def bent(body, start, end):
+    """A bar along x, ``(0, 1)``, bent to a ring of radius 1 from one angle to another."""
+
+    def ring(x):
+        a, r = start + (end - start) * x[:, 0], 1.0 + x[:, 1]
+        return np.column_stack([r * np.cos(a), r * np.sin(a), x[:, 2:]])
+
+    return body.mapped(ring)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_nothing_on_bodies_at_rest(cell):
+    """Thin plates of one cell, blocks and arcs that see no part of themselves have nothing to touch, however far one looks."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    plate = box(cell, [0.0] * g, [1.0, 0.02, 1.0][:g], [8, 1, 4][:g])
+    block = box(cell, [0.0] * g, [1.0] * g, [3] * g)
+    assert resting(cell, [plate]) == resting(cell, [block]) == 0
+    bar = box(cell, [0.0, 0.0, 0.0][:g], [1.0, 0.1, 0.3][:g], [12, 1, 2][:g])
+    assert resting(cell, [bent(bar, 0.0, 0.6)]) == 0
+    # of a fork the prongs see each other alone
+    assert resting(cell, [fork(cell)]) > 0
+
+
+@pytest.mark.parametrize(
+    ("cell", "more"), [("quadrilateral", 0.0), ("triangle", 0.2), slow("quadrilateral", 0.2), slow("triangle", 0.0)]
+)
+def test_prongs_in_any_pose(cell, more):
+    """In any pose, which decides which prong follows, the prongs close alike; none passes into the other."""
+    found = []
+    for angle in 2 * np.pi * np.array([0.0, 0.2, 0.52, 0.75]):
+        contact, X, U, iterations = closed(cell, angle, more=more)
+        assert contact.n_active > 5 and contact.max_gap() < 1e-12 and max(iterations) <= 10
+        assert contact.parts[0].balance().force < 1e-12
+        found.append(farthest(U))
+        upper = (X[:, 0] > 0.05) & (np.abs(X[:, 1] - 0.05) < 1e-9)
+        assert COMM.allreduce(float((X + U)[upper, 1].min(initial=1.0)), op=MPI.MIN) > -0.06
+    assert np.ptp(found) < 0.01 * found[0]
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree", "normals"),
+    [slow("quadrilateral", 2, "facet"), ("triangle", 1, "averaged"), slow("hexahedron", 1, "facet")],
+)
+def test_prongs_of_other_kinds(cell, degree, normals):
+    """Degree 2, averaged normals and 3D close as far as linear quadrilaterals do, but for what these err."""
+    contact, _, U, _ = closed(cell, degree=degree, normals=normals, more=0.2)
+    _, _, W, _ = closed("quadrilateral", more=0.2)
+    assert contact.n_active > 3 and contact.max_gap() < 1e-12
+    assert farthest(U) == pytest.approx(farthest(W), rel=0.1)
+
+
+def test_order_of_the_input():
+    """Any order of nodes and cells gives the same displacements, to rounding."""
+    ends = [farthest(closed("triangle", shuffle=seed)[2]) for seed in (None, 1)]
+    assert ends[1] == pytest.approx(ends[0], rel=1e-9)
+
+
+def test_not_declared():
+    """Without self contact one body alone has nothing to touch; a part that may names the body."""
+    s = scene(COMM, "triangle", [fork("triangle")])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    root = s.tag("root", 0, at(0, -0.4))
+    bcs = [uem.dirichlet(V, root)]
+    refused(
+        uem.SurfaceError,
+        ("one body", "self_contact"),
+        lambda: uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.GeneralContact()]),
+    )
+    contact = uem.GeneralContact(self_contact=[root])
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    assert contact.n_active == 0 and contact.touching() == []
