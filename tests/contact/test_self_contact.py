@@ -1,4 +1,4 @@
-"""Bodies that touch themselves: nothing is found on bodies at rest, prongs of a fork that close, in any pose and on any ranks, in 2D and 3D.
+"""Bodies that touch themselves: nothing is found on bodies at rest; prongs of a fork that close, in any pose, on any ranks, in 2D and 3D.
 
 Read first: ``test_prongs_in_any_pose``.
 """
