@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 pytest.register_assert_rewrite(
-    "helpers", "bar_scenes", "corner_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes",
+    "helpers", "bar_scenes", "body_scenes", "corner_scenes", "counting", "mass_scenes", "plastic_scenes", "ramp_scenes", "restart_scenes",
     "resting_scenes", "results_scenes",
 )  # fmt: skip
 from helpers import complementary, coulomb, highest

@@ -5,12 +5,13 @@ from __future__ import annotations
 from mpi4py import MPI
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
-from helpers import box, scene
+from helpers import at, box, highest, linear, modulus, scene, st_venant
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.skin import Skin
 
@@ -45,6 +46,7 @@ def all_facets(mesh, name="all"):
     """The exterior facets of a mesh."""
     mesh.topology.create_connectivity(mesh.topology.dim - 1, mesh.topology.dim)
     facets = np.asarray(exterior_facet_indices(mesh.topology), dtype=np.int32)
+    facets = compat.shared_by_ranks(mesh.topology.index_map(mesh.topology.dim - 1), facets)
     return uem.Tag(name, 0, mesh.topology.dim - 1, mesh, facets)
 
 
@@ -53,3 +55,71 @@ def skin_of(cell, bodies, degree=1, comm=COMM, tag=None, **how):
     s = scene(comm, cell, bodies, **how)
     config = Configuration(fem.Function(compat.function_space(s.mesh, degree, (dimension(cell),))))
     return s, Skin(config, all_facets(s.mesh) if tag is None else tag(s))
+
+
+def surface_of(s, body):
+    """All exterior facets of a body of a scene, as a tag."""
+    every = all_facets(s.mesh).entities
+    cells = s.mesh.topology.connectivity(s.mesh.topology.dim - 1, s.mesh.topology.dim)
+    facets = np.array([f for f in every if s.body[cells.links(f)[0]] == body], dtype=np.int32)
+    return uem.Tag(f"surface {body}", body + 1, s.mesh.topology.dim - 1, s.mesh, facets)
+
+
+class Bodies:
+    """Some bodies in one mesh, of one modulus unless told, and their displacement."""
+
+    def __init__(self, cell, bodies, degree=1, E=None, comm=COMM, law=linear, nu=0.3, **how):
+        self.s = scene(comm, cell, bodies, **how)
+        self.g = self.s.mesh.geometry.dim
+        self.V = compat.function_space(self.s.mesh, degree, (self.g,))
+        self.u = fem.Function(self.V, name="u")
+        self.F = law(self.u, modulus(self.s, *(E or [1.0] * len(bodies))), nu)
+        self.parts = bodies
+
+    def push(self, tag, traction):
+        """Dead traction on facets."""
+        t = fem.Constant(self.s.mesh, np.array(traction, dtype=float))
+        self.F -= ufl.inner(t, ufl.TestFunction(self.V)) * forms.surface_measure(self.s.mesh, tag.entities)
+
+    def side(self, body, axis, value):
+        """A flat side of a body as a tag."""
+        return self.s.tag(f"side {axis} of {body}", body, at(axis, value))
+
+    def problem(self, contacts, bcs, **how):
+        return uem.UnitedProblem(self.F, self.u, bcs=bcs, contacts=contacts, **({"rtol": 1e-11} | how))
+
+
+def bodies_of(problem, s):
+    """The body in a scene of every local node."""
+    cells, body = compat.cell_dofs(problem.config.V), np.zeros(problem.config.n_local, int)
+    body[cells] = s.body[: len(cells), None]
+    return body
+
+
+def close(a, b, length=1.0):
+    """Displacements of two Functions on one mesh agree to rounding (collective)."""
+    assert highest(COMM, np.abs(a.x.array - b.x.array)) <= 1e-12 * length
+
+
+class Discs:
+    """Discs that fall onto each other, onto a floor and against a wall; hand-declared pairs in the order of the general contact."""
+
+    def __init__(self, rows, columns, n=3, mu=0.2, degree=1):
+        d = 0.975
+        middles = [[d * j, 0.49 + d * i] for i in range(rows) for j in range(columns)]
+        self.b = b = Bodies("quadrilateral", [ball("quadrilateral", m, 0.5, n) for m in middles], degree)
+        self.walls = lambda: [uem.RigidPlane((0, 0.0), (0, 1)), uem.RigidPlane((-0.49, 0), (1, 0))]
+        self.mu, self.surfaces = mu, [surface_of(b.s, k) for k in range(len(middles))]
+
+    def contacts(self, general):
+        if general:
+            return [uem.GeneralContact(rigid=self.walls(), friction=self.mu)]
+        s, every = self.surfaces, all_facets(self.b.s.mesh)
+        pairs = [uem.Contact(a, b, friction=self.mu) for k, a in enumerate(s) for b in s[k + 1 :]]
+        return pairs + [uem.Contact(every, wall, friction=self.mu, name=f"wall {k}") for k, wall in enumerate(self.walls())]
+
+    def problem(self, contacts):
+        V, u = self.b.V, fem.Function(self.b.V)
+        F = st_venant(u, modulus(self.b.s, *[1e4] * len(self.surfaces)))
+        moves = uem.Dynamics(uem.lumped_mass(V, 1.0), gravity=(-0.5, -2.0), contactors="massy")
+        return uem.UnitedProblem(F, u, contacts=contacts, dynamics=moves, rtol=1e-11)

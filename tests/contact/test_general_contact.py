@@ -1,0 +1,244 @@
+"""All surfaces against each other by one declaration: as hand-declared pairs, stacks and corners of many bodies, what is told of them.
+
+Three tests to read first: ``test_as_declared_by_hand``, ``test_discs_in_motion`` and ``test_uniform_strain_in_a_grid``.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from body_scenes import Bodies, Discs, ball, close, dimension, surface_of
+from dolfinx import fem
+from helpers import M, blocks, box, clamp, highest, linear, modulus, run, slow, st_venant
+
+import uem_dolfinx as uem
+
+COMM = MPI.COMM_WORLD
+
+
+# -- as declared by hand -----------------------------------------------------------------------------------------------------
+
+BLOCKS = [("quadrilateral", 4, 6), ("triangle", 4, 6), ("quadrilateral", 4, 4), ("tetrahedron", 2, 3), ("hexahedron", 2, 3)]
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+@pytest.mark.parametrize("cell,n_low,n_high", BLOCKS)
+@pytest.mark.parametrize("degree", [1, slow(2)])
+def test_as_declared_by_hand(cell, n_low, n_high, degree, mu):
+    """A block pushed down and sideways on a wider one: forces, states and displacements."""
+    b = blocks(COMM, cell, n_low, n_high, overhang=0.25, degree=degree)
+    g, found = b.gdim, []
+    way = [0.02, *[0.0] * (g - 2), -0.05]
+    for contact in (uem.GeneralContact(order=[b.high], friction=mu), uem.Contact(b.high, b.low, friction=mu)):
+        u = fem.Function(b.V)
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=way)]
+        problem = uem.UnitedProblem(linear(u, modulus(b.scene, 1.0, 2.0)), u, bcs=bcs, contacts=[contact], rtol=1e-12)
+        histories = [len(problem.solve()) for _ in range(2)]
+        assert contact.n_active == sum(part.n_active for part in problem.contacts)
+        found.append((u, contact, histories, problem.reaction(b.top)))
+    (u, general, n, there), (v, declared, m, back) = found
+    close(u, v)
+    assert general.n_active == declared.n_active > 2 and n[1] == m[1] == 1
+    assert np.abs(there - back).max() < 1e-12
+    assert general.max_gap() <= 1e-12
+    close(general.force, declared.force)
+    # at the rim of what is declared by hand less of the surface belongs to a node than of the whole
+    assert 0.0 < general.max_pressure() <= declared.max_pressure() * (1 + 1e-10)
+    for about in (None, np.linspace(0.3, 0.6, g)):
+        one, other = general.between("body 2", "body 1", about), declared.resultant(about=about)
+        assert np.abs(one.force - other.force).max() < 1e-12 and np.abs(one.moment - other.moment).max() < 1e-12
+
+
+@pytest.mark.parametrize("rows,columns,end", [(2, 1, 0.12), slow(3, 2, 0.6)])
+def test_discs_in_motion(rows, columns, end):
+    """Every step, iteration and displacement is that of pairs declared by hand."""
+    discs, found = Discs(rows, columns), []
+    for general in (True, False):
+        problem = discs.problem(discs.contacts(general))
+        steps = [
+            (s.time, s.newton_iterations, sum(c.n_active for c in problem.contacts)) for s in uem.time_steps(problem, 0.01, end)
+        ]
+        found.append((problem.u, steps))
+    (u, one), (v, other) = found
+    assert one == other and max(n for _, _, n in one) >= 2
+    close(u, v)
+
+
+# -- closed forms ----------------------------------------------------------------------------------------------------------
+
+
+def grid(cell, n, counts, **how):
+    """Unit boxes in a grid, with ``n`` divisions in turn: side by side, one above the other, in 3D one behind the other as well."""
+    g = dimension(cell)
+    places = list(product(*map(range, counts)))
+    bodies = [box(cell, np.array(p, float), np.array(p) + 1.0, [n[k % len(n)]] * g) for k, p in enumerate(places)]
+    return Bodies(cell, bodies, **how), places
+
+
+def oedometer(b, places, counts, settlement):
+    """Rollers at all outer sides, the top pushed down."""
+    bcs = []
+    for k, place in enumerate(places):
+        for axis in range(b.g):
+            if place[axis] == 0:
+                bcs += clamp(b.V, b.side(k, axis, 0.0), axis)
+            if place[axis] == counts[axis] - 1:
+                end = b.side(k, axis, float(counts[axis]))
+                bcs += clamp(b.V, end, axis, value=-settlement if axis == b.g - 1 else 0.0)
+    return bcs
+
+
+GRIDS = [
+    ("quadrilateral", (2, 2), (1, 2, 4, 2)), ("triangle", (2, 2), (2, 2)), ("quadrilateral", (3, 2), (2,)),
+    ("hexahedron", (2, 1, 2), (1, 2, 2, 1)), ("tetrahedron", (1, 1, 2), (1, 2)), ("hexahedron", (2, 2, 2), (1,)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("cell,counts,n", GRIDS, ids=str)
+@pytest.mark.parametrize("shuffle", [None, 5])
+def test_uniform_strain_in_a_grid(cell, counts, n, shuffle):
+    """Blocks one on another and side by side, nested meshes: one strain in all of them, through sides, edges and points where they meet."""
+    b, places = grid(cell, n, counts, shuffle=shuffle)
+    strain = 0.01
+    contact = uem.GeneralContact()
+    problem = b.problem([contact], oedometer(b, places, counts, strain * counts[-1]), rtol=1e-12)
+    run(problem)
+    x, u = problem.config.X, problem.config.displacement
+    exact = np.zeros_like(x)
+    exact[:, -1] = -strain * x[:, -1]
+    assert highest(COMM, np.abs(u - exact)) < 1e-12
+    column = int(np.prod(counts[:-1]))
+    names = [f"body {k + 1}" for k in range(len(places))]
+    if shuffle is None and column == 1:
+        for low, high in zip(names, names[1:]):
+            assert contact.between(high, low).force[-1] == pytest.approx(M * strain, rel=1e-10)
+            assert contact.between(low, high).force[-1] == pytest.approx(-M * strain, rel=1e-10)
+        assert [(t.first, t.second) for t in contact.touching()] == list(zip(names, names[1:]))
+    if column > 1:
+        total = sum(contact.between(name).force for name in names)
+        assert np.abs(total).max() < 1e-13
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_a_block_in_a_corner_of_two_bodies(cell):
+    """Pressed into the corner between a floor and a wall it hands each its own traction; nodes in the corner touch both."""
+    g = dimension(cell)
+    deep = [0.0] * (g - 2), [1.0] * (g - 2), [2] * (g - 2)
+    floor = box(cell, [-1.5, *deep[0], -1.0], [1.5, *deep[1], 0.0], [6, *deep[2], 2])
+    wall = box(cell, [-1.5, *deep[0], 0.0], [0.0, *deep[1], 1.5], [3, *deep[2], 3])
+    block = box(cell, [0.0, *deep[0], 0.0], [1.0, *deep[1], 1.0], [4, *deep[2], 4])
+    b = Bodies(cell, [floor, wall, block])
+    bcs = [*clamp(b.V, b.side(0, g - 1, -1.0)), *clamp(b.V, b.side(1, 0, -1.5))]
+    if g == 3:
+        bcs += clamp(b.V, b.side(2, 1, 0.0), 1)
+    px, pz = 0.003, 0.005
+    b.push(b.side(2, 0, 1.0), [-px, *[0.0] * (g - 2), 0.0])
+    b.push(b.side(2, g - 1, 1.0), [0.0, *[0.0] * (g - 2), -pz])
+    bodies = {"floor": b.side(0, g - 1, -1.0), "wall": b.side(1, 0, -1.5), "block": b.side(2, 0, 1.0)}
+    contact = uem.GeneralContact(order=[bodies["block"]], bodies=bodies, exclude=[(surface_of(b.s, 0), surface_of(b.s, 1))])
+    problem = b.problem([contact], bcs)
+    run(problem)
+    assert [(t.first, t.second) for t in contact.touching()] == [("floor", "block"), ("wall", "block")]
+    floor, wall = (contact.between("block", name).force for name in ("floor", "wall"))
+    # contact normals turn with what they lie on, by as much as that strains
+    assert floor[-1] + wall[-1] == pytest.approx(pz, rel=1e-9) and floor[0] + wall[0] == pytest.approx(px, rel=1e-9)
+    assert floor[-1] == pytest.approx(pz, rel=0.02) and wall[0] == pytest.approx(px, rel=0.02)
+    assert np.abs(contact.between("block").force - floor - wall).max() < 1e-15
+    active = [part.pair.config.to_global(part.pair.nodes[part.pair.trial.active]) for part in problem.contacts]
+    active = np.concatenate(COMM.allgather(np.concatenate(active)))
+    assert contact.n_active == sum(t.n_active for t in contact.touching()) == len(active) >= len(np.unique(active))
+
+
+def test_a_node_on_a_joint():
+    """It lies on both blocks below, and is held once: a block that presses evenly stays flat, and no force is counted twice."""
+    below = [box("quadrilateral", [x, -1.0], [x + 1.0, 0.0], [2, 2]) for x in (-1.0, 0.0)]
+    b = Bodies("quadrilateral", [*below, box("quadrilateral", [-0.5, 0.0], [0.5, 1.0], [4, 4])], nu=0.0)
+    top = b.side(2, 1, 1.0)
+    bcs = [bc for k in (0, 1) for bc in clamp(b.V, b.side(k, 1, -1.0))]
+    b.push(top, [0.0, -0.01])
+    contact = uem.GeneralContact(exclude=[(surface_of(b.s, 0), surface_of(b.s, 1))])
+    problem = b.problem([contact], [*bcs, *clamp(b.V, top, 0)])
+    run(problem)
+    left, right = contact.between("body 3", "body 1"), contact.between("body 3", "body 2")
+    assert left.force[1] + right.force[1] == pytest.approx(0.01, rel=1e-10)
+    assert contact.between("body 3").force[1] == pytest.approx(0.01, rel=1e-10)
+    # the joint's node may be held by either, so that only both together are symmetric
+    assert contact.between("body 3").moment == pytest.approx(0.0, abs=1e-5)
+    u = problem.config.displacement[np.abs(problem.config.X[:, 1] - 1.0) < 1e-9, 1]
+    assert highest(COMM, u) < 0
+
+
+# -- it does not matter how it is drawn --------------------------------------------------------------------------------------
+
+
+def heap(order=(0, 1, 2), *, turn=0.0, length=1.0, stress=1.0, mu=0.0, comm=COMM, **how):
+    """Three discs of different facets pressed against each other, in any order: answers in the drawing's frame."""
+    middles = np.array([[0.0, 0.0], [0.965, 0.0], [0.48, 0.86]])
+    bodies = [ball("triangle", m, 0.5, n) for m, n in zip(middles, (3, 5, 8))]
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    b = Bodies(
+        "triangle", [bodies[k] for k in order], E=[stress * (1.0 + k) for k in order], comm=comm, law=st_venant,
+        pose=lambda x: length * x @ R.T, **how,
+    )  # fmt: skip
+    names, parts, bcs = ("left", "right", "top"), {}, []
+    for k, name in enumerate(names):
+        parts[name] = surface_of(b.s, order.index(k))
+        middle, way = length * R @ middles[k], length * R @ [0.03, -0.06] * (k == 2)
+        core = fem.locate_dofs_geometrical(b.V, lambda x, m=middle: np.hypot(x[0] - m[0], x[1] - m[1]) < 0.2 * length)
+        bcs.append(fem.dirichletbc(way, core, b.V))
+    contact = uem.GeneralContact(bodies=parts, friction=mu)
+    problem = b.problem([contact], bcs, rtol=1e-10)
+    steps = run(problem, 2)
+    drawn, u = b.s.drawing, b.s.gather(b.u) @ R / length
+    sort = np.lexsort(np.round(drawn, 9).T)
+    pairs = [("top", "left"), ("top", "right"), ("left", "right")]
+    return {
+        "X": drawn[sort], "u": u[sort], "iterations": [s.newton_iterations for s in steps],
+        "touching": sorted((*sorted((t.first, t.second)), t.n_active) for t in contact.touching()),
+        "forces": np.array([contact.between(*names).force @ R for names in pairs]) / (stress * length),
+    }  # fmt: skip
+
+
+def same(a, b, tol=1e-9):
+    assert np.allclose(a["X"], b["X"], atol=1e-12) and a["touching"] == b["touching"]
+    assert np.abs(a["u"] - b["u"]).max() < tol and np.abs(a["forces"] - b["forces"]).max() < tol
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.2], ids=["smooth", "rough"])
+def reference(request):
+    """The answer as it is drawn."""
+    found = heap(mu=request.param)
+    assert len(found["touching"]) == 3 and found["forces"][:2, 1].min() > 1e-3 and found["forces"][2, 0] < -1e-4
+    return request.param, found
+
+
+@pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0), (2, 1, 0)])
+def test_order_of_input(reference, order):
+    """The finer follows, whoever comes first."""
+    same(heap(order, mu=reference[0]), reference[1])
+
+
+@pytest.mark.parametrize("turn", [0.4, np.pi / 2, -2.0])
+def test_pose(reference, turn):
+    same(heap(turn=turn, mu=reference[0]), reference[1])
+
+
+@pytest.mark.parametrize("length,stress", [(1e-9, 2.1e11), (1e3, 1e-3)])
+def test_units(reference, length, stress):
+    scaled = heap(length=length, stress=stress, mu=reference[0])
+    same(scaled, reference[1])
+    assert scaled["iterations"] == reference[1]["iterations"]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_numbering(reference, seed):
+    same(heap(shuffle=seed, mu=reference[0]), reference[1])
+
+
+def test_ranks(reference):
+    """All ranks together find what each finds alone."""
+    same(heap(comm=MPI.COMM_SELF, mu=reference[0]), reference[1])
