@@ -116,7 +116,7 @@ class IndependentEquations:
                 other._groups.append(group)
                 singular[group.given] = True
         other.undetermined = np.zeros(len(equations), dtype=bool)
-        (other.undetermined[self._conflicting],) = self._gathered.back(singular)
+        (other.undetermined[self._sent],) = self._gathered.back(singular)
         other._scatter(equations)
         return other
 
@@ -126,6 +126,11 @@ class IndependentEquations:
         mine = replace(mine, node=self._space.to_global(mine.node))
         together, self._gathered = send(self._space.comm, mine, self._rank)
         return together
+
+    @property
+    def _sent(self) -> Ints:
+        """The conflicting equations in the order in which they went to the ranks that solve them."""
+        return np.flatnonzero(self._conflicting)[self._gathered.rows]
 
     def _scatter(self, equations: UnitingEquations) -> None:
         """Take the groups' independent equations in place of the conflicting ones, each on the rank that has its node (collective)."""
@@ -157,7 +162,7 @@ class IndependentEquations:
             lam[group.given], redundant[group.given] = group.shares @ mu[start:end], group.redundant
         given = np.empty(len(self._conflicting))
         given[~self._conflicting] = multipliers[:n]
-        given[self._conflicting], self.redundant[self._conflicting] = self._gathered.back(lam, redundant)
+        given[self._sent], self.redundant[self._sent] = self._gathered.back(lam, redundant)
         return given
 
 
