@@ -95,6 +95,7 @@ def oedometer(b, places, counts, settlement):
 GRIDS = [
     ("quadrilateral", (2, 2), (1, 2, 4, 2)), ("triangle", (2, 2), (2, 2)), ("quadrilateral", (3, 2), (2,)),
     ("hexahedron", (2, 1, 2), (1, 2, 2, 1)), ("tetrahedron", (1, 1, 2), (1, 2)), ("hexahedron", (2, 2, 2), (1,)),
+    ("triangle", (1, 4), (2, 4)), ("quadrilateral", (1, 4), (4, 1, 2, 2)), ("hexahedron", (1, 1, 3), (2, 1)),
 ]  # fmt: skip
 
 
@@ -170,6 +171,21 @@ def test_a_node_on_a_joint():
     assert contact.between("body 3").moment == pytest.approx(0.0, abs=1e-5)
     u = problem.config.displacement[np.abs(problem.config.X[:, 1] - 1.0) < 1e-9, 1]
     assert highest(COMM, u) < 0
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.2])
+def test_a_joint_with_a_step(mu):
+    """A block on two others of which one is higher: corners and nodes that hold each other by rows which nearly say the same."""
+    bodies = [box("triangle", [-1.01, -1.0], [-0.01, 0.0], [3, 3]), box("triangle", [0.0, -1.0], [1.0, 0.01], [2, 2])]
+    b = Bodies("triangle", [*bodies, box("triangle", [-0.6, 0.02], [0.5, 0.8], [6, 4])])
+    bcs = [*clamp(b.V, b.side(0, 1, -1.0)), *clamp(b.V, b.side(1, 1, -1.0)), *clamp(b.V, b.side(2, 1, 0.8), value=[0.03, -0.1])]
+    contact = uem.GeneralContact(friction=mu)
+    problem = b.problem([contact], bcs)
+    run(problem, 2)
+    left, right = contact.between("body 3", "body 1").force, contact.between("body 3", "body 2").force
+    assert left[1] > 0 and right[1] > 0
+    assert left + right == pytest.approx(-problem.reaction(b.side(2, 1, 0.8)), rel=1e-8)
+    assert all(part.balance().force < 1e-13 for part in contact.parts)
 
 
 # -- it does not matter how it is drawn --------------------------------------------------------------------------------------
