@@ -181,6 +181,21 @@ def test_forces_and_moments_balance(mu):
             assert np.abs(told - nodal).max() < 1e-14
 
 
+def test_written_as_one(folder):
+    """Files have one set of fields and columns for all that it consists of; the resultant is that of the rigid surfaces."""
+    plane = uem.RigidPlane((0.0, -1.0), (0.0, 1.0))
+    _, (contact,), problem = pressed(lambda b: [uem.GeneralContact(rigid=plane)])
+    assert len(problem.contacts) > 2 and problem.declared == [contact]
+    with uem.ResultsWriter(folder / "run", problem) as writer:
+        writer.write(1.0)
+    columns = (folder / "run.csv").read_text().splitlines()[0].split(",")
+    assert columns[3:] == ["active", "max_gap", "force_x", "force_y", "moment_z"]
+    assert contact.resultant().force == pytest.approx(problem.contacts[-1].resultant().force, abs=1e-15)
+    own = slice(problem.config.n_owned)
+    most = COMM.allreduce(float(contact.active.x.array[own].max(initial=0.0)), op=MPI.MAX)
+    assert most >= 1 and COMM.allreduce(float(contact.gap.x.array[own].min(initial=0.0)), op=MPI.MIN) > -1e-12
+
+
 def test_names():
     """Bodies by parts of cells or facets; others by their numbers; what is unknown is refused with what there is."""
     _, (contact,), _ = pressed(lambda b: [uem.GeneralContact(bodies={"punch": b.top, "base": cells_of(b, 0)}, name="all")])

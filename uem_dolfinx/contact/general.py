@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
+import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
 
@@ -96,7 +97,7 @@ class GeneralContact:
             order of the mesh's input.
         friction: as of ``Contact``, for all.
         normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
-        max_penetration: bound on overlaps at the start, a length; None is 5 % of the model's size.
+        max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
         measure: as of ``Contact``.
         name: for messages and files.
 
@@ -138,6 +139,7 @@ class GeneralContact:
         #: Whether a problem has been made of it.
         self.taken = False
         self._parts: list[Contact] = []
+        self._fields: dict[str, fem.Function] = {}
 
     def __repr__(self) -> str:
         """Its name, and how many rigid surfaces it has."""
@@ -161,9 +163,8 @@ class GeneralContact:
         place = skin.order([_part(config, part, "order") for part in self.order])
         self._name_bodies()
         nodes = surface_nodes(config, surface)
-        options: dict[str, Any] = {
-            "friction": self.friction, "max_penetration": self.max_penetration, "measure": self.measure,
-        }  # fmt: skip
+        bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
+        options: dict[str, Any] = {"friction": self.friction, "max_penetration": bound, "measure": self.measure}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
             itself |= self._bodies_of(_part(config, part, "self_contact"))
@@ -177,7 +178,6 @@ class GeneralContact:
             body = skin.body_of_node[nodes]
             own = nodes[(place[body] < with_facets.max()) | itself[body] | skin.corners[nodes]]
             apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
-            bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
             # as many bodies as others meet one in a corner of a grid of blocks
             n_lists = 2**config.gdim - 1
             neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
@@ -233,12 +233,38 @@ class GeneralContact:
         """Nodal contact forces as a vector field, on both bodies (collective)."""
         return self._sum("force")
 
+    @property
+    def active(self) -> fem.Function:
+        """The number of bodies and rigid surfaces that contactors touch, as a scalar field (collective)."""
+        return self._sum("active")
+
+    @property
+    def gap(self) -> fem.Function:
+        """The least gap as a scalar field, a length; as large as the model where nothing is near, zero off the surfaces (collective)."""
+        return self._of_all("gap", np.minimum)
+
+    def resultant(self, about: npt.ArrayLike | None = None) -> Resultant:
+        """Force and moment that rigid surfaces exert on the bodies; what these exert on each other cancels (collective).
+
+        Args:
+            about: point that the moment is taken about ``(gdim,)``; None is the origin.
+        """
+        g = self._config.gdim
+        centre = np.zeros(g) if about is None else given.vector("about", about, g)
+        rigid = [part.resultant(centre) for part in self.parts if not part.pair.target.n_nodes]
+        nothing = sum_up(self._config.comm, np.zeros((0, g)), np.zeros((0, g)))
+        return Resultant(sum((r.force for r in rigid), nothing.force), sum((r.moment for r in rigid), nothing.moment))
+
     def _sum(self, what: str) -> fem.Function:
+        return self._of_all(what, np.add)
+
+    def _of_all(self, what: str, together: np.ufunc) -> fem.Function:
+        """A field of all parts together (collective)."""
         fields = [getattr(part, what) for part in self.parts]
-        total = fem.Function(fields[0].function_space, name=f"contact_{what}_in_all")
-        for field in fields:
-            total.x.array[:] += field.x.array
-        return total
+        if what not in self._fields:
+            self._fields[what] = fem.Function(fields[0].function_space, name=f"contact_{what}_of_all")
+        self._fields[what].x.array[:] = together.reduce([field.x.array for field in fields])
+        return self._fields[what]
 
     def touching(self) -> list[Touch]:
         """Bodies that touch now, and rigid surfaces with them, sorted by their numbers in the mesh's input (collective)."""

@@ -40,6 +40,7 @@ class Skin(TargetFacets):
         body: of each facet ``(m,)``.
         across: number over all ranks of the neighbour across each side of each facet ``(m, n_sides)``, -1 for none.
         size: mean length of the sides of each body's facets, 0 where it has none ``(n_bodies,)``.
+        extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
 
     def __init__(self, config: Configuration, tag: Tag):
@@ -58,6 +59,10 @@ class Skin(TargetFacets):
         np.add.at(sums, self.body, np.column_stack([self._sides().mean(axis=1), np.ones(len(self.body))]))
         total = reduced(config.comm, sums)
         self.size: Array = total[:, 0] / np.maximum(total[:, 1], 1.0)
+        g, ends = config.gdim, np.full((self.n_bodies, 2 * config.gdim), -np.inf)
+        np.maximum.at(ends, self.body_of_node, np.column_stack([config.X, -config.X]))
+        ends = reduced(config.comm, ends, op=MPI.MAX)
+        self.extent: Array = np.linalg.norm(ends[:, :g] + ends[:, g:], axis=1)
 
     def _sides(self) -> Array:
         x, ends = self.config.X[self.dofs], np.array(self.shape.topology[1])

@@ -12,6 +12,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_expression
@@ -48,7 +49,7 @@ class HistoryWriter(Closing):
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         columns = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
-        for suffix in contact_suffixes(problem.contacts):
+        for suffix in contact_suffixes(problem.declared):
             columns += [f"active{suffix}", f"max_gap{suffix}"]
             columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
         self._progress = problem.progress
@@ -93,7 +94,7 @@ class HistoryWriter(Closing):
         self._last = time
         iterations = step.newton_iterations if isinstance(step, (LoadStep, TimeStep)) else ""
         row: list[object] = [time, self._progress.steps, iterations]
-        for contact in self.problem.contacts:
+        for contact in self.problem.declared:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
         self.table.write(row)
@@ -221,7 +222,7 @@ class ResultsWriter(Closing):
     def _sources(self) -> dict[str, fem.Function]:
         """Functions of the problem by name, up to date (collective)."""
         found = {"displacement": self.problem.u}
-        for contact, suffix in zip(self.problem.contacts, contact_suffixes(self.problem.contacts)):
+        for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
             found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
             found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
         return found
@@ -290,7 +291,7 @@ def clock(step: LoadStep | TimeStep | float) -> float:
     return float(step.time if isinstance(step, TimeStep) else step.factor if isinstance(step, LoadStep) else step)
 
 
-def contact_suffixes(contacts: Sequence[Contact]) -> list[str]:
+def contact_suffixes(contacts: Sequence[Contact | GeneralContact]) -> list[str]:
     """What tells the contacts apart in names of fields and columns; nothing where there is but one."""
     if len(contacts) == 1:
         return [""]

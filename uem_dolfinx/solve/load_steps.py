@@ -61,7 +61,7 @@ def load_steps(
         way = AlongArc(problem)
     made = _load_steps(problem, steps, way)
     return between_steps(
-        problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint, problem.contacts
+        problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint, problem.declared
     )
 
 

@@ -126,7 +126,8 @@ class UnitedProblem:
             newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
-        #: All contacts; a general one is several.
+        #: Contacts as they were declared, and all that they consist of: a general one is several.
+        self.declared: list[Contact | GeneralContact] = contacts
         self.contacts: list[Contact] = parts_of(contacts, self.config)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:

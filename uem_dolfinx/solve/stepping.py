@@ -14,6 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.log import logger
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
@@ -46,7 +47,7 @@ class Step:
         shown |= {"newton_iterations": self.newton_iterations, "exchanges": self.exchanges}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
-    def summary(self, contacts: Sequence[Contact]) -> str:
+    def summary(self, contacts: Sequence[Contact | GeneralContact]) -> str:
         """A line for the log of a run, with the active contactors and the force of every contact (collective)."""
         cut = f", cut {self.cuts} times" if self.cuts else ""
         words = [f"{self}: {self.newton_iterations} iterations, {self.exchanges} exchanges{cut}"]
@@ -159,7 +160,11 @@ def begin_checkpoint(checkpoint: Checkpoint | None, state: Callable[[], State], 
 
 
 def between_steps(
-    comm: MPI.Comm, progress: Progress, steps: Iterable[S], checkpoint: Checkpoint | None, contacts: Sequence[Contact]
+    comm: MPI.Comm,
+    progress: Progress,
+    steps: Iterable[S],
+    checkpoint: Checkpoint | None,
+    contacts: Sequence[Contact | GeneralContact],
 ) -> Iterator[S]:
     """Steps, between which the checkpoint is written when it is time, and on a signal to any rank, which ends the run on all.
 
@@ -168,7 +173,7 @@ def between_steps(
     Args:
         comm: communicator of the problem.
         progress: of the problem, by which it checks signals within a step, too.
-        contacts: of the problem.
+        contacts: of the problem, as they were declared.
         steps: each brings the problem from one committed state to the next; where it raises, the last one is restored.
         checkpoint: which has begun; None writes none.
 

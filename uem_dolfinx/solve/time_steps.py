@@ -125,7 +125,7 @@ def time_steps(
     begin_checkpoint(checkpoint, problem.state, problem.u)
     steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
     shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
-    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.contacts)
+    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
 
 
 def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
