@@ -127,7 +127,8 @@ class GeneralContact:
             self.order = given.items("order", order, lambda one: one is not None, "a part of a mesh")
             if not isinstance(self_contact, bool):
                 self_contact = given.items("self_contact", self_contact, lambda one: one is not None, "a part of a mesh")
-            given.kind("bodies", bodies, bodies is None or isinstance(bodies, dict), "names and parts, {name: part}, or None")
+            named = isinstance(bodies, dict) and all(isinstance(key, str) for key in bodies)
+            given.kind("bodies", bodies, bodies is None or named, "names and parts, {name: part}, or None")
             given_friction(friction)
             self.normals = given.word("normals", normals, ("facet", "averaged"))
             self.measure = given.word("measure", measure, ("reference", "current"))
