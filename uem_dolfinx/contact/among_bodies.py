@@ -22,12 +22,12 @@ class AmongBodies(NodeToSurface):
     """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
 
     target: Neighbour
-    #: Of two edges that meet, the one that is over the other's facet follows it.
-    ends_hold = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.ordered_by = target.neighbours.number
+        # of two edges that meet, the one that is over the other's facet follows it
+        self.ends_hold = ~target.neighbours.skin.corners[nodes]
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""

@@ -126,9 +126,9 @@ class ControlGaps:
         control = np.where(active, multipliers, 0.0)
         dropped, of_facet = self.shared & self.closed, self.family.of_facet
         # from the middle of a facet to edges, then from both to vertices
-        control = control + active * self._handed_on(control, dropped & of_facet)
-        control = control + active * self._handed_on(control, dropped & ~of_facet)
-        nodal = control - self._handed_on(control, self.shared)
+        control = control + active * self.handed_on(control, dropped & of_facet)
+        control = control + active * self.handed_on(control, dropped & ~of_facet)
+        nodal = control - self.handed_on(control, self.shared)
         return self.scale * control, nodal
 
     @property
@@ -164,8 +164,8 @@ class ControlGaps:
 
     def areas(self, areas: Array) -> Array:
         """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
-        areas = areas + self._handed_on(areas, self.shared & self.family.of_facet)
-        return self.scale * (areas + self._handed_on(areas, self.shared & ~self.family.of_facet))
+        areas = areas + self.handed_on(areas, self.shared & self.family.of_facet)
+        return self.scale * (areas + self.handed_on(areas, self.shared & ~self.family.of_facet))
 
     def forces_back(self, weights: Array, active: Bools) -> Array:
         """The transpose of the map from multipliers to control forces, for weights of these ``(n,)`` (collective)."""
@@ -181,12 +181,12 @@ class ControlGaps:
         return weights + self._handed_back(weights, self.shared & self.family.of_facet)
 
     def _handed_back(self, values: Array, terms: Bools) -> Array:
-        """The transpose of ``_handed_on`` (collective)."""
+        """The transpose of ``handed_on`` (collective)."""
         f = self.family
         at_parent = f.config.from_owners(f.nodes, values[:, None], f.parent)[:, 0]
         return np.asarray(np.bincount(f.child, np.where(terms, f.weight * at_parent, 0.0), minlength=len(f.nodes)), dtype=float)
 
-    def _handed_on(self, values: Array, terms: Bools) -> Array:
+    def handed_on(self, values: Array, terms: Bools) -> Array:
         """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
         f = self.family
         amounts = np.where(terms, f.weight * values[f.child], 0.0)
@@ -260,6 +260,10 @@ class ControlKinematics(NodalKinematics):
 
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         return self.control.forces(multipliers, state.active)
+
+    def nodal_friction(self, tau: Array) -> Array:
+        """Handed on from the control points to the nodes; what targets get that are contactors themselves is not theirs (collective)."""
+        return np.column_stack([along - self.control.handed_on(along, self.control.shared) for along in tau.T])
 
     def areas(self, areas: Array, current: bool) -> Array:
         """Integrals of Bernstein's basis (collective)."""

@@ -7,7 +7,7 @@ ring. A node may touch as many bodies at once as others meet it in a corner of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -18,18 +18,20 @@ from dolfinx.mesh import exterior_facet_indices
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import Resultant, sum_up
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.neighbours import Neighbours
+    from uem_dolfinx.geometry.skin import Skin
 
 
 class RigidContact(Contact):
@@ -44,6 +46,8 @@ class AmongContact(Contact):
     of_all_surfaces = True
 
     def __init__(self, general: GeneralContact, neighbours: Neighbours, number: int, **options: Any):
+        from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
+
         skin = neighbours.skin
         quadratic = skin.config.degree == 2
         coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
@@ -52,6 +56,8 @@ class AmongContact(Contact):
         self._neighbours, self._number = neighbours, number
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
+        from uem_dolfinx.geometry.neighbours import Neighbour
+
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
 
     def begin(self) -> None:
@@ -153,6 +159,9 @@ class GeneralContact:
             TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
             SurfaceError: if nothing is left that may touch, or a body has two names.
         """
+        from uem_dolfinx.geometry.neighbours import Neighbours
+        from uem_dolfinx.geometry.skin import Skin
+
         self.taken, self._config = True, config
         alone = [one for one in self.exclude if not _is_pair(one)]
         pairs = [one for one in self.exclude if _is_pair(one)]
@@ -309,7 +318,7 @@ class GeneralContact:
             i = np.flatnonzero(pair.trial.active)
             target = pair.target
             second = np.full(len(i), skin.n_bodies + k)
-            if isinstance(target, Neighbour):
+            if isinstance(target, MeshTarget):
                 second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
             first, force = skin.body_of_node[pair.nodes[i]], pair.trial.force[i]
             rows = np.column_stack([np.ones(len(i)), force, moments(pair.points[i] - centre, force)])

@@ -164,6 +164,9 @@ class Kinematics(Protocol):
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """Contact forces across the target from the multipliers of equations ``(m,)`` (collective)."""
 
+    def nodal_friction(self, tau: Array) -> Array:
+        """Forces at the contactors of multipliers ``tau (n, gdim)`` of rows along the target ``(n, gdim)`` (collective)."""
+
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The state's contact forces at nodes of both bodies: global nodes, repeated or not ``(k,)``, and forces ``(k, gdim)``."""
 

@@ -43,8 +43,8 @@ class NodeToSurface(OnTarget):
 
     chained, two_pass = False, True
     pointwise = at_feet = True
-    #: Whether an end of the target holds contactors that came to it there.
-    ends_hold = True
+    #: Whether an end of the target holds contactors that came to it there, one or each ``(n,)``.
+    ends_hold: bool | Bools = True
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -293,6 +293,10 @@ class NodalKinematics:
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         """Deciding and nodal forces along the normals from the multipliers of all contactors, each ``(n,)`` (collective)."""
         return multipliers, multipliers
+
+    def nodal_friction(self, tau: Array) -> Array:
+        """Each its own."""
+        return tau
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """On each contactor its force, on the target's nodes the opposite with the weights of the foot."""

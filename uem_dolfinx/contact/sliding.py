@@ -346,10 +346,7 @@ class Sliding:
             i = np.flatnonzero(self.slipping(state))
             taken = stiffness[:, None] * self.frame.way.relative(du)[i] + part[:, None] * self.pivot.tau[i]
             tau[i] -= np.einsum("kgh,kh->kg", projector, taken)
-        at_contactors = tau
-        if not self.discretisation.pointwise:
-            at_contactors = np.asarray(self.config.add_at_owners(*self.frame.ties.handed_on(tau))[self.nodes])
-        return across._replace(force=across.force + at_contactors, tau=tau * share[:, None])
+        return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
 
     def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array] | None:
         """Friction of contactors that does not grow with the force along the normal: nodes and forces; None without any (collective)."""

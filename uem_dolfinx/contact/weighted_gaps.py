@@ -225,6 +225,10 @@ class MortarKinematics:
         force = np.asarray(config.add_at_owners(*self._handed_on(mu))[self.of.nodes])
         return Traction(mu / rows.length * rows.share, np.einsum("ng,ng->n", force, rows.plain.direction), force)
 
+    def nodal_friction(self, tau: Array) -> Array:
+        """Of the rows' weights, on both sides of contactors that follow each other (collective)."""
+        return np.asarray(self.of.config.add_at_owners(*self.ties.handed_on(tau))[self.of.nodes])
+
     def _handed_on(self, mu: Array) -> tuple[Ints, Array]:
         """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
         eq, nodes = self.rows.equations, self.of.nodes

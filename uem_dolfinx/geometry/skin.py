@@ -10,13 +10,13 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, unit
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import gathered, reduced, sums_by_keys
+from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
 #: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
 #: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
@@ -128,11 +128,44 @@ class Skin(TargetFacets):
         """Which owned nodes lie on a sharp convex edge ``(n_owned,)`` (first time: collective)."""
         return self._on_sides(self._rims)[: self.config.n_owned]
 
+    @cached_property
+    def _around(self) -> tuple[Ints, Ints, Exchange, Ints, Ints]:
+        """Facets that meet at nodes on sharp edges and are of one face (first time: collective).
+
+        Returns:
+            Facets and their nodes ``(k,)``, the exchange of these with the nodes' owners, and of those received pairs that are alike in
+            the reference configuration, each with itself.
+        """
+        facet, node = np.nonzero(self._sharp_nodes)
+        exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes[facet, node]))
+        drawn = unit(self._area_vectors(self.config.X[self.dofs]))[facet, node]
+        there, normal = exchange.send(self.nodes[facet, node], drawn)
+        i, j = pairs_of_equals(there)
+        alike = np.einsum("kg,kg->k", normal[i], normal[j]) > SHARP_EDGE
+        return facet, node, exchange, i[alike], j[alike]
+
+    def _of_one_face(self, vectors: Array) -> tuple[tuple[Ints, Ints], Array]:
+        """Sums of ``vectors (m, nn, k)`` at nodes on sharp edges over the facets of one face: facets and nodes, and sums (collective)."""
+        facet, node, exchange, i, j = self._around
+        (arrived,) = exchange.send(vectors[facet, node])
+        (sums,) = exchange.back(sums_of_rows(i, arrived[j], len(arrived)))
+        return (facet[exchange.rows], node[exchange.rows]), sums
+
     def current(self, corners: bool = False) -> FacetData:
-        """Facets where they are now; at sharp edges normals are the facets' own (collective)."""
+        """Facets where they are now; at sharp edges normals are averaged over facets of one face alone (collective)."""
         data = super().current(corners)
-        own = self.normals()
-        return replace(data, nodal_normals=np.where(self._sharp_nodes[:, :, None], own, data.nodal_normals))
+        normals = data.nodal_normals.copy()
+        there, sums = self._of_one_face(self._area_vectors(data.x))
+        normals[there] = unit(sums)
+        return replace(data, nodal_normals=normals)
+
+    def spread(self) -> Array:
+        """See ``TargetFacets``; at sharp edges of facets of one face alone (collective)."""
+        vectors, spread = self._area_vectors(self.x), super().spread().copy()
+        there, sums = self._of_one_face(np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2))
+        length = np.linalg.norm(sums[:, :-1], axis=1)
+        spread[there] = np.where(length > 0, sums[:, -1] / np.where(length > 0, length, 1.0), 1.0)
+        return spread
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
@@ -152,3 +185,14 @@ class Skin(TargetFacets):
         cones[there, place + 1] = arrived.reshape(-1, 2, g)
         cones[:, 0] = unit(cones.sum(axis=1))
         return cones[nodes]
+
+
+def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
+    """Places of numbers ``(n,)`` that are equal, each with each and with itself ``(k,)``."""
+    order = np.argsort(numbers, kind="stable")
+    first = np.searchsorted(numbers[order], numbers[order], side="left")
+    end = np.searchsorted(numbers[order], numbers[order], side="right")
+    count = end - first
+    i = np.repeat(np.arange(len(numbers)), count)
+    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+    return order[i], order[j]
