@@ -5,7 +5,7 @@ A form of another mesh or space would be assembled with the numbers of other nod
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import ufl
 from dolfinx import fem
@@ -15,6 +15,9 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
+
+#: What a functional may be differentiated by.
+Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
 
 
 def check_linear(what: str, form: Any, V: Any) -> None:

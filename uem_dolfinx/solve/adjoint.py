@@ -24,7 +24,7 @@ has a further load that moves contactors against their targets, by which the for
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,14 +37,12 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pressure_slopes import PressureSlopes
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.form_checks import Control
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState
 from uem_dolfinx.solve.system import CLOSED, BodySystem
-
-#: What a functional may be differentiated by.
-Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
 
 
 class Motion(NamedTuple):

@@ -16,9 +16,8 @@ from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError, InputTypeError
-from uem_dolfinx.form_checks import check_functional
+from uem_dolfinx.form_checks import Control, check_functional
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.adjoint import Adjoint, Control, Linearised
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodySystem
 
@@ -58,6 +57,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
         given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
         check_functional("J", J)
     pressing = _check_results(problem, J)
+    from uem_dolfinx.solve.adjoint import Adjoint, Linearised
+
     with Linearised(problem) as linearised:
         adjoint = Adjoint(linearised, J, pressing)
         return [adjoint.by(m) for m in some]
@@ -85,6 +86,8 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[Control, Any]], of
             which = [k for k, pressure in enumerate(pressures) if pressure is of]
             given.kind("of", of, bool(which), "the pressure of a contact of the problem, or None for the displacement")
         contact = problem.contacts[which[0]]
+    from uem_dolfinx.solve.adjoint import Linearised
+
     with Linearised(problem) as linearised:
         motion = linearised.moved(pairs)
         return motion.du if contact is None else linearised.pressed(contact, motion)
