@@ -31,6 +31,8 @@ Mechanics and Engineering 191 (2001) 843-860.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 __version__ = "0.2.0"
 
 __all__ = [
@@ -101,16 +103,35 @@ from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.materials.von_mises import VonMises
-from uem_dolfinx.output.energy import Energies, EnergyBook
-from uem_dolfinx.output.films import animate
-from uem_dolfinx.output.frames import outline
-from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
 from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
-from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps
+
+if _TYPE_CHECKING:
+    from uem_dolfinx.output.energy import Energies, EnergyBook
+    from uem_dolfinx.output.films import animate
+    from uem_dolfinx.output.frames import outline
+    from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
+    from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
+
+#: Modules that are imported when one of their names is asked for.
+_LATER = {
+    "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
+    "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
+    "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> object:
+    """A public name of a module that has not been imported yet."""
+    if name not in _LATER:
+        raise AttributeError(f"module 'uem_dolfinx' has no attribute '{name}'")
+    from importlib import import_module
+
+    found = globals()[name] = getattr(import_module(f"uem_dolfinx.{_LATER[name]}"), name)
+    return found
