@@ -187,24 +187,23 @@ class Exchange:
 
 
 def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
-    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective; equal rows meet on one rank)."""
-    meeting = Exchange.to(comm, keys[:, 0] % comm.size)
-    (met,) = meeting.send(keys)
-    _, inverse, counts = np.unique(met, axis=0, return_inverse=True, return_counts=True)
-    total = np.empty(len(keys), dtype=np.int64)
-    (total[meeting.rows],) = meeting.back(counts[inverse.ravel()])
-    return total
+    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective)."""
+    return sums_by_keys(comm, keys, np.ones((len(keys), 1), np.int64))[:, 0]
 
 
 def sums_by_keys(comm: MPI.Comm, keys: Ints, values: AnyArray) -> AnyArray:
-    """Sums of the rows of ``values (n, k)`` with equal ``keys (n, l)`` over all ranks, for every row ``(n, k)`` (collective)."""
+    """Sums of the rows of ``values (n, k)`` with equal ``keys (n, l)`` over all ranks, for every row ``(n, k)`` (collective).
+
+    Equal rows meet on one rank.
+    """
     meeting = Exchange.to(comm, keys[:, 0] % comm.size)
     met, their = meeting.send(keys, values)
     _, inverse = np.unique(met, axis=0, return_inverse=True)
-    sums = np.zeros((inverse.max(initial=-1) + 1, values.shape[1]))
-    np.add.at(sums, inverse.ravel(), their)
-    total = np.empty(values.shape)
-    (total[meeting.rows],) = meeting.back(sums[inverse.ravel()])
+    inverse = inverse.ravel()
+    sums = np.zeros((inverse.max(initial=-1) + 1, values.shape[1]), values.dtype)
+    np.add.at(sums, inverse, their)
+    total = np.empty(values.shape, values.dtype)
+    (total[meeting.rows],) = meeting.back(sums[inverse])
     return total
 
 

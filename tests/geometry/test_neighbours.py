@@ -233,6 +233,17 @@ def projections(n):
     return found
 
 
+def nothing_is_missed(n, order, within, step):
+    """What is nearer than a length is what lists made now tell, of two nodes at least."""
+    found, fresh = projections(n), projections(lists_of(n.skin, order))
+    near = [key for key, p in fresh.items() if np.linalg.norm(p["point"] - p["foot"]) < within]
+    assert COMM.allreduce(len(near)) >= 2
+    for key in near:
+        assert key in found, (step, key)
+        for name, value in fresh[key].items():
+            assert np.abs(found[key][name] - value).max() < 1e-12, (step, key, name)
+
+
 @pytest.mark.parametrize("way,times", [(0.05, (3, 6)), (0.45, (6, 14))], ids=["slow", "fast"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_lists_last(cell, way, times):
@@ -248,13 +259,7 @@ def test_lists_last(cell, way, times):
     moving = skin.body_of_node == 1
     for step in range(41):
         config.displacement[moving, 0] = way * side * step
-        found, fresh = projections(n), projections(lists_of(skin, order))
-        near = [key for key, p in fresh.items() if np.linalg.norm(p["point"] - p["foot"]) < 0.25 * side]
-        assert COMM.allreduce(len(near)) >= 2
-        for key in near:
-            assert key in found, (step, key)
-            for name, value in fresh[key].items():
-                assert np.abs(found[key][name] - value).max() < 1e-12, (step, name)
+        nothing_is_missed(n, order, 0.25 * side, step)
         n.commit()
     assert times[0] <= n.times_made <= times[1]
 
@@ -274,13 +279,7 @@ def test_bodies_that_come_and_go_are_not_missed(cell, width):
     n, order = lists_of(skin, [*range(1, count + 1), 0]), [*range(1, count + 1), 0]
     for step in range(steps + 1):
         skin.config.displacement[skin.body_of_node == count, 0] = way * side * step
-        found, fresh = projections(n), projections(lists_of(skin, order))
-        near = [key for key, p in fresh.items() if np.linalg.norm(p["point"] - p["foot"]) < 0.15 * side]
-        assert COMM.allreduce(len(near)) >= 2
-        for key in near:
-            assert key in found, (step, key)
-            for name, value in fresh[key].items():
-                assert np.abs(found[key][name] - value).max() < 1e-12, (step, key, name)
+        nothing_is_missed(n, order, 0.15 * side, step)
         n.commit()
 
 

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
 
-from uem_dolfinx import given
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.results import Resultant, sum_up
+from uem_dolfinx.contact.results import Resultant, moments, sum_up
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Target
@@ -166,9 +166,7 @@ class GeneralContact:
         alone = [one for one in self.exclude if not _is_pair(one)]
         pairs = [one for one in self.exclude if _is_pair(one)]
         pairs += [(c.contactor, c.target) for c in others if not hasattr(c.target, "project")]
-        surface = _surface(
-            config, self.surfaces, [as_tag(p, config.mesh, (config.tdim - 1, config.tdim), "exclude") for p in alone]
-        )
+        surface = _surface(config, self.surfaces, [_part(config, part, "exclude") for part in alone])
         self._skin = skin = Skin(config, surface)
         place = skin.order([_part(config, part, "order") for part in self.order])
         self._name_bodies()
@@ -177,7 +175,7 @@ class GeneralContact:
         options: dict[str, Any] = {"friction": self.friction, "max_penetration": bound, "measure": self.measure}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
-            itself |= self._bodies_of(_part(config, part, "self_contact"))
+            itself |= skin.bodies_of(_part(config, part, "self_contact"))
         if len(with_facets) < 2 and not itself.any() and not self.rigid:
             raise SurfaceError(
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
@@ -199,14 +197,10 @@ class GeneralContact:
         self._parts = parts
         return parts
 
-    def _bodies_of(self, tag: Tag) -> Bools:
-        """Which bodies a part of the mesh is of ``(n_bodies,)`` (collective)."""
-        return self._skin.bodies_of(surface_nodes(self._config, tag))
-
     def _name_bodies(self) -> None:
         self._names = [f"body {k + 1}" for k in range(self._skin.n_bodies)]
         for name, part in self.bodies.items():
-            for body in np.flatnonzero(self._bodies_of(_part(self._config, part, "bodies"))):
+            for body in np.flatnonzero(self._skin.bodies_of(_part(self._config, part, "bodies"))):
                 if self._names[body] in self.bodies:
                     raise SurfaceError(f"bodies: '{name}' and '{self._names[body]}' are one body: give each body one name")
                 self._names[body] = name
@@ -308,8 +302,6 @@ class GeneralContact:
 
     def _touching(self, centre: Array | None = None) -> dict[tuple[int, int, str], tuple[int, Array, Array]]:
         """Numbers of contactors that touch, forces and moments on the first, by number of the first, and number and name of the second."""
-        from uem_dolfinx.contact.results import moments
-
         config, skin = self._config, self._skin
         found: dict[tuple[int, int, str], tuple[int, Array, Array]] = {}
         centre = np.zeros(config.gdim) if centre is None else centre
@@ -352,6 +344,11 @@ def _is_pair(one: Any) -> bool:
     )
 
 
+def _n_sides(config: Configuration) -> int:
+    """Number of facets of a cell."""
+    return len(forms.reference_topology(compat.cell_name(config.mesh))[config.tdim - 1])
+
+
 def _part(config: Configuration, part: Part, role: str) -> Tag:
     return as_tag(part, config.mesh, (config.tdim - 1, config.tdim), role)
 
@@ -366,9 +363,9 @@ def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag
     left = tag.entities
     for part in without:
         if part.dim == config.tdim:
-            mesh.topology.create_connectivity(facets, config.tdim)
-            behind = mesh.topology.connectivity(facets, config.tdim)
-            left = np.array([f for f in left if not np.isin(behind.links(f), part.entities).any()], dtype=np.int32)
+            mesh.topology.create_connectivity(config.tdim, facets)
+            of_cells = mesh.topology.connectivity(config.tdim, facets)
+            left = np.setdiff1d(left, compat.cell_table(of_cells, _n_sides(config))[part.entities])
         else:
             left = np.setdiff1d(left, part.entities)
     if reduced(config.comm, len(left)) == 0:
@@ -384,7 +381,6 @@ def _where(skin: Skin, part: Part) -> tuple[Bools, Bools]:
     nodes[surface_nodes(config, tag)] = True
     if tag.dim == config.tdim:
         return nodes, np.isin(skin.cells, tag.entities)
-    config.mesh.topology.create_connectivity(config.tdim, tag.dim)
-    links = config.mesh.topology.connectivity(config.tdim, tag.dim)
-    facet: Ints = np.array([links.links(c)[s] for c, s in zip(skin.cells, skin.sides)], dtype=np.int64)
-    return nodes, np.isin(facet, tag.entities)
+    cells, sides = forms.cells_of_facets(config.mesh, tag.entities)
+    n_sides = _n_sides(config)
+    return nodes, np.isin(skin.cells * n_sides + skin.sides, cells * n_sides + sides)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Indices, Ints, sums_of_rows
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import agree, count_keys
+from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered
 
 FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
 
@@ -73,6 +74,23 @@ class TargetFacets:
         n_sides = len(forms.reference_topology(compat.cell_name(self.config.mesh))[self.config.tdim - 1])
         return forms.original_cells(self.config.mesh)[self.cells] * n_sides + self.sides
 
+    @cached_property
+    def first(self) -> Ints:
+        """Number over all ranks of the first facet of each rank, and one past the last (first time: collective)."""
+        return np.append(0, np.cumsum(gathered(self.config.comm, len(self.dofs))))
+
+    def owners(self, facet: Ints) -> Exchange:
+        """Exchange with the ranks that hold the facets numbered ``facet (n,)``; -1 is nobody's (collective)."""
+        return Exchange.to(self.config.comm, np.searchsorted(self.first, facet, side="right") - 1)
+
+    def values_at(self, facet: Ints, values: AnyArray) -> Any:
+        """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
+        exchange = self.owners(facet)
+        (asked,) = exchange.send(facet)
+        found = np.full((len(facet), *values.shape[1:]), -1, dtype=values.dtype)
+        (found[exchange.rows],) = exchange.back(values[asked - self.first[self.config.comm.rank]])
+        return found
+
     def _orient(self, cell_dofs: Indices) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
         X, x = self.config.X, self.config.X[self.dofs]
@@ -96,18 +114,25 @@ class TargetFacets:
             )
         agree(self.config.comm, error)
 
-    def _open_sides(self) -> npt.NDArray[np.bool_]:
-        """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
+    def _side_keys(self) -> Ints:
+        """What tells each side of each facet, alike on both facets that share it ``(m n_sides, k)``."""
         corners = 1 if self.shape.dim == 1 else 2
         sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
-        keys = np.stack(sides, axis=1).reshape(-1, corners)
-        return (count_keys(self.config.comm, keys) == 1).reshape(len(self.nodes), len(sides))
+        return np.stack(sides, axis=1).reshape(-1, corners)
+
+    def _open_sides(self) -> npt.NDArray[np.bool_]:
+        """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
+        return (count_keys(self.config.comm, self._side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges()))
 
     def _open_nodes(self) -> npt.NDArray[np.bool_]:
         """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""
+        return self.on_sides(self.open_sides)[self.dofs]
+
+    def on_sides(self, which: Bools) -> Bools:
+        """Local nodes on some of the facets' sides, of any rank ``(n_local,)``; ``which (m, n_sides)`` are those (collective)."""
         sides = enumerate(self.shape.edges())
-        dofs = np.concatenate([self.dofs[self.open_sides[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
-        return self.config.to_owners(dofs, np.ones(len(dofs)))[self.dofs] > 0
+        dofs = np.concatenate([self.dofs[which[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
+        return self.config.to_owners(dofs, np.ones(len(dofs))) > 0
 
     @cached_property
     def _normal_field(self) -> fem.Function:
@@ -147,13 +172,19 @@ class TargetFacets:
 
     def spread(self) -> Array:
         """Areas of the facets around each node, over the length of their sum as vectors: 1 where all is flat ``(m, nn)`` (collective)."""
+        parts = self._areas_beside().reshape(-1, self.config.gdim + 1)
+        return spread_of(np.column_stack([self.config.to_owners(self.dofs.ravel(), part) for part in parts.T])[self.dofs])
+
+    def _areas_beside(self) -> Array:
+        """Outward normals at the nodes, as long as the facets are large, and beside them their lengths ``(m, nn, gdim + 1)``."""
         vectors = self._area_vectors(self.x)
-        parts = np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2).reshape(
-            -1, self.config.gdim + 1
-        )
-        sums = np.column_stack([self.config.to_owners(self.dofs.ravel(), part) for part in parts.T])[self.dofs]
-        length = np.linalg.norm(sums[:, :, :-1], axis=2)
-        return np.asarray(np.where(length > 0, sums[:, :, -1] / np.where(length > 0, length, 1.0), 1.0))
+        return np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2)
+
+
+def spread_of(sums: Array) -> Array:
+    """Sums of lengths over lengths of sums, from sums of vectors with lengths beside them ``(..., gdim + 1)``; 1 where there is none."""
+    length = np.linalg.norm(sums[..., :-1], axis=-1)
+    return np.asarray(np.where(length > 0, sums[..., -1] / np.where(length > 0, length, 1.0), 1.0))
 
 
 def unit(vectors: Array) -> Array:

@@ -22,7 +22,7 @@ from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, balls_that_meet
 from uem_dolfinx.geometry.facets import FacetData
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import Feet, MeshTarget, box_distances
-from uem_dolfinx.geometry.shapes import closest_point, unit_normals
+from uem_dolfinx.geometry.shapes import closest_point
 from uem_dolfinx.geometry.skin import Skin
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, gathered, reduced
@@ -133,7 +133,6 @@ class Neighbours:
         self.lists: list[Listing] = []
         #: How often lists have been made.
         self.times_made = 0
-        self.first: Ints = np.append(0, np.cumsum(gathered(config.comm, len(skin.dofs))))
 
     def _motion(self, since: Array) -> Array:
         """Largest motion of each body's surface on this rank ``(n_bodies,)``."""
@@ -191,7 +190,7 @@ class Neighbours:
         node, facet, cosine, *about_pairs = self._pairs(Asking(*told))
         home, row = exchange.origins[node], rows[node]
         # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
-        meeting, first = Exchange.to(comm, home), self.first[comm.rank]
+        meeting, first = Exchange.to(comm, home), self.skin.first[comm.rank]
         pairs = meeting.send(row, skin.body[facet], facet + first, skin.across[facet], skin.keys[facet], *about_pairs)
         seen = self._on_this_side(pairs[0], pairs[1], *pairs[4:])
         rows, bodies, facets, across, _, distance = (a[seen] for a in pairs[:6])
@@ -248,7 +247,7 @@ class Neighbours:
             facet: numbers of the facets listed for them, over all ranks.
             across: those of their neighbours ``(k, n_sides)``, -1 for none.
         """
-        most = self.first[-1]
+        most = self.skin.first[-1]
         listed = np.sort(row * most + facet)
         asked = np.where(across >= 0, row[:, None] * most + across, -1)
         at = np.minimum(np.searchsorted(listed, asked), max(len(listed) - 1, 0))
@@ -266,8 +265,7 @@ class Neighbours:
         none = np.zeros(0, np.int64)
         if not len(points) or not len(x):
             return none, none, *np.zeros((2, 0)), *np.zeros((2, 0), bool), np.zeros((0, points.shape[1]))
-        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(x), 1)))
-        middle = np.einsum("na,nag->ng", tab.N, x)
+        middle, outward = skin.middles(x)
         radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
         i, f = balls_that_meet(points, of.reach, middle, radius + self._reach[skin.body])
         own, its = of.body[i], skin.body[f]
@@ -275,14 +273,14 @@ class Neighbours:
         follows = (self.place[its] > self.place[own]) | (of.corner[i] & (its != own))
         follows |= same & (skin.nodes[f] != of.node[i, None]).all(axis=1)
         i, f, same = i[follows], f[follows], same[follows]
-        normal = unit_normals(tab, x)[f] * skin.sign[f, None]
+        normal = outward[f]
         cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], normal)
         front, cosine = self._in_front(of.committed[i], f), cosines.min(axis=1, initial=0.0)
         faces = cosine < -FACED
         # at the start facets that look away tell as well whether a node is inside a body
         kept = np.where(same, faces & front, faces | (self._overlap > 0.0))
         kept[same] &= of.corner[i[same]] | self._first_of_itself(of, i[same], f[same], cosines[same])
-        holds = (of.held[i] == (f + self.first[self._config.comm.rank])[:, None]).any(axis=1)
+        holds = (of.held[i] == (f + self.skin.first[self._config.comm.rank])[:, None]).any(axis=1)
         kept, faces, front = kept | holds, faces | holds, front | holds
         for k, (_, a, _, b) in enumerate(self._apart):
             kept &= ~((of.sides[i, k] & b[f]) | (of.sides[i, len(self._apart) + k] & a[f]))
@@ -293,9 +291,8 @@ class Neighbours:
 
     def _in_front(self, points: Array, facet: Ints) -> Bools:
         """Which nodes at ``points (k, gdim)`` were in front of this rank's facets ``(k,)``."""
-        skin, y = self.skin, self._committed[self.skin.dofs]
-        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(y), 1)))
-        normal, middle = unit_normals(tab, y) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, y)
+        skin = self.skin
+        middle, normal = skin.middles(self._committed[skin.dofs])
         height = np.einsum("kg,kg->k", points - middle[facet], normal[facet])
         return np.asarray(height >= -BEHIND * np.minimum(skin.depth, skin.radius)[facet])
 
@@ -309,9 +306,7 @@ class Neighbours:
             cosines: between their normals and those of the facets around the node ``(k, c)``.
         """
         skin, d = self.skin, DIRECTION[: self._config.gdim]
-        X = self._config.X[skin.dofs]
-        tab = skin.shape.tabulate(np.tile(skin.shape.middle, (len(X), 1)))
-        normal, middle = unit_normals(tab, X) * skin.sign[:, None], np.einsum("na,nag->ng", tab.N, X)
+        middle, normal = skin.middles(self._config.X[skin.dofs])
         # the normal of that facet around the node that faces most squarely
         own = of.cones[node, cosines.argmin(axis=1), 1] if len(node) else np.zeros((0, len(d)))
         # where normals are alike, as on one side of a strip that is folded, places tell
@@ -331,7 +326,7 @@ class Neighbours:
         _, first = np.unique(row * self.skin.n_bodies + body, return_index=True)
         first.sort()
         row, body = row[first], body[first]
-        held = np.stack([self._body_of(h) for h in self.held])
+        held = np.stack([self.skin.values_at(facets, self.skin.body) for facets in self.held])
         found, taken = np.full(held.shape, -1), np.zeros(len(row), bool)
         for k in range(self._n):
             keeps = (held[k][row] == body) & ~taken
@@ -342,14 +337,6 @@ class Neighbours:
             rows, nearest = np.unique(row[left], return_index=True)
             found[k][rows] = body[left[nearest]]
             taken[left[nearest]] = True
-        return found
-
-    def _body_of(self, facet: Ints) -> Ints:
-        """Bodies of facets of any rank ``(n,)``, -1 for -1 (collective)."""
-        exchange = Exchange.to(self._config.comm, np.searchsorted(self.first, facet, side="right") - 1)
-        (asked,) = exchange.send(facet)
-        found = np.full(len(facet), -1)
-        (found[exchange.rows],) = exchange.back(self.skin.body[asked - self.first[self._config.comm.rank]])
         return found
 
     def _list(self, home: Ints, row: Ints, facet: Ints, more: tuple[Array, Bools], empty: bool) -> Listing:

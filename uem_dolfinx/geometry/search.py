@@ -18,7 +18,7 @@ from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
-from uem_dolfinx.parallel import Exchange, gathered, reduced
+from uem_dolfinx.parallel import Exchange, reduced
 
 #: An averaged normal that leans further from the facet's no longer tells where the facet is.
 #: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
@@ -77,7 +77,7 @@ class MeshTarget:
         # half of what the thinnest body of one cell, or its shortest facet, measures
         shortest = min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))
         self.stride = 0.5 * reduced(self.comm, float(shortest), op=MPI.MIN)
-        self.first: Ints = np.append(0, np.cumsum(gathered(self.comm, len(facets.dofs))))
+        self.first: Ints = facets.first
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective).
@@ -99,15 +99,15 @@ class MeshTarget:
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
-        return self._ask(self._to_owners(facet), self.facets.current(), points, facet)[0]
+        return self._ask(self.facets.owners(facet), self.facets.current(), points, facet)[0]
 
     def at(self, points: Array, facet: Ints, xi: Array) -> FacetProjection:
         """Where ``points (n, gdim)`` stand relative to given places ``xi (n, fdim)`` of facets (collective)."""
-        return self._ask(self._to_owners(facet), self.facets.current(), points, facet, xi)[0]
+        return self._ask(self.facets.owners(facet), self.facets.current(), points, facet, xi)[0]
 
     def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
         """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
-        new, _ = self._ask(self._to_owners(old.facet), self.facets.current(), points, old.facet, old.xi)
+        new, _ = self._ask(self.facets.owners(old.facet), self.facets.current(), points, old.facet, old.xi)
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
 
@@ -160,11 +160,7 @@ class MeshTarget:
 
     def of_facets(self, facet: Ints, values: AnyArray) -> Any:
         """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
-        exchange = self._to_owners(facet)
-        (asked,) = exchange.send(facet)
-        found = np.full((len(facet), *values.shape[1:]), -1, dtype=values.dtype)
-        (found[exchange.rows],) = exchange.back(values[asked - self.first[self.comm.rank]])
-        return found
+        return self.facets.values_at(facet, values)
 
     def facets_of(self, keys: Ints) -> Ints:
         """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""
@@ -179,10 +175,6 @@ class MeshTarget:
         facet = np.full(len(keys), -1, dtype=np.int64)
         (facet[exchange.rows],) = exchange.back(np.where(np.append(known, -1)[at] == wanted, number[at], -1))
         return facet
-
-    def _to_owners(self, facet: Ints) -> Exchange:
-        """Exchange with the ranks that hold the facets; facet -1 is nobody's."""
-        return Exchange.to(self.comm, np.searchsorted(self.first, facet, side="right") - 1)
 
     def bounds(self, points: Array, x: Array) -> tuple[Array, Array]:
         """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective).

@@ -13,10 +13,11 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import FacetData, TargetFacets, unit
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
+from uem_dolfinx.geometry.shapes import unit_normals
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
+from uem_dolfinx.parallel import Exchange, reduced, sums_by_keys
 
 #: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
 #: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
@@ -76,17 +77,17 @@ class Skin(TargetFacets):
         """
         named = np.full(self.n_bodies, len(first))
         for k, tag in reversed(list(enumerate(first))):
-            named[self.bodies_of(surface_nodes(self.config, tag))] = k
+            named[self.bodies_of(tag)] = k
         with np.errstate(divide="ignore"):
             fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE_IN_SIZE))
         place = np.empty(self.n_bodies, np.int64)
         place[np.lexsort((np.arange(self.n_bodies), fine, named))] = np.arange(self.n_bodies)
         return place
 
-    def bodies_of(self, nodes: Indices) -> Bools:
-        """Which bodies local ``nodes (n,)`` of all ranks are of ``(n_bodies,)`` (collective)."""
+    def bodies_of(self, tag: Tag) -> Bools:
+        """Which bodies a part of the mesh is of ``(n_bodies,)`` (collective)."""
         told = np.zeros(self.n_bodies, bool)
-        told[self.body_of_node[nodes]] = True
+        told[self.body_of_node[surface_nodes(self.config, tag)]] = True
         return np.asarray(reduced(self.config.comm, told, op=MPI.LOR))
 
     # -- sharp edges -----------------------------------------------------------------------------------------------------
@@ -97,36 +98,27 @@ class Skin(TargetFacets):
         normal = self._area_vectors(X).mean(axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         middle = X[:, : len(self.shape.topology[0])].mean(axis=1)
-        corners = 1 if self.shape.dim == 1 else 2
-        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
-        keys = np.stack(sides, axis=1).reshape(-1, corners)
-        first = int(np.sum(gathered(self.config.comm, len(X))[: self.config.comm.rank]))
-        number = first + np.arange(len(X))
-        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), len(sides), axis=0)
-        others = sums_by_keys(self.config.comm, keys, told) - told
+        n_sides = len(self.shape.edges())
+        number = self.first[self.config.comm.rank] + np.arange(len(X))
+        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), n_sides, axis=0)
+        others = sums_by_keys(self.config.comm, self._side_keys(), told) - told
         g, one = self.config.gdim, others[:, 0] == 1
-        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), len(sides))
+        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), n_sides)
         cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
         falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
-        self.sharp_sides: Bools = (one & (cosine < SHARP_EDGE)).reshape(len(X), len(sides))
-        self._rims: Bools = (one & falls & (cosine < SHARP_EDGE)).reshape(len(X), len(sides))
-        return ~one.reshape(len(X), len(sides)) | self._rims
-
-    def _on_sides(self, which: Bools) -> Bools:
-        """Local nodes on some of the facets' sides, of any rank ``(n_local,)``; ``which (m, n_sides)`` are those (collective)."""
-        sides = enumerate(self.shape.edges())
-        dofs = np.concatenate([self.dofs[which[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
-        return self.config.to_owners(dofs, np.ones(len(dofs))) > 0
+        self.sharp_sides: Bools = (one & (cosine < SHARP_EDGE)).reshape(len(X), n_sides)
+        self._rims: Bools = (one & falls & (cosine < SHARP_EDGE)).reshape(len(X), n_sides)
+        return ~one.reshape(len(X), n_sides) | self._rims
 
     @cached_property
     def _sharp_nodes(self) -> Bools:
         """Which nodes of facets lie on a sharp edge, of any facet ``(m, nn)`` (first time: collective)."""
-        return self._on_sides(self.sharp_sides)[self.dofs]
+        return self.on_sides(self.sharp_sides)[self.dofs]
 
     @cached_property
     def corners(self) -> Bools:
         """Which owned nodes lie on a sharp convex edge ``(n_owned,)`` (first time: collective)."""
-        return self._on_sides(self._rims)[: self.config.n_owned]
+        return self.on_sides(self._rims)[: self.config.n_owned]
 
     @cached_property
     def _around(self) -> tuple[Ints, Ints, Exchange, Ints, Ints]:
@@ -161,11 +153,15 @@ class Skin(TargetFacets):
 
     def spread(self) -> Array:
         """See ``TargetFacets``; at sharp edges of facets of one face alone (collective)."""
-        vectors, spread = self._area_vectors(self.x), super().spread().copy()
-        there, sums = self._of_one_face(np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2))
-        length = np.linalg.norm(sums[:, :-1], axis=1)
-        spread[there] = np.where(length > 0, sums[:, -1] / np.where(length > 0, length, 1.0), 1.0)
+        spread = super().spread()
+        there, sums = self._of_one_face(self._areas_beside())
+        spread[there] = spread_of(sums)
         return spread
+
+    def middles(self, x: Array) -> tuple[Array, Array]:
+        """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
+        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
+        return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
