@@ -5,7 +5,7 @@ States are handed in and out; only the geometry of the target is kept.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -89,7 +89,7 @@ class ConcaveEdges:
             own = self.target.project_on(points[i], state.facet[i])
             own = replace(own, normal=self.target.outward(own))
             own = replace(own, gap=np.einsum("ng,ng->n", own.normal, points[i] - own.foot))
-            nearest = nearest.with_rows(i, {f.name: getattr(own, f.name) for f in fields(own)})
+            nearest = nearest.with_those(i, own)
         return nearest, *self.place(nearest, points, state)
 
     def leave(self, corners: Corners | None, state: PairState) -> tuple[PairState, Bools]:

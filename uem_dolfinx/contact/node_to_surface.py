@@ -6,7 +6,7 @@ contactor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -96,7 +96,7 @@ class NodeToSurface(OnTarget):
             return nearest
         i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
         own = self.target.at(points[i], f.facet[i], f.xi[i])
-        return nearest.with_rows(i, {x.name: getattr(own, x.name) for x in fields(own)} | {"beyond": 0.0})
+        return nearest.with_those(i, replace(own, beyond=np.zeros_like(own.beyond)))
 
     def _target_moves(self, p: Projection) -> Bools | None:
         """Which targets can move along the normal (collective)."""

@@ -399,7 +399,7 @@ class Neighbour(MeshTarget):
             )
             nearest, _ = self._nearest_foot(points, listed.exchange.rows, feet)
             rows = np.unique(listed.exchange.rows)
-            found = found.with_rows(rows, {name: getattr(nearest, name) for name in found.__dataclass_fields__})
+            found = found.with_those(rows, nearest)
         return found if which is None else found.take(which)
 
     def nowhere(self, points: Array) -> FacetProjection:

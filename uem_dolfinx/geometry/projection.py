@@ -157,6 +157,10 @@ class FacetProjection:
             updates[name][which] = value
         return replace(self, **updates)
 
+    def with_those(self, which: Ints, other: FacetProjection) -> FacetProjection:
+        """Copy with the points ``which (k,)`` where another projection, of k points, has them."""
+        return self.with_rows(which, {f.name: getattr(other, f.name) for f in fields(self)})
+
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""
         return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
