@@ -55,6 +55,12 @@ def vertex_nodes(domain: Any) -> Indices:
     return nodes
 
 
+def expanded(form: ufl.Form) -> ufl.Form | None:
+    """A form with its derivatives taken; None where nothing is left."""
+    found = ufl.algorithms.expand_derivatives(form)
+    return None if found.empty() else found
+
+
 def cells_of_facets(domain: Any, facets: npt.ArrayLike) -> tuple[Indices, Indices]:
     """Cells of facets, ghosts included, and which of its cell's facets each is ``(k,)``; one that lies between two comes twice."""
     topology, entities = domain.topology, np.asarray(facets, dtype=np.int32)

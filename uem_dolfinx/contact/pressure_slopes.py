@@ -94,8 +94,7 @@ class PressureSlopes:
             V = compat.function_space(config.mesh, config.degree)
             area = self.contact.surface.integral(ufl.TestFunction(V), self._current)
             for by, change in ((config.u, du), (ufl.SpatialCoordinate(config.mesh), shape)):
-                form = ufl.algorithms.expand_derivatives(ufl.derivative(area, by, change))
-                if not form.empty():
+                if (form := forms.expanded(ufl.derivative(area, by, change))) is not None:
                     areas += forms.assemble_array(V, forms.form(form))[nodes]
         slopes = self._over * (lam - p * kinematics.areas_along(areas))
         if self._stretching is not None:

@@ -152,7 +152,7 @@ class Linearised:
         for m, change in direction:
             if isinstance(m, ufl.SpatialCoordinate):
                 shape.x.array[:] += change.x.array
-                if (form := _expanded(ufl.derivative(self.F, m, change))) is not None:
+                if (form := forms.expanded(ufl.derivative(self.F, m, change))) is not None:
                     forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
                 continue
             if (form := _along(self.F, m, change)) is not None:
@@ -280,7 +280,7 @@ class Adjoint:
     def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
         """A Function of the displacement's space."""
         found = fem.Function(self.config.V)
-        self._assemble(found, lambda form: _expanded(ufl.derivative(form, X, ufl.TestFunction(self.config.V))))
+        self._assemble(found, lambda form: forms.expanded(ufl.derivative(form, X, ufl.TestFunction(self.config.V))))
         found.x.array[: len(self._by_places)] += self._by_places
         found.x.scatter_forward()
         return found
@@ -296,7 +296,7 @@ class Adjoint:
 
 def _derivative(form: ufl.Form, m: fem.Function, direction: Any) -> ufl.Form | None:
     """Derivative of a form by a Function; None where it does not depend on it."""
-    return _expanded(ufl.derivative(form, m, direction)) if m in form.coefficients() else None
+    return forms.expanded(ufl.derivative(form, m, direction)) if m in form.coefficients() else None
 
 
 def _along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.Form | None:
@@ -310,13 +310,7 @@ def _along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.F
         by, shape = ufl.diff(ufl.replace(integral.integrand(), {m: v}), v), np.shape(m.value)
         parts = [float(np.asarray(change)[i]) * (by[i] if i else by) for i in np.ndindex(shape) if np.asarray(change)[i] != 0.0]
         integrals += [integral.reconstruct(integrand=sum(parts[1:], parts[0]))] if parts else []
-    return _expanded(ufl.Form(integrals))
-
-
-def _expanded(form: ufl.Form) -> ufl.Form | None:
-    """A form with its derivatives taken; None where nothing is left."""
-    found = ufl.algorithms.expand_derivatives(form)
-    return None if found.empty() else found
+    return forms.expanded(ufl.Form(integrals))
 
 
 def _set(m: Any, values: npt.ArrayLike) -> None:
