@@ -63,10 +63,11 @@ except ImportError as _error:
 
 from uem_dolfinx.algebra.options import multigrid_options
 from uem_dolfinx.compat import function_space
-from uem_dolfinx.contact.contact import Balance, Contact, Resultant
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.tresca import Tresca
+from uem_dolfinx.contact.results import Balance, Resultant
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
 from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark

@@ -1,14 +1,26 @@
-"""Force and moment of nodal contact forces, and how far they are from balance."""
+"""What can be read from a contact after a step: forces, pressures, gaps, as arrays, fields and sums; and how far from balance they are."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from functools import cached_property
 
 from mpi4py import MPI
 
 import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
 
-from uem_dolfinx.arrays import Array, cross_products
+from uem_dolfinx import compat, given
+from uem_dolfinx.arrays import Array, Indices, cross_products
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import Areas
+from uem_dolfinx.geometry.tags import Part
+from uem_dolfinx.parallel import reduced
 
 
 @dataclass(frozen=True)
@@ -49,3 +61,199 @@ def imbalance(comm: MPI.Comm, x: Array, f: Array) -> Balance:
         float(np.linalg.norm(whole.force) / all_f) if all_f > 0 else 0.0,
         float(np.linalg.norm(whole.moment) / all_m) if all_m > 0 else 0.0,
     )
+
+
+class ContactResults:
+    """What can be read from a contact after a step.
+
+    Attributes:
+        name: for messages and files.
+        contactor: facets whose nodes are the contactors, or points.
+        measure: what pressures and tractions are forces per area of: ``"reference"`` or ``"current"``.
+        config: configuration of the displacement, once the contact belongs to a problem.
+    """
+
+    name: str
+    contactor: Part
+    measure: str
+    config: Configuration
+    _pair: Interface | None
+    _fields: dict[str, fem.Function]
+
+    @property
+    def pair(self) -> Interface:
+        """The pair behind this contact."""
+        if self._pair is None:
+            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+        return self._pair
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks (collective)."""
+        return self.pair.n_active
+
+    @property
+    def initial_overlap(self) -> float:
+        """How deep contactors were inside the target before the first step, a length; 0 if none was."""
+        return self.pair.initial_overlap
+
+    def max_gap(self) -> float:
+        """Largest gap of an active contactor, a length (collective)."""
+        return self.pair.largest_gap()
+
+    @cached_property
+    def surface(self) -> Areas:
+        """Integrals of the shape functions over the contactor."""
+        return Areas(self.config, self.contactor)
+
+    @property
+    def _areas(self) -> Array:
+        """Integral of the shape function of each contactor over the reference surface ``(n_contactors,)`` (first time: collective)."""
+        return self.surface.reference[self.pair.nodes]
+
+    def measured_areas(self) -> Array:
+        """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
+        current = self.measure == "current"
+        areas = self.surface.current[self.pair.nodes] if current else self._areas
+        return self.pair.kinematics.areas(areas, current)
+
+    @property
+    def nodes(self) -> Indices:
+        """Nodes of this rank's contactors, its own alone, by which fields of the displacement's space are asked ``(n_contactors,)``."""
+        return self.pair.nodes
+
+    @property
+    def points(self) -> Array:
+        """Current positions of this rank's contactors ``(n_contactors, gdim)``, a length."""
+        return self.pair.points
+
+    @property
+    def pressures(self) -> Array:
+        """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
+
+        The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
+        whether of the reference or of the current surface.
+        """
+        areas = self.measured_areas()
+        return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
+
+    def max_pressure(self) -> float:
+        """Largest contact pressure, a force per area (collective)."""
+        return float(reduced(self.config.comm, float(self.pressures.max(initial=0.0)), op=MPI.MAX))
+
+    @property
+    def pressure(self) -> fem.Function:
+        """Contact pressure as a scalar field, zero off the contactor (collective)."""
+        return self._field("pressure", self.pressures)
+
+    @property
+    def gap(self) -> fem.Function:
+        """Gap as a scalar field, a length; zero off the contactor (collective)."""
+        return self._field("gap", self.pair.projection.gap)
+
+    @property
+    def active(self) -> fem.Function:
+        """1 at active contactors, 0 elsewhere (collective)."""
+        return self._field("active", self.pair.trial.active)
+
+    @property
+    def status(self) -> fem.Function:
+        """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective).
+
+        With friction a contactor that a corner of the target holds in the plane sticks.
+        """
+        state = self.pair.trial
+        sticks = (
+            np.zeros(len(state.active), bool)
+            if state.friction is None
+            else state.friction.stick | (state.in_corner & (self.config.gdim == 2))
+        )
+        return self._field("status", np.where(state.active, np.where(sticks, 1.0, 2.0), 0.0))
+
+    @property
+    def traction(self) -> fem.Function:
+        """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
+        pair, areas = self.pair, self.measured_areas()[:, None]
+        tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
+        return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
+
+    @property
+    def slip(self) -> fem.Function:
+        """How far contactors have slipped over the target, summed over all committed steps, as a vector field on the contactor.
+
+        It is zero without friction (collective).
+        """
+        state = self.pair.trial
+        return self._field("slip", 0.0 if state.friction is None else state.friction.slipped, vector=True)
+
+    @property
+    def dissipation(self) -> float:
+        """Energy that friction has taken from the bodies in all committed steps: slips times means of a step's friction (collective)."""
+        friction = self.pair.committed.friction
+        return float(reduced(self.config.comm, 0.0 if friction is None else float(friction.work.sum())))
+
+    @property
+    def force(self) -> fem.Function:
+        """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
+        if "force" not in self._fields:
+            self._fields["force"] = fem.Function(self.config.V, name=_identifier(f"contact_force_{self.name}"))
+        f, g, pair = self._fields["force"], self.config.gdim, self.pair
+        f.x.array[:] = 0.0
+        total = compat.petsc_vector(f)
+        nodes, forces = pair.nodal_forces(pair.trial)
+        rows = (nodes[:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        total.setValues(rows, forces.ravel(), addv=PETSc.InsertMode.ADD)
+        total.assemble()
+        f.x.scatter_forward()
+        return f
+
+    def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
+        """Force and moment that the contact exerts on one of the bodies (collective).
+
+        Args:
+            about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
+                the surface's reference point where it is now: a tool's moment is about the point it turns about.
+            on: ``"contactor"``, or ``"target"``: a meshed one receives its forces at the feet of the contactors, a rigid one,
+                which has no nodes, where the contactors are.
+
+        Raises:
+            InputError, InputTypeError: for an unknown body, or a point that is not finite.
+        """
+        given.word("on", on, ("contactor", "target"))
+        target, p, g = self.pair.target, self.pair.projection, self.config.gdim
+        centre = np.zeros(g) if about is None else given.vector("about", about, g)
+        x, f = self.pair.points, self.pair.trial.force
+        if on == "target":
+            x, f = p.foot, -f
+            centre = target.reference(g) if about is None else centre
+        return sum_up(self.config.comm, x - centre, f)
+
+    def balance(self) -> Balance | None:
+        """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
+
+        The contactors' forces come from the residual, the target's from handing them on to its nodes.
+
+        Returns:
+            Imbalances relative to the sums of absolute nodal forces and moments; None for a rigid target, which has no nodes.
+        """
+        if self.pair.target.n_nodes == 0:
+            return None
+        n, g = self.config.n_owned, self.config.gdim
+        return imbalance(self.config.comm, self.config.x[:n], self.force.x.array.reshape(-1, g)[:n])
+
+    def _field(self, what: str, values: npt.ArrayLike, vector: bool = False) -> fem.Function:
+        config = self.config
+        if what not in self._fields:
+            space = config.V if vector else compat.function_space(config.mesh, config.degree)
+            self._fields[what] = fem.Function(space, name=_identifier(f"contact_{what}_{self.name}"))
+        f = self._fields[what]
+        f.x.array[:] = 0.0
+        table = f.x.array.reshape(-1, config.gdim) if vector else f.x.array
+        table[self.pair.nodes] = values
+        f.x.scatter_forward()
+        return f
+
+
+def _identifier(text: str) -> str:
+    """Name of a Function that the form compiler can use in code."""
+    return re.sub(r"\W+", "_", text)
