@@ -64,6 +64,7 @@ def test_deflated_unknowns_are_solved_exactly():
     problem, _, _ = pressed(1e4, n=3)
     solver, P, config = problem.system.solver, problem.system.restriction(), problem.config
     K = problem.bodies.tangent.K
+    solver.forget()
     solver.set_operator(P, K, None)
     hard = pressed_hard(config, solver.A, K, P)
     W = deflated(config, solver.A, P, hard)

@@ -293,7 +293,6 @@ def test_the_sign_of_the_determinant():
         pair.trial = replace(pair.trial, active=np.ones(n, bool), friction=friction)
         rows = system._rows()
         state = system._with_rows(before, rows)
-        system._factored = None
         system.solve(system.linearise(state, None), 0.0, None)
         P, Q, K = (gathered_matrix(A) for A in (state.trial.P, state.test.P, scene.problem.bodies.tangent.K))
         used = np.abs(P).max(axis=0) > 0

@@ -17,7 +17,7 @@ from uem_dolfinx.algebra.entries import is_symmetric, stiffen
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, default_options, last_words, tell_unused
-from uem_dolfinx.algebra.products import UnitedMatrix
+from uem_dolfinx.algebra.products import UnitedMatrix, made_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
@@ -40,8 +40,7 @@ UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 class UnitedSolver:
     """KSP for ``P'KP dq = P'(r - K c)``.
 
-    PETSc's ``options`` are given without their ``prefix``; None chooses by size. Without ``ksp_rtol`` every solve is as accurate as
-    its Newton iteration can use.
+    PETSc's ``options`` are given without ``prefix``; None chooses by size. Without ``ksp_rtol`` solves are as accurate as is of use.
     """
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
@@ -70,6 +69,8 @@ class UnitedSolver:
         #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
+        #: What the last united matrix was made of.
+        self._made_of: Any = None
         #: P and K of the present united matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
         #: Iterations per digit that the preconditioner took at first and takes now.
@@ -108,7 +109,7 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
-        self._A = self._crossed = self._served = self._factor_of = self._of = None
+        self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = None
         self._kept.drop()
         self._condensed.drop()
         self._use(self._first)
@@ -146,18 +147,22 @@ class UnitedSolver:
         return self.pc.getType() in ("gamg", "ml", "bddc")
 
     def set_operator(
-        self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, same: bool = False
+        self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
     ) -> None:
-        """Build ``Q'(K + G)P`` and give it to the KSP (collective).
+        """Build ``Q'(K + G)P`` and give it to the KSP, unless that has it (collective).
 
         ``restriction`` is P, of the current uniting equations, ``test`` is Q: if None, or the same object, P, and the matrix is
         symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``G`` second derivatives of gaps times forces.
-        ``same`` tells that all of them have the values that they had the last time, although a step has begun since.
+        The matrix is the same, ``roughly``, where all but coefficients in P, Q and G is.
         """
-        if same and not self._on_condensed and self._served is None:
+        test = test or restriction
+        before, self._made_of = self._made_of, made_of(restriction, test, K, G, roughly)
+        same = before is not None and before == self._made_of
+        # a step that begins is solved as if it were the first
+        otherwise = self._on_condensed or self._served is not None or self.options is not self._first
+        if same and not (self._begins and otherwise):
             self._begins, self._of = False, (K, K.stateGet())
             return
-        test = test or restriction
         self._petrov_galerkin = test is not restriction
         if self._begins and self.options is not self._first:
             self._use(self._first)
@@ -376,7 +381,7 @@ class UnitedSolver:
             if accuracy > 0 and (found := self._kept.solve(*self._served, rhs, accuracy)) is not None:
                 return found
             self._kept.drop()
-            self._of = None
+            self._of = self._made_of = None
             self.set_operator(*self._served)
             return self.solve(rhs, accuracy, near)
         # a factorisation has no use for a guess
@@ -419,11 +424,6 @@ class UnitedSolver:
         if self._factor_of is not None:
             self._kept.keep(self.pc, *self._factor_of)
         return dq, iterations
-
-    @property
-    def begins(self) -> bool:
-        """Whether a step begins, in which the united matrix, although it may be the same, is solved with as if the step were the first."""
-        return self._begins
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
         """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""

@@ -12,6 +12,7 @@ the matrix has them, in one piece between lines that have more.
 
 from __future__ import annotations
 
+import zlib
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,29 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import Exchange, reduced
+from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: Places of earlier products are kept while there are no more than this times as many of them as of the present one's.
 #: [convention; number of entries that K lacks; test_linear_solver.py::test_places_of_earlier_products]
 KEPT_PLACES = 2.0
+
+
+def made_of(P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, roughly: bool) -> tuple[Any, ...] | None:
+    """K and numbers that tell ``Q'(K + G)P`` from others; None where it is taken for a new one in any case (collective).
+
+    Args:
+        P: trial rows.
+        Q: test rows.
+        K: the tangent, told by the state of its values.
+        G: the curvature.
+        roughly: whether coefficients of P and Q, and values of G, do not count.
+    """
+    values = not roughly
+    if values and (G is not None or Q is not P):
+        return None
+    exact = 0 if G is not None else P.fingerprint(values=values)
+    parts = (K.stateGet(), exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes()))
+    return K, *gathered(P.space.comm, np.array(parts, dtype=np.int64)).ravel().tolist()
 
 
 class UnitedMatrix:

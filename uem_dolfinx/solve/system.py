@@ -5,7 +5,6 @@ It implements ``newton.ContactMethod`` by elimination, and leaves load steps and
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -65,7 +64,6 @@ class BodySystem:
         self.config, self.comm = bodies.config, bodies.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
-        self._factored: object = None
         self._curvature: PETSc.Mat | None = None
         self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
@@ -144,7 +142,6 @@ class BodySystem:
 
     def _refuse_one_of_several(self, state: BodyState) -> None:
         """Refuse an equilibrium between which and that without friction the united matrix was singular (collective)."""
-        self._factored = None
         added = together(self._curvature, state.added)
         if not self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
             raise FrictionError(
@@ -389,15 +386,8 @@ class BodySystem:
         assert isinstance(state, BodyState)
         K, P, Q = self.bodies.tangent.K, state.trial, state.test
         curvature = together(self._curvature, state.added)
-        # what the united matrix was made of; a modified Newton loop lets small changes of P pass
-        exact = 0 if curvature is not None else P.fingerprint(values=self.newton == "full")
-        parts = self.bodies.tangent.number, exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes())
-        made_of = gathered(self.comm, np.array(parts, dtype=np.int64)).tolist()
-        moving = (curvature is not None or Q is not P) and self.newton == "full"
-        same = made_of == self._factored and not moving
-        if not same or self.solver.begins:
-            self.solver.set_operator(P, K, curvature, Q, same)
-        self._factored = made_of
+        # a modified Newton loop lets small changes of P pass
+        self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
         self.solver.begin_at(c := P.c)
         linear, iterative = self.bodies.linear, self.solver.inexact
         # momentum is kept exactly where solves can be
@@ -432,7 +422,6 @@ class BodySystem:
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
-        self._factored = None
         self.solver.forget()
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
