@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, given
@@ -114,13 +115,17 @@ class Elastic(ABC):
             InputError: for simplices of degree 1, which lock with one point.
         """
         shear, volume = (ufl.inner(self._first_piola(u, part), ufl.grad(v)) for part in self._stresses(u))
-        return shear * dx + volume * self._fewer_points(u, dx)
+        return self._integrated(shear, volume, u, dx)
 
     def energy_form(self, u: fem.Function, dx: ufl.Measure = ufl.dx) -> ufl.Form:
         """Stored energy, integrated as in ``residual_form``, which is its derivative."""
         self._check(u)
-        shear, volume = self._energies(u)
-        return shear * dx + volume * self._fewer_points(u, dx)
+        return self._integrated(*self._energies(u), u, dx)
+
+    def _integrated(self, shear: Expr, volume: Expr, u: fem.Function, dx: ufl.Measure) -> ufl.Form:
+        """Integral of two parts of a stress or an energy, the second of which is zero where nu is, and has no integral then."""
+        fewer = self._fewer_points(u, dx)
+        return shear * dx if isinstance(volume, Zero) else shear * dx + volume * fewer
 
     def _fewer_points(self, u: fem.Function, dx: ufl.Measure) -> ufl.Measure:
         """Measure of the changes of volume; across a stress-free plane they are free."""
