@@ -9,9 +9,10 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from benchmarks.cases_scales import springs
 from dolfinx import fem
-from helpers import CELLS, blocks, box, clamp, complementary, linear, modulus, oedometric, run, scene, st_venant
+from helpers import CELLS, at, blocks, box, clamp, complementary, linear, modulus, oedometric, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -92,3 +93,17 @@ def test_the_same_history_on_every_number_of_ranks(cell, degree):
     assert np.abs(of_all - force).max() <= 1e-9 * np.abs(force).max()
     # some exchanges there were
     assert sum(i[1] for i in alone) > 0
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1e-13, 1e-14])
+def test_a_load_near_the_rounding_of_positions_is_not_taken_for_none(weight):
+    """Ten units of length from the origin, a strip of modulus 1 on a floor sinks by ``w (y - y^2 / 2)``, however light it is."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [10.0, 1.0], [40, 4])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    F = uem.LinearElastic(E=1.0, nu=0.0, kind="plane_strain").residual_form(u, ufl.TestFunction(V))
+    F += fem.Constant(s.mesh, weight) * ufl.TestFunction(V)[1] * ufl.dx
+    floor = uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
+    uem.UnitedProblem(F, u, bcs=clamp(V, s.tag("side", 0, at(0, 0.0)), 0), contacts=[floor]).solve()
+    y = V.tabulate_dof_coordinates()[:, 1]
+    assert np.abs(u.x.array.reshape(-1, 2)[:, 1] + weight * (y - y**2 / 2)).max() <= max(1e-15, 1e-10 * weight)

@@ -267,8 +267,8 @@ def solve_united(
         steady = state.right and not state.changed
         stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
         norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
-        if small < norm <= rounding:
-            # rounding excuses a residual that is small beside real forces, or where there are none
+        if small < norm <= rounding and (k > 0 or forces_before > 0.0):
+            # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
             real = max(bodies.above_rounding(state.in_contact), forces_before)
             small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
         converged = steady and state.closed and norm <= small
