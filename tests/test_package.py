@@ -67,6 +67,13 @@ def test_installed_elsewhere(kind, built, tmp_path):
     for name in ("common.py", "stack.py"):
         shutil.copy(REPO / "demos" / name, tmp_path / "demos")
     shutil.copytree(REPO / "meshes", tmp_path / "meshes")
+    (script,) = re.findall(r"```python\n(from mpi4py.*?)```", (REPO / "README.md").read_text(encoding="utf-8"), re.S)
+    (tmp_path / "script.py").write_text(script.replace('"h": 0.01', '"h": 0.04'), encoding="utf-8")
+    (tmp_path / "away").mkdir()
+    alone = subprocess.run(
+        [tmp_path / "empty" / "bin" / "python", "../script.py"], env=environment, **(how | {"cwd": tmp_path / "away"})
+    )
+    assert alone.returncode == 0 and "largest pressure" in alone.stdout, alone.stdout + alone.stderr
     run = [tmp_path / "empty" / "bin" / "python", "-c", RUN, "demos/stack.py", site, *NAMES]
     done = subprocess.run(run, env=environment | {"PYTHONPATH": "demos"}, **how)
     assert done.returncode == 0 and "came from" not in done.stdout, done.stdout + done.stderr

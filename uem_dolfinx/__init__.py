@@ -37,15 +37,15 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "GeneralContact", "HistoryWriter", "InputError",
-    "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
-    "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError",
-    "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface",
-    "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
-    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "consistent_mass", "dirichlet", "ds",
-    "dx", "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "tangent",
-    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "GeneralContact", "HistoryWriter",
+    "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
+    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
+    "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
+    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags",
+    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
+    "consistent_mass", "dirichlet", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
+    "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure",
+    "plot_scene", "read_checkpoint", "read_gmsh", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -98,7 +98,7 @@ from uem_dolfinx.errors import (
     UEMError,
     UserFunctionError,
 )
-from uem_dolfinx.geometry.gmsh import read_gmsh
+from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings

@@ -339,3 +339,9 @@ def test_communicator_of_one_rank(plates):
     """Each rank may read for itself."""
     mesh, tags = read_gmsh(plates, MPI.COMM_SELF)
     assert mesh.comm.size == 1 and size(mesh, tags["lower"]) == pytest.approx(2)
+
+
+def test_examples_come_with_the_package():
+    assert uem.example_mesh("hertz_cylinder").read_text(encoding="utf-8").count("Physical") > 3
+    with pytest.raises(uem.InputError, match="'hertz_cylinder'.*did you mean 'hertz_sphere'"):
+        uem.example_mesh("hertz_spher")

@@ -39,6 +39,22 @@ INCLUDED = r'\b((?:Include|Merge|ShapeFromFile)\s*\(?\s*)"([^"\n]+)"'
 FLAT = 1e-10
 
 
+#: Where the parametric files of the demos are, which come with the package.
+EXAMPLES = Path(__file__).resolve().parent.parent / "meshes"
+
+
+def example_mesh(name: str) -> Path:
+    """Path of a parametric Gmsh file of the demos, for ``read_gmsh``.
+
+    Args:
+        name: without ending, as ``"hertz_cylinder"``.
+
+    Raises:
+        InputError, InputTypeError: with the names that there are.
+    """
+    return EXAMPLES / f"{given.word('name', name, sorted(path.stem for path in EXAMPLES.glob('*.geo')))}.geo"
+
+
 def read_gmsh(
     source: Any, comm: MPI.Comm, gdim: int | None = None, parameters: Mapping[str, float] | None = None
 ) -> tuple[Any, Tags]:
