@@ -45,7 +45,8 @@ __all__ = [
     "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
     "consistent_mass", "dirichlet", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
     "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure",
-    "plot_scene", "read_checkpoint", "read_gmsh", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent",
+    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -114,6 +115,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
+    from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
@@ -122,6 +124,7 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
+    "read_mesh": "geometry.mesh_files",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",

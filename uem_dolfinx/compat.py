@@ -49,8 +49,7 @@ def has_vtx() -> bool:
 def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.float64], cell: str, degree: int) -> Any:
     """Mesh of this rank's ``cells (n, n_nodes)``, numbers of nodes in Gmsh's order, and of its part ``x (k, gdim)`` of the nodes."""
     gdim = x.shape[1]
-    order = cpp.io.perm_gmsh(getattr(mesh.CellType, cell), cells.shape[1])
-    cells = np.ascontiguousarray(cells[:, order], dtype=np.int64)
+    cells = np.ascontiguousarray(from_gmsh(cell, cells), dtype=np.int64)
     x = np.ascontiguousarray(x, dtype=np.float64)
     if DOLFINX_VERSION < (0, 7):
         scalar = ufl.FiniteElement("Lagrange", ufl.Cell(cell, geometric_dimension=gdim), degree, variant="equispaced")
@@ -65,6 +64,19 @@ def vtk_nodes(cell: str, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Nodes of cells ``(n, n_nodes)`` from DOLFINx's order into that of VTK and XDMF."""
     out = np.empty_like(nodes)
     out[:, cpp.io.perm_vtk(getattr(mesh.CellType, cell), nodes.shape[1])] = nodes
+    return out
+
+
+def from_gmsh(cell: str, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Nodes of cells from Gmsh's order into DOLFINx's."""
+    return nodes[:, cpp.io.perm_gmsh(getattr(mesh.CellType, cell), nodes.shape[1])]
+
+
+def gmsh_nodes(cell: str, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Nodes of cells from VTK's order into Gmsh's."""
+    kind, n = getattr(mesh.CellType, cell), nodes.shape[1]
+    out = np.empty_like(nodes)
+    out[:, cpp.io.perm_gmsh(kind, n)] = nodes[:, cpp.io.perm_vtk(kind, n)]
     return out
 
 

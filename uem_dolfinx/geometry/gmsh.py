@@ -79,16 +79,25 @@ def read_gmsh(
         MissingFileError: there is no such file.
         MeshError: Gmsh refuses the file, a parameter is unknown, or the model has no cells this package can use.
     """
-    with timed("read gmsh"):
-        given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
+    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
+
+    def read() -> RawMesh:
+        known = parameters is None or isinstance(parameters, Mapping)
+        given.kind("parameters", parameters, known, "numbers by name, as {'h': 0.1}, or None")
+        for name, value in (parameters or {}).items():
+            given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
+        return _read(source, gdim, dict(parameters or {}))
+
+    return distributed(comm, read, source if isinstance(source, (str, Path)) else "gmsh model")
+
+
+def distributed(comm: MPI.Comm, read: Callable[[], RawMesh], label: Any) -> tuple[Any, Tags]:
+    """The mesh that rank 0 reads, on all ranks, and its groups as tags; ``label`` is for the log (collective)."""
+    with timed("read mesh"):
         raw = None
         with agreed(comm):
-            known = parameters is None or isinstance(parameters, Mapping)
-            given.kind("parameters", parameters, known, "numbers by name, as {'h': 0.1}, or None")
-            for name, value in (parameters or {}).items():
-                given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
             if comm.rank == 0:
-                raw = _read(source, gdim, dict(parameters or {}))
+                raw = read()
         header = None if raw is None else (raw.cell, raw.degree, raw.points.shape[1], raw.cells.shape[1], raw.groups)
         cell, degree, gdim, nodes_per_cell, groups = comm.bcast(header, root=0)
         cells = np.empty((0, nodes_per_cell), dtype=np.int64) if raw is None else raw.cells
@@ -97,7 +106,6 @@ def read_gmsh(
         tags = [Tag(g.name, g.number, g.dim, mesh, _local_entities(mesh, g)) for g in groups]
         sizes = np.array([len(tag.entities) for tag in tags], dtype=np.int64)
         result = Tags(tags, comm.allreduce(sizes))
-    label = source if isinstance(source, (str, Path)) else "gmsh model"
     logger.info("%s: %d %s cells of degree %d, %r", label, comm.allreduce(len(cells)), cell, degree, result)
     # what locating d.o.f. of tags needs, and newer DOLFINx no longer builds by itself
     tdim = mesh.topology.dim
@@ -110,8 +118,8 @@ def read_gmsh(
 
 
 @dataclass(frozen=True)
-class _Group:
-    """A physical group as Gmsh has it.
+class Group:
+    """A physical group, or a set of another program.
 
     Its ``rows`` are, for the bodies, the input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
     input node index, shape ``(n, n_vertices)``.
@@ -124,17 +132,17 @@ class _Group:
 
 
 @dataclass(frozen=True)
-class _RawMesh:
+class RawMesh:
     """A whole mesh on one rank: ``points (n_nodes, gdim)``, and ``cells (n_cells, n_nodes_per_cell)`` of nodes in Gmsh's order."""
 
     cell: str
     degree: int
     points: npt.NDArray[np.float64]
     cells: npt.NDArray[np.int64]
-    groups: list[_Group]
+    groups: list[Group]
 
 
-def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
+def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> RawMesh:
     """Read a file or a live model; Gmsh is left as it was found."""
     if gdim not in (None, 2, 3):
         raise MeshError(f"gdim is {gdim!r}: a body is of dimension 2 or 3")
@@ -149,7 +157,7 @@ def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> _RawMe
         return _extract(source, gdim, "the live gmsh.model")
     path = Path(source).expanduser().absolute()
     if path.suffix not in (".geo", ".msh"):
-        raise MeshError(f"{source} is neither a .geo nor a .msh file")
+        raise MeshError(f"{source} is neither a .geo nor a .msh file: uem.read_mesh reads files of other programs")
     if not path.is_file():
         raise MissingFileError(f"mesh file {source} does not exist (looked for {path})")
     if path.suffix == ".msh" and parameters:
@@ -216,7 +224,7 @@ def _whole(path: Path, folder: Path, copies: dict[Path, Path]) -> Path:
     return copies[path]
 
 
-def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> _RawMesh:
+def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> RawMesh:
     """Open and mesh a file in a session of our own, or in a model of our own in the user's session."""
     with _session(gmsh) as errors, tempfile.TemporaryDirectory() as folder:
         # constants set before the file is included win over its DefineConstant, in this model only
@@ -269,7 +277,7 @@ def _session(gmsh: Any) -> Iterator[Callable[[], list[str]]]:
                 gmsh.option.setNumber(name, value)
 
 
-def _extract(model: Any, gdim: int | None, label: str) -> _RawMesh:
+def _extract(model: Any, gdim: int | None, label: str) -> RawMesh:
     """Take nodes, cells and physical groups out of a meshed model."""
     groups = [(int(dim), int(number)) for dim, number in model.getPhysicalGroups()]
     dims = [dim for dim in (3, 2) if len(model.mesh.getElements(dim)[0])]
@@ -304,8 +312,8 @@ def _extract(model: Any, gdim: int | None, label: str) -> _RawMesh:
             rows = np.concatenate([np.empty(0, dtype=np.int64), *(numbering[e] for e in members)])
         else:
             rows = _vertex_rows(model, dim, members, node_tags)
-        result.append(_Group(name, number, dim, rows.astype(np.int64)))
-    return _RawMesh(cell, degree, _points(model, node_tags, tdim, label), cells.astype(np.int64), result)
+        result.append(Group(name, number, dim, rows.astype(np.int64)))
+    return RawMesh(cell, degree, _points(model, node_tags, tdim, label), cells.astype(np.int64), result)
 
 
 def _elements(model: Any, dim: int, entity: int) -> dict[int, npt.NDArray[np.int64]]:
@@ -328,7 +336,11 @@ def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str)
     """Coordinates of the nodes used, shape ``(n_nodes, tdim)``."""
     tags, x, _ = model.mesh.getNodes()
     order = np.argsort(tags)
-    points = np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)]
+    return points_of(np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)], tdim, label)
+
+
+def points_of(points: npt.NDArray[np.float64], tdim: int, label: str) -> npt.NDArray[np.float64]:
+    """Coordinates ``(n_nodes, tdim)`` of nodes ``(n_nodes, 3)``; those of a 2D body must be in a plane ``z = constant``."""
     if tdim == 2 and np.ptp(points[:, 2]) > FLAT * np.ptp(points[:, :2], axis=0).max():
         raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
     return np.ascontiguousarray(points[:, :tdim])
@@ -337,7 +349,7 @@ def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str)
 # ---------------------------------------------------------------------------------------------- on every rank
 
 
-def _local_entities(mesh: Any, group: _Group) -> Indices:
+def _local_entities(mesh: Any, group: Group) -> Indices:
     """Local index of a group's entities on this rank, ghosts included, ascending."""
     topology = mesh.topology
     if group.dim == topology.dim:
