@@ -66,6 +66,21 @@ def test_tutorial(folder, monkeypatch):
     assert max(known["balance"].force, known["balance"].moment) < 1e-14
 
 
+def test_viscoelastic_page():
+    """A spring beside a spring and a dashpot, squeezed steadily: the force to the first order of the steps' length."""
+    page = (REPO / "demos" / "site" / "howto" / "own_residuals.md").read_text(encoding="utf-8")
+    errors = []
+    for n in (40, 80):
+        known = {}
+        script = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[1].replace("0.02, 80", f"0.02, {n}")
+        exec(compile(script, "own_residuals.md", "exec"), known)
+        E, E1, tau, end, squeeze = (known[name] for name in ("E", "E1", "tau", "end", "squeeze"))
+        t = end * np.arange(1, n + 1) / n
+        force = squeeze / end * (E * t + E1 * tau * (1 - np.exp(-t / tau)))
+        errors.append(np.abs(known["forces"] - force).max() / force.max())
+    assert errors[1] < 3.5e-3 and errors[0] == pytest.approx(2 * errors[1], rel=0.05)
+
+
 def test_readme_is_short_and_needs_no_inner_module():
     assert len(README.splitlines()) <= 20
     sources = {"README.md": README} | {p.name: p.read_text(encoding="utf-8") for p in (REPO / "demos").glob("*.py")}
