@@ -42,11 +42,11 @@ __all__ = [
     "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
     "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
     "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags",
-    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
-    "consistent_mass", "dirichlet", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
-    "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure",
-    "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent",
-    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "axisymmetric",
+    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
+    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark",
+    "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test",
+    "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -99,6 +99,7 @@ from uem_dolfinx.errors import (
     UEMError,
     UserFunctionError,
 )
+from uem_dolfinx.geometry.axisymmetry import axisymmetric, displacement_gradient
 from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
 from uem_dolfinx.geometry.tags import Tag, Tags

@@ -23,6 +23,7 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
 from ufl.constantvalue import IntValue
 from ufl.corealg.traversal import traverse_unique_terminals, unique_pre_traversal
+from ufl.indexed import Indexed
 from ufl.mathfunctions import MathFunction
 
 from uem_dolfinx import compat
@@ -177,9 +178,12 @@ def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
 
     No rule integrates what is no polynomial of its Functions exactly. On quadrilaterals and hexahedra UFL's estimate for a neo-Hookean
     law asks for 12 points in every direction at degree 1, and 22 at degree 2, where 3 and 5 leave an error below 1e-6 at strains of
-    30 %. Rules that the measure names stay.
+    30 %. Hoop strains, which are quotients by a radius, count as such in all cells. Rules that the measure names stay.
     """
-    if not F.integrals() or compat.cell_name(F.ufl_domain()) not in ("quadrilateral", "hexahedron"):
+    if not F.integrals():
+        return F
+    tensor = compat.cell_name(F.ufl_domain()) in ("quadrilateral", "hexahedron")
+    if not tensor and not any(_has_hoop_strains(i.integrand()) for i in F.integrals_by_type("cell")):
         return F
     spaces = [f.ufl_function_space() for f in (*F.coefficients(), *F.arguments())]
     degree = int(DEGREES_ENOUGH * max((compat.lagrange_degree(V) or 0 for V in spaces), default=0))
@@ -187,10 +191,17 @@ def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
     for integral in F.integrals():
         if integral.integral_type() == "cell" and not any(key.startswith("quadrature") for key in integral.metadata()):
             integrand = expand_derivatives(apply_algebra_lowering(integral.integrand()))
-            if not _is_polynomial(integrand) and estimate_total_polynomial_degree(integrand) > degree:
+            smooth = not _has_hoop_strains(integrand) and _is_polynomial(integrand)
+            if not smooth and estimate_total_polynomial_degree(integrand) > degree:
                 integral = integral.reconstruct(metadata={**integral.metadata(), "quadrature_degree": degree})
         integrals.append(integral)
     return ufl.Form(integrals)
+
+
+def _has_hoop_strains(integrand: Any) -> bool:
+    """Whether an expression divides by a coordinate."""
+    quotients = (part.ufl_operands[1] for part in unique_pre_traversal(integrand) if isinstance(part, Division))
+    return any(isinstance(below.ufl_operands[0], ufl.SpatialCoordinate) for below in quotients if isinstance(below, Indexed))
 
 
 def _is_polynomial(integrand: Any) -> bool:

@@ -16,6 +16,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.form_checks import check_expression, check_functional
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag
 from uem_dolfinx.parallel import agreed
 
@@ -150,7 +151,8 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
     """Value of a functional, as in ``uem.integrate(p * uem.ds(tags["top"]))``, summed over all ranks (collective).
 
     Args:
-        integrals: in UFL, or compiled by ``fem.form``, which saves time where it is asked for again and again.
+        integrals: in UFL, on a mesh declared ``axisymmetric`` over whole circles; or compiled by ``fem.form``, which saves time where it
+            is asked for again and again, over what is in the form.
 
     Raises:
         InputError, InputTypeError: for anything else, or a form with a test function or without integrals.
@@ -165,5 +167,5 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
         check_functional("the integral", integrals)
     else:
         raise InputError("the form of no integrals belongs to no mesh: expected one integral at least")
-    M = forms.form(integrals) if isinstance(integrals, ufl.Form) else integrals
+    M = forms.form(revolved(integrals)) if isinstance(integrals, ufl.Form) else integrals
     return forms.assemble_scalar(M, forms.parts_of(M)[0].mesh.comm)

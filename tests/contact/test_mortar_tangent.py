@@ -77,13 +77,13 @@ def leaning(b, cell):
         disturbed(b, 2, 0.01)
 
 
-def weighted_gap(cell, target):
-    """Of blocks that lean, above a mesh, above one that ends over a facet, or above a rigid ball."""
-    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, contactor=(
+def weighted_gap(cell, target, hollow=None):
+    """Of blocks that lean, above a mesh, above one that ends over a facet, or above a rigid ball; of rings with a radius ``hollow``."""
+    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, hollow=hollow, contactor=(
         "lower" if target == "end" else "upper"
     ))  # fmt: skip
     if target == "ball":
-        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+        b.contact = uem.Contact(b.high, uem.RigidSphere([0.4 + (hollow or 0.0)] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
     problem = b.pressed()
     leaning(b, cell)
     return WeightedGap(b, problem.system)
@@ -116,3 +116,31 @@ def test_curvature_against_differences(cell, target):
             index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
             np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+
+
+@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
+def test_circles(target):
+    """Both of rings, whose parts grow with their radii; of second derivatives all but how dual functions change to second order."""
+    phi = weighted_gap("triangle", target, hollow=0.5)
+    rows = phi.leave_out(target)
+    first, parts = phi.forces(phi.start), curvature(rows.points, phi.pressure)
+    for way, (ahead, behind), h in phi.ways("triangle"):
+        slope = (phi.value(ahead) - phi.value(behind)) / h
+        assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
+        measured, told = -(phi.forces(ahead) - phi.forces(behind)) / h, np.zeros(len(phi.start))
+        for nodes, blocks in parts:
+            index = (nodes[:, :, None] * 2 + np.arange(2)).reshape(len(nodes), -1)
+            np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        assert np.abs(measured - told).max() < 1e-4 * np.abs(measured).max()
+
+
+@pytest.mark.parametrize("hollow", [None, 0.5])
+def test_shares_grow(hollow):
+    """Derivatives of the integrals of the basis over facets by their nodes, against differences."""
+    of = weighted_gap("triangle", "mesh", hollow=hollow).pair.discretisation
+    facets, x, h = np.arange(len(of.surface.dofs)), of.surface.x, 1e-6
+    slopes = of.share_slopes(facets, x)
+    for a, k in np.ndindex(x.shape[1:]):
+        step = h * (np.arange(x.shape[1]) == a)[:, None] * np.eye(2)[k]
+        ahead, behind = (of.shares(of.sizes(x + side * step), x + side * step) for side in (1, -1))
+        assert np.abs(slopes[:, :, a, k] - (ahead - behind) / (2 * h)).max() < 1e-8

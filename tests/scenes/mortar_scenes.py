@@ -29,6 +29,7 @@ class Blocks:
         seed: moves the inner nodes of the surfaces at random.
         narrow: width of the upper block.
         wave: height of waves of both surfaces.
+        hollow: inner radius of axisymmetric blocks, rings if it is positive; None are blocks in the plane.
         how: arguments of the contact.
     """
 
@@ -45,6 +46,7 @@ class Blocks:
         gap=0.0,
         comm=COMM,
         E=(1.0, 2.0),
+        hollow=None,
         **how,
     ):
         g = 2 if cell in ("triangle", "quadrilateral") else 3
@@ -63,6 +65,9 @@ class Blocks:
         tagged = scene(comm, cell, bodies)
         self.scene = s = scene(comm, cell, [moved(body, k) for body, k in zip(bodies, n)])
         s.drawing = tagged.drawing
+        if hollow is not None:
+            s.mesh.geometry.x[:, 0] += hollow
+            uem.axisymmetric(s.mesh)
         self.V = compat.function_space(s.mesh, degree, (g,))
         self.u = fem.Function(self.V)
         self.low, self.high = s.tag("low", 0, at(g - 1, 0.0)), s.tag("high", 1, at(g - 1, gap))

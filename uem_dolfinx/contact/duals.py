@@ -12,11 +12,12 @@ facet, which keeps the sum.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from math import comb, factorial
 
 import numpy as np
 
+from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.geometry.shapes import FacetShape
@@ -48,6 +49,12 @@ class Basis:
         self.T: Array = np.asarray(np.linalg.inv(self.at(shape.nodes)))
         # they add up to one, and all have the same integral
         self.mean: Array = np.full(len(self.rank), 1.0 / len(self.rank))
+
+    @cached_property
+    def products(self) -> Array:
+        """Means over the reference facet of products with the shape functions ``(nn, nn)``."""
+        xi, weights = forms.quadrature_rule(self.shape.cell, 2 * self.shape.degree)
+        return np.asarray(self.at(xi).T @ (weights[:, None] * self.shape.functions(xi)) / weights.sum())
 
     def at(self, xi: Array) -> Array:
         """Values at ``xi (q, fdim)``: ``(q, nn)``."""
@@ -95,7 +102,7 @@ class Covered:
     full: Array
 
     @classmethod
-    def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, size: Array, mean: Array) -> Covered:
+    def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array) -> Covered:
         """Integrate.
 
         Args:
@@ -103,16 +110,15 @@ class Covered:
             b: functions of the contactor's basis at their points ``(q, nn)``.
             N: the target's shape functions there ``(q, nt)``.
             facet: contactor facet of each pair ``(k,)``.
-            size: of the contactor facets in their planes ``(m,)``.
-            mean: of the functions b over a whole facet ``(nn,)``.
+            full: of the functions b over the whole facets ``(m, nn)``.
         """
-        s, m, k, nn = segments, len(size), len(facet), len(mean)
+        s, k, (m, nn) = segments, len(facet), full.shape
         weighted = s.weight[:, None] * b
         own = add_up(s.pair, products(weighted, np.column_stack([b, s.gap])), k)
         M, G = np.split(add_up(facet, own, m).reshape(m, nn, nn + 1), [nn], axis=2)
         D = add_up(facet[s.pair], weighted, m)
         pairs = add_up(s.pair, products(weighted, N), k).reshape(k, nn, N.shape[1])
-        return cls(facet, D, M, G[:, :, 0], pairs, own.reshape(k, nn, nn + 1), size[:, None] * mean)
+        return cls(facet, D, M, G[:, :, 0], pairs, own.reshape(k, nn, nn + 1), full)
 
 
 def add_up(place: Ints, values: Array, n: int) -> Array:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import exterior_facet_indices
+from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Indices
@@ -22,6 +22,7 @@ from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import Resultant, moments, sum_up
 from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.search import MeshTarget
@@ -312,8 +313,8 @@ class GeneralContact:
             second = np.full(len(i), skin.n_bodies + k)
             if isinstance(target, MeshTarget):
                 second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
-            first, force = skin.body_of_node[pair.nodes[i]], pair.trial.force[i]
-            rows = np.column_stack([np.ones(len(i)), force, moments(pair.points[i] - centre, force)])
+            first, force = skin.body_of_node[pair.nodes[i]], config.whole(pair.trial.force[i])
+            rows = np.column_stack([np.ones(len(i)), force, moments(config.whole(pair.points[i]) - centre, force)])
             keys, inverse = np.unique(first * (skin.n_bodies + len(self.parts)) + second, return_inverse=True)
             sums = np.zeros((len(keys), rows.shape[1]))
             np.add.at(sums, inverse.ravel(), rows)
@@ -359,6 +360,9 @@ def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag
     if surfaces is None:
         mesh.topology.create_connectivity(facets, config.tdim)
         surfaces = np.asarray(exterior_facet_indices(mesh.topology))
+        if config.axisymmetric:
+            # the axis is inside the bodies
+            surfaces = np.setdiff1d(surfaces, locate_entities_boundary(mesh, facets, on_axis(mesh)))
     tag = as_tag(surfaces, mesh, (facets,), "surfaces")
     left = tag.entities
     for part in without:

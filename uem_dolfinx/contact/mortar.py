@@ -154,7 +154,11 @@ class Mortar(Contactors):
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
         segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
-        covered = Covered.of(segments, b, N, pairs, planes.size, self.basis.mean)
+        radius = None
+        if config.axisymmetric:
+            radius = np.einsum("qa,qa->q", phi, x[facets][pairs[segments.pair], :, 0])
+            segments = replace(segments, weight=2 * np.pi * radius * segments.weight)
+        covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]))
         dofs = surface.dofs[facets]
         part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
         ratio = part / np.where(full > 0, full, 1.0)
@@ -162,7 +166,7 @@ class Mortar(Contactors):
         other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
             segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
-            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator,
+            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius,
         )  # fmt: skip
         rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
         return replace(rows, facing=facing)

@@ -100,6 +100,12 @@ class _Ends:
         tab = at.shape.tabulate(s.xi)
         over = dual_tangents(tangents(tab, at.x[e]), n)
         of_b = np.einsum("qb,qbf->qf", with_b, np.einsum("qaf,ab->qbf", tab.dN, np.linalg.inv(basis_of(at.shape).T)))
+        if at.radius is not None:
+            # circles grow as the place goes outward, and with the nodes
+            r, wider = np.einsum("qa,qa->q", s.motions.phi, at.x[e][:, :, 0]), np.zeros(v.shape)
+            of_b += (h / r)[:, None] * np.einsum("qaf,qa->qf", tab.dN, at.x[e][:, :, 0])
+            wider[:, : s.motions.nc, 0] = s.motions.phi / r[:, None]
+            half += sum_of_products(s.pair, s.weight * h, wider, v, k)
         weight = s.weight * h
         for f in range(at.shape.dim):
             goes = -s.motions.along(over[:, f])

@@ -58,6 +58,7 @@ class SegmentPoints:
         y: of the target facets, pair by pair ``(k, nt, gdim)``.
         sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
         shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
+        radius: of the circles that points of axisymmetric bodies stand for, which their weights hold ``(q,)``; None of others.
     """
 
     segments: Segments
@@ -77,6 +78,7 @@ class SegmentPoints:
     y: Array
     sign: Array
     shape_operator: Array | None
+    radius: Array | None = None
 
     @cached_property
     def turning(self) -> Array:
@@ -101,13 +103,21 @@ class SegmentPoints:
     def stretching(self) -> Array:
         """How the part of the plane that a point stands for grows with the contactor facet's nodes beside the facet ``(q, nc, gdim)``.
 
-        Of affine facets all parts grow alike.
+        Of affine facets all parts grow alike, but for circles.
         """
         e = self.facet[self.segments.pair]
         tab, x, n = self.shape.tabulate(self.segments.xi), self.x[e], self.planes.normal[e]
         over = dual_tangents(tangents(tab, x), n)
         turned = (to_gap(area_vectors(tab, x), n) + 2 * n) / self.planes.size[e, None]
-        return np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
+        grown = np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
+        if self.radius is not None:
+            grown[:, :, 0] += self.phi / self.radius[:, None]
+        return grown
+
+    @property
+    def unequal(self) -> bool:
+        """Whether parts of facets do not grow as these do."""
+        return self.shape.degree == 2 or self.radius is not None
 
     # -- first derivatives -----------------------------------------------------------------------------------------------
 
@@ -140,7 +150,7 @@ class SegmentPoints:
         on_facet += (vector[:, None] @ self.turning).swapaxes(1, 2).reshape(m, nc, nc * g)
         by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
         by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
-        if self.shape.degree == 2:
+        if self.unequal:
             grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap)
             stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
             by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
@@ -162,7 +172,7 @@ class SegmentPoints:
     def partly_covered(self) -> Ints:
         """Pairs whose contactor facets are not covered altogether ``(p,)``."""
         some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
-        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.planes.size)[self.facet] & some)
+        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.covered.full.sum(axis=1))[self.facet] & some)
 
     # -- second derivatives ----------------------------------------------------------------------------------------------
 
@@ -196,7 +206,7 @@ class SegmentPoints:
             shape_operator = self.shape_operator[np.isin(self.segments.pair, pressing)]
             for row, unit in zip(np.moveaxis(shape_operator, 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
-        if self.shape.degree == 2:
+        if self.unequal:
             gaps = motions.along(t) + motions.of_area(((2 if nt else 1) * gap / size[pair])[:, None] * n[pair])
             half += self._stretched(pressing, pair, pressure, gaps)
         blocks = half + half.transpose(0, 2, 1)
@@ -226,7 +236,7 @@ class SegmentPoints:
     def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Motions]:
         """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, t, eta and motions.
 
-        Where all facets are affine, t is the same all over a pair: one point stands for all of them, with sums for values.
+        Where all facets are affine and grow evenly, t is the same all over a pair: one point stands for all, with sums for values.
         """
         k, s, e = len(pressing), self.segments, self.facet[pressing]
         place = np.full(len(self.facet), -1, dtype=np.int64)
@@ -235,7 +245,7 @@ class SegmentPoints:
         pair = place[s.pair[q]]
         force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * s.weight[q]
         phi, N, gap, size, turning = self.phi[q], self.N[q], s.gap[q], self.planes.size[e], self.turning[e]
-        if self.other is None or not (self.shape.affine and self.other.affine):
+        if self.other is None or self.unequal or not (self.shape.affine and self.other.affine):
             return pair, force, gap, self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
         total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap]), k)
         one = q[np.searchsorted(pair, np.arange(k))]
@@ -310,8 +320,11 @@ class SegmentPoints:
         t = to_gap(area_vectors(tab, y[pair]), planes.normal[pair])
         gap, height = (np.einsum("qa,qa->q", N, its[pair, :, -1]) - above for N in (tab.N, chord))
         motions = Motions(phi, chord, height / planes.size[pair], self.turning[e][pair])
+        weight = s.weight
+        if self.radius is not None:
+            weight = 2 * np.pi * np.einsum("qa,qa->q", phi, self.x[e[pair], :, 0]) * weight
         return Sides(
             pair=pair, xi=xi, b=basis_of(self.shape).at(xi), N=tab.N, gap=gap, t=t, slope=np.einsum("qg,qg->q", t, outward),
             outward=outward, motions=motions, way=motions.along(outward), ahead=ahead,
-            shift=shift, cut=cut, weight=s.weight, end=alone,
+            shift=shift, cut=cut, weight=weight, end=alone,
         )  # fmt: skip

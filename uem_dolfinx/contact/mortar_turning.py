@@ -63,7 +63,7 @@ def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
     share, one = np.concatenate([at.phi[q], -at.N[q]], axis=1), np.ones(len(q))
     # all grow with the facet
     blocks = sum_of_products(pair, one, share[:, :, None] * force[:, None], motions.of_area((n / size[:, None])[pair]), k)
-    if at.shape.degree == 2:
+    if at.unequal:
         blocks += _stretched(at, traction, which, q, pair)
     if at.other is not None:
         tab = at.other.tabulate(s.eta[q])
@@ -154,7 +154,7 @@ def turning(
     # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
     unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
     grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * unit[:, None]
-    if at.shape.degree == 2:
+    if at.unequal:
         s = at.segments
         stretched = products(s.weight[:, None] * at.b, at.stretching.reshape(len(at.b), nc * g))
         on_facet = add_up(at.facet[s.pair], stretched, m).reshape(m, nc, nc, g)

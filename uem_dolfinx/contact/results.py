@@ -25,7 +25,7 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Resultant:
-    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D."""
+    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; of axisymmetric bodies the force along the axis."""
 
     force: Array
     moment: Array
@@ -210,6 +210,8 @@ class ContactResults:
     def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies (collective).
 
+        Of axisymmetric bodies it is that on the whole body, which lies on the axis: radial forces cancel around it.
+
         Args:
             about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
                 the surface's reference point where it is now: a tool's moment is about the point it turns about.
@@ -226,12 +228,13 @@ class ContactResults:
         if on == "target":
             x, f = p.foot, -f
             centre = target.reference(g) if about is None else centre
-        return sum_up(self.config.comm, x - centre, f)
+        return sum_up(self.config.comm, self.config.whole(x) - centre, self.config.whole(f))
 
     def balance(self) -> Balance | None:
         """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
 
-        The contactors' forces come from the residual, the target's from handing them on to its nodes.
+        The contactors' forces come from the residual, the target's from handing them on to its nodes. Of axisymmetric bodies the forces
+        along the axis count.
 
         Returns:
             Imbalances relative to the sums of absolute nodal forces and moments; None for a rigid target, which has no nodes.
@@ -239,7 +242,8 @@ class ContactResults:
         if self.pair.target.n_nodes == 0:
             return None
         n, g = self.config.n_owned, self.config.gdim
-        return imbalance(self.config.comm, self.config.x[:n], self.force.x.array.reshape(-1, g)[:n])
+        force = self.force.x.array.reshape(-1, g)[:n]
+        return imbalance(self.config.comm, self.config.whole(self.config.x[:n]), self.config.whole(force))
 
     def _field(self, what: str, values: npt.ArrayLike, vector: bool = False) -> fem.Function:
         config = self.config

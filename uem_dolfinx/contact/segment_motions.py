@@ -69,7 +69,7 @@ class Sides:
         ahead: along the side in that plane; zero in 2D ``(q, gdim)``.
         shift: change of the target's shape functions on this way ``(q, nt)``.
         cut: way along the side of the place where it leaves the contactor facet, per motion; zero elsewhere ``(q, gdim)``.
-        weight: of the quadrature, a length in 3D ``(q,)``.
+        weight: of the quadrature, a length in 3D, and of axisymmetric bodies ``2 pi r`` ``(q,)``.
         end: whether the target ends there ``(q,)``.
     """
 

@@ -79,11 +79,25 @@ class Contactors(OnTarget):
         out[:, ring] = 0.5 * cross_products(across, n[:, None])
         return out
 
+    def shares(self, size: Array, x: Array) -> Array:
+        """Integrals of the basis over facets of a ``size (m,)`` with nodes at ``x (m, nn, gdim)``: ``(m, nn)``."""
+        if self.config.axisymmetric:
+            return 2 * np.pi * size[:, None] * (x[:, :, 0] @ self.basis.products.T)
+        return size[:, None] * self.basis.mean
+
+    def share_slopes(self, facets: Ints, x: Array) -> Array:
+        """Derivatives of the ``shares`` of some facets by their nodes at ``x (m, nn, gdim)``: ``(m, nn, nn, gdim)``."""
+        size = Planes.of(self.surface.shape, x, self.surface.sign[facets]).size
+        out = (self.shares(size, x) / size[:, None])[:, :, None, None] * self.growth(facets, x)[:, None]
+        if self.config.axisymmetric:
+            out[..., 0] += 2 * np.pi * size[:, None, None] * self.basis.products
+        return out
+
     def stretch(self, facets: Ints, size: Array) -> Array:
         """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
-        dofs, mean = self.surface.dofs[facets], self.basis.mean
-        drawn = self.sizes(self.config.X[self.surface.dofs])[facets]
-        now, then = (self.config.to_owners(dofs.ravel(), (a[:, None] * mean).ravel())[self.nodes] for a in (size, drawn))
+        dofs, X = self.surface.dofs[facets], self.config.X[self.surface.dofs]
+        shares = self.shares(size, self.surface.x[facets]), self.shares(self.sizes(X), X)[facets]
+        now, then = (self.config.to_owners(dofs.ravel(), own.ravel())[self.nodes] for own in shares)
         return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
 
 
@@ -306,13 +320,13 @@ class MortarStretching:
 
     @cached_property
     def _parts(self) -> tuple[tuple[Array, Array], ...]:
-        """Derivatives of the areas of facets ``(m, nn, gdim)``, and powers over their sums ``(n,)``: now and as drawn (collective)."""
+        """Derivatives of facets' shares ``(m, nn, nn, gdim)``, and powers over their sums ``(n,)``: now and as drawn (collective)."""
         of, parts = self.of, []
         dofs = of.surface.dofs[self.facets]
         for x, sign in ((of.config.x[dofs], 1.0), (of.config.X[dofs], -1.0)):
             size = Planes.of(of.surface.shape, x, of.surface.sign[self.facets]).size
-            whole = of.config.to_owners(dofs.ravel(), (size[:, None] * of.basis.mean).ravel())[of.nodes]
-            parts.append((of.growth(self.facets, x), sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
+            whole = of.config.to_owners(dofs.ravel(), of.shares(size, x).ravel())[of.nodes]
+            parts.append((of.share_slopes(self.facets, x), sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
         return tuple(parts)
 
     def along(self, now: Array, drawn: Array) -> Array:
@@ -320,7 +334,7 @@ class MortarStretching:
         of, found = self.of, np.zeros(len(self.power))
         dofs = of.surface.dofs[self.facets]
         for (slopes, over), moved in zip(self._parts, (now, drawn)):
-            change = np.einsum("mag,mag->m", slopes, moved[dofs])[:, None] * of.basis.mean
+            change = np.einsum("mbag,mag->mb", slopes, moved[dofs])
             found += over * of.config.to_owners(dofs.ravel(), change.ravel())[of.nodes]
         return found
 
@@ -330,6 +344,6 @@ class MortarStretching:
         dofs = of.surface.dofs[self.facets]
         for slopes, over in self._parts:
             at = of.config.from_owners(of.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
-            values = (at @ of.basis.mean)[:, None, None] * slopes
-            found.append(of.config.add_at_owners(of.config.to_global(dofs.ravel()), values.reshape(-1, slopes.shape[2])))
+            values = np.einsum("mb,mbag->mag", at, slopes)
+            found.append(of.config.add_at_owners(of.config.to_global(dofs.ravel()), values.reshape(-1, of.config.gdim)))
         return found[0], found[1]

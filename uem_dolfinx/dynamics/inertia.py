@@ -21,7 +21,8 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
-from uem_dolfinx.errors import InputTypeError, LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.errors import InputError, InputTypeError, LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
@@ -120,6 +121,8 @@ class Dynamics:
         self._held = np.zeros(self._n, dtype=bool)
         with agreed(config.comm):
             self._down = np.zeros(g) if self.gravity is None else given.vector("gravity", self.gravity, g)
+            if config.axisymmetric and self._down[0] != 0.0:
+                raise InputError(given.sentence("gravity", self._down, "no radial component, as bodies are axisymmetric"))
         given.alike(
             config.comm, "Dynamics", gravity=self._down, time=self.time, contactors=self.contactors, scheme=str(self.scheme)
         )
@@ -133,7 +136,7 @@ class Dynamics:
             with agreed(config.comm):
                 if form is None:
                     raise InputTypeError("damping(v) = None: expected a UFL form, linear in the test function; return it")
-            self.damping_form = form
+            self.damping_form = revolved(form) if isinstance(form, ufl.Form) else form
         return self.damping_form
 
     def _set_velocity(self) -> None:
@@ -346,9 +349,9 @@ class Dynamics:
         return self._weight.copy()
 
     def momentum(self) -> Array:
-        """Momentum ``(gdim,)`` (collective)."""
+        """Momentum ``(gdim,)``, of axisymmetric bodies that along the axis (collective)."""
         p = self.mass.M * self._like(self.velocity.x.array[: self._n])
-        return np.asarray(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
+        return self.config.whole(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2`` (collective)."""

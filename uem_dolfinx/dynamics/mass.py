@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import MassError, SpaceError
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.geometry.configuration import Configuration, configuration_of
@@ -88,7 +89,7 @@ class Mass:
         """Centre of all mass as the bodies are drawn, components taken together ``(gdim,)``; NaN without mass (collective)."""
         m = self._row_sums.sum(axis=1)
         sums = reduced(self.config.comm, np.append(m @ self._X, m.sum()))
-        return np.asarray(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
+        return self.config.whole(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
 
     def rigid(self) -> Array:
         """What each body's rigid motions feel of M ``(n_bodies, n_rigid, n_rigid)`` (collective).
@@ -328,7 +329,7 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     with timed("assemble mass"):
         density = _density(config, rho)
         _cell_masses(config, density)
-        a = forms.form(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx)
+        a = forms.form(revolved(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx))
         M = forms.create_matrix(a)
         forms.assemble_matrix(M, a)
     return Mass(M, config, diagonal=False)
@@ -351,7 +352,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     config = configuration_of(V)
     with timed("assemble mass"):
         density = _density(config, rho)
-        rows = forms.assemble_array(V, forms.form(density * sum(ufl.TestFunction(V)) * ufl.dx)).reshape(-1, config.gdim)[:, 0]
+        rows = forms.assemble_array(V, forms.form(revolved(density * ufl.TestFunction(V)[0] * ufl.dx)))[:: config.gdim]
         of_cells = _cell_masses(config, density)
         cell = compat.cell_name(config.mesh)
         points, weights = forms.quadrature_rule(cell, 2 * config.degree)
@@ -424,13 +425,12 @@ def _cell_masses(config: Configuration, density: Any) -> Array:
     """Masses of the owned cells ``(n_cells,)``, refused if they cannot be (collective)."""
     S = compat.function_space(config.mesh, ("DG", 0))
     n_cells = config.mesh.topology.index_map(config.tdim).size_local
-    of_dofs = forms.assemble_array(S, forms.form(density * ufl.TestFunction(S) * ufl.dx))
+    of_dofs = forms.assemble_array(S, forms.form(revolved(density * ufl.TestFunction(S) * ufl.dx)))
     masses = of_dofs[compat.cell_dofs(S)[:n_cells, 0]]
     wrong, error = np.flatnonzero(~((masses >= 0) & np.isfinite(masses))), None
     if len(wrong):
         where = ", ".join(f"{c:.6g}" for c in config.X[compat.cell_dofs(config.V)[wrong[0]]].mean(axis=0))
-        found = f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}"
-        error = MassError(f"{found}: give a density that is finite and not negative")
+        error = MassError(f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}: give one that is finite and not negative")
     agree(config.comm, error)
     return masses
 

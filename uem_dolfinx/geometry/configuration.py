@@ -15,6 +15,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.bodies import rigid_velocities
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
@@ -44,6 +45,8 @@ class Configuration(Nodes):
         if degree > 2:
             raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
         super().__init__(V)
+        #: Whether the coordinates are radius and height, and nodes stand for circles.
+        self.axisymmetric: bool = is_axisymmetric(V.mesh)
 
     @property
     def displacement(self) -> Array:
@@ -76,6 +79,10 @@ class Configuration(Nodes):
         if centred:
             x = (x - reduced(self.comm, x.sum(axis=0)) / self.index_map.size_global) / self.size
         return rigid_velocities(x)
+
+    def whole(self, vectors: Array) -> Array:
+        """Forces, momenta or places of nodes ``(..., gdim)`` as those of all that they stand for: around an axis radial parts cancel."""
+        return vectors * np.array([0.0, 1.0]) if self.axisymmetric else vectors
 
     @cached_property
     def size(self) -> float:

@@ -13,6 +13,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.tags import Tag
@@ -46,6 +47,8 @@ class Areas:
             n = ufl.cofac(F) * ufl.FacetNormal(self._config.mesh)
             # which is no polynomial
             stretch, metadata = ufl.sqrt(ufl.dot(n, n)), {"quadrature_degree": 2 * self._config.degree + 1}
+        if self._config.axisymmetric:
+            stretch = stretch * circumference(self._config.mesh, self._config.u if current else None)
         return q * stretch * forms.surface_measure(self._config.mesh, self._tag.entities, metadata)
 
     def _integrals(self, current: bool) -> Any:

@@ -1,4 +1,4 @@
-"""Elastic laws in UFL: stored energy, stress and internal virtual work, in 3D, plane strain and plane stress.
+"""Elastic laws in UFL: stored energy, stress and internal virtual work, in 3D, plane strain, plane stress and axisymmetry.
 
 A convenience: the united solver takes any UFL residual.
 """
@@ -17,9 +17,10 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.axisymmetry import displacement_gradient, is_axisymmetric
 from uem_dolfinx.parallel import agree
 
-KINDS = ("3d", "plane_strain", "plane_stress")
+KINDS = ("3d", "plane_strain", "plane_stress", "axisymmetric")
 #: Poisson's ratios of bodies that resist every strain.
 POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.4999, with residual_form")
 
@@ -31,7 +32,8 @@ class Elastic(ABC):
     Attributes:
         E: Young's modulus, a force per area: a number, a Constant, a Function or any UFL expression.
         nu: Poisson's ratio, likewise.
-        kind: ``"3d"``, ``"plane_strain"`` or ``"plane_stress"``.
+        kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh that has been declared so: strains and
+            stresses are ``(3, 3)`` then, in the order r, z and around the axis.
 
     Raises:
         InputError, InputTypeError: for an unknown kind, E that is not positive and finite, or nu that is not between -1 and 1/2. Values
@@ -63,12 +65,9 @@ class Elastic(ABC):
         return 2 * self.mu * self.lam / (self.lam + 2 * self.mu) if self.kind == "plane_stress" else self.lam
 
     def _check(self, u: Any) -> Any:
-        """Identity of the displacement's dimension, which must fit the kind."""
-        gdim = len(given.kind("u", u, isinstance(u, Expr) and len(u.ufl_shape) == 1, "a displacement, as a Function"))
-        if (gdim == 3) != (self.kind == "3d"):
-            fitting = "'3d'" if gdim == 3 else "'plane_strain' or 'plane_stress'"
-            raise InputError(f"kind = '{self.kind}' does not fit a displacement with {gdim} components: expected {fitting}")
-        return ufl.Identity(gdim)
+        """Identity of the strain's dimension; the displacement must fit the kind."""
+        check_kind(self.kind, given.kind("u", u, isinstance(u, Expr) and len(u.ufl_shape) == 1, "a displacement, as a Function"))
+        return ufl.Identity(3 if self.kind == "axisymmetric" else len(u))
 
     @abstractmethod
     def _energies(self, u: Any) -> tuple[Expr, Expr]:
@@ -92,11 +91,11 @@ class Elastic(ABC):
         return self._first_piola(u, self.stress(u))
 
     def _first_piola(self, u: Any, stress: Any) -> Expr:
-        return (self._check(u) + ufl.grad(u)) * stress
+        return (self._check(u) + displacement_gradient(u)) * stress
 
     def residual(self, u: Any, v: Any) -> Expr:
         """Internal virtual work per reference volume, to be integrated with ``dx``."""
-        return ufl.inner(self.first_piola(u), ufl.grad(v))
+        return ufl.inner(self.first_piola(u), displacement_gradient(v))
 
     def residual_form(self, u: fem.Function, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
         """Internal virtual work of bodies that hardly change their volume, whose cells do not lock as nu approaches 1/2.
@@ -112,9 +111,9 @@ class Elastic(ABC):
             dx: measure of the body's cells.
 
         Raises:
-            InputError: for simplices of degree 1, which lock with one point.
+            InputError: for simplices of degree 1, which lock with one point, and axisymmetric cells of degree 1, where one is not enough.
         """
-        shear, volume = (ufl.inner(self._first_piola(u, part), ufl.grad(v)) for part in self._stresses(u))
+        shear, volume = (ufl.inner(self._first_piola(u, part), displacement_gradient(v)) for part in self._stresses(u))
         return self._integrated(shear, volume, u, dx)
 
     def energy_form(self, u: fem.Function, dx: ufl.Measure = ufl.dx) -> ufl.Form:
@@ -134,11 +133,11 @@ class Elastic(ABC):
         V = given.kind("u", u, isinstance(u, fem.Function), "the displacement, whose degree tells the points").function_space
         cell, degree = compat.cell_name(V.mesh), compat.lagrange_degree(V) or 0
         simplex = cell in ("triangle", "tetrahedron")
-        if simplex and degree == 1:
-            raise InputError(
-                f"residual_form: cells of type {cell} and degree 1 lock where the volume hardly changes, with one point as well: take "
-                "degree 2, or quadrilaterals or hexahedra"
-            )
+        if degree == 1 and (simplex or self.kind == "axisymmetric"):
+            lock = "lock where the volume hardly changes, with one point as well"
+            why = lock if simplex else "do not pass the patch test near the axis with one point"
+            remedy = "degree 2" if self.kind == "axisymmetric" else "degree 2, or quadrilaterals or hexahedra"
+            raise InputError(f"residual_form: cells of type {cell} and degree 1 {why}: take {remedy}")
         return dx(degree=1 if simplex else 2 * degree - 1)
 
 
@@ -149,7 +148,7 @@ class LinearElastic(Elastic):
     def strain(self, u: Any) -> Expr:
         """Symmetric gradient."""
         self._check(u)
-        return ufl.sym(ufl.grad(u))
+        return ufl.sym(displacement_gradient(u))
 
     def _energies(self, u: Any) -> tuple[Expr, Expr]:
         """``mu eps:eps + lambda/2 tr(eps)^2``."""
@@ -183,7 +182,7 @@ class StVenantKirchhoff(Elastic):
     def _stresses(self, u: Any) -> tuple[Expr, Expr]:
         """Second Piola-Kirchhoff stress."""
         E = self.strain(u)
-        return 2 * self.mu * E, self.lam_in_plane * ufl.tr(E) * ufl.Identity(len(u))
+        return 2 * self.mu * E, self.lam_in_plane * ufl.tr(E) * self._check(u)
 
 
 @dataclass(frozen=True)
@@ -198,20 +197,20 @@ class NeoHooke(Elastic):
         """``J^2 - 1``, from the strain itself lest small strains drown in rounding."""
         E = green_lagrange(u)
         second = (ufl.tr(E) ** 2 - ufl.inner(E, E)) / 2
-        change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if len(u) == 3 else 0)
+        change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if E.ufl_shape == (3, 3) else 0)
         return self.mu * change / (self.mu + self.lam / 2 * (1 + change)) if self.kind == "plane_stress" else change
 
     def _energies(self, u: Any) -> tuple[Expr, Expr]:
         """``mu/2 (tr C - 3 - 2 ln J) + lambda/4 (J^2 - 1 - 2 ln J)``."""
-        F = self._check(u) + ufl.grad(u)
+        F = self._check(u) + displacement_gradient(u)
         JJ = 1 + self._volume_change(u)
-        across = JJ / ufl.det(F) ** 2 if len(u) == 2 else 0.0
+        across = JJ / ufl.det(F) ** 2 if F.ufl_shape == (2, 2) else 0.0
         return self.mu / 2 * (ufl.inner(F, F) + across - 3 - ufl.ln(JJ)), self.lam / 4 * (JJ - 1 - ufl.ln(JJ))
 
     def _stresses(self, u: Any) -> tuple[Expr, Expr]:
         """Second Piola-Kirchhoff stress ``mu (I - C^-1) + lambda/2 (J^2 - 1) C^-1``."""
         E = green_lagrange(u)
-        C_inverse = ufl.inv(ufl.Identity(len(u)) + 2 * E)
+        C_inverse = ufl.inv(ufl.Identity(E.ufl_shape[0]) + 2 * E)
         return 2 * self.mu * C_inverse * E, self.lam / 2 * self._volume_change(u) * C_inverse
 
 
@@ -236,8 +235,23 @@ def check_parameter(what: str, value: Any, within: given.Range) -> None:
 
 def green_lagrange(u: Any) -> Expr:
     """Green-Lagrange strain; ``F'F - I`` would lose strains below the rounding of 1."""
-    G = ufl.grad(u)
+    G = displacement_gradient(u)
     return (G + G.T + G.T * G) / 2
+
+
+def check_kind(kind: str, u: Any) -> None:
+    """Refuse a kind that does not fit a displacement, by its number of components and by whether its mesh is axisymmetric.
+
+    Raises:
+        InputError: with the kinds that fit.
+    """
+    if (len(u) == 3) != (kind == "3d"):
+        fitting = "'3d'" if len(u) == 3 else "'plane_strain', 'plane_stress' or 'axisymmetric'"
+        raise InputError(f"kind = '{kind}' does not fit a displacement with {len(u)} components: expected {fitting}")
+    if is_axisymmetric(u) != (kind == "axisymmetric"):
+        told = "has not been declared" if kind == "axisymmetric" else "has been declared axisymmetric"
+        remedy = "call uem.axisymmetric(mesh) first" if kind == "axisymmetric" else "take kind = 'axisymmetric'"
+        raise InputError(f"kind = '{kind}' does not fit the displacement's mesh, which {told}: {remedy}")
 
 
 def material_of(f: Any) -> Any:

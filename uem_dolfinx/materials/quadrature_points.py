@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.geometry.axisymmetry import circumference, is_axisymmetric
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.log import compiling
 from uem_dolfinx.parallel import reduced
@@ -46,7 +47,7 @@ class QuadraturePoints:
     Attributes:
         points: on the reference cell, ``(n_points, tdim)``.
         dx: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless others write there.
-        volumes: that belong to the points, ``(n_cells, n_points)``.
+        volumes: that belong to the points, of whole circles if the mesh is axisymmetric, ``(n_cells, n_points)``.
     """
 
     def __init__(self, domain: Any, cells: Indices, degree: int):
@@ -63,6 +64,8 @@ class QuadraturePoints:
         self.dx = ufl.dx(domain=domain, metadata=metadata)
         jacobian = self.evaluate(self.compile(ufl.JacobianDeterminant(domain)))
         self.volumes: Array = np.abs(jacobian.reshape(len(cells), len(weights))) * weights
+        if is_axisymmetric(domain):
+            self.volumes *= self.evaluate(self.compile(circumference(domain))).reshape(self.volumes.shape)
 
     def compile(self, expression: Any) -> fem.Expression:
         """Prepare a scalar or vector UFL expression for ``evaluate``; once, as it takes a compiler."""

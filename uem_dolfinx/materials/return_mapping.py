@@ -23,7 +23,7 @@ MAX_STEPS = 50
 class Returned:
     """Stress, history and tangent after a return, at n points.
 
-    Vectors hold the k components (11, 22, sqrt(2) 12) in plane stress, (11, 22, 33, sqrt(2) 12) in plane strain and
+    Vectors hold the k components (11, 22, sqrt(2) 12) in plane stress, (11, 22, 33, sqrt(2) 12) in plane strain and axisymmetry, and
     (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product is that of the tensors.
 
     Attributes:
@@ -52,7 +52,7 @@ class Returned:
 def radial_return(
     strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array
 ) -> Returned:
-    """Return of the deviator along its own direction, for 3D and plane strain (Simo and Hughes, Computational Inelasticity, box 3.2).
+    """Return of the deviator along its own direction, except in plane stress (Simo and Hughes, Computational Inelasticity, box 3.2).
 
     Strains ``(n, k)``, ``plastic_strain`` and ``peeq (n,)`` the committed ones, have components as in ``Returned``, here k = 4 or 6;
     parameters are ``(n,)``: shear modulus, ``yield_stress`` at no plastic strain, infinite where elastic, and ``hardening``, its

@@ -13,6 +13,7 @@ from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.form_checks import check_functional, check_linear
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.log import logger
 from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
@@ -87,7 +88,7 @@ class EnergyBook(Closing):
                 check_functional("stored", stored, problem.config.mesh)
             if stored is not None and problem.u not in stored.coefficients():
                 raise SpaceError("stored does not depend on the problem's displacement: expected the energy of its u")
-        works = stored, external, self.dynamics.damping_form
+        works = *(None if work is None else revolved(work) for work in (stored, external)), self.dynamics.damping_form
         self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
         #: Rows written, in order.
         self.rows: list[Energies] = []

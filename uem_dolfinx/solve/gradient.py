@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_functional
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodySystem
@@ -60,7 +61,7 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
     from uem_dolfinx.solve.adjoint import Adjoint, Linearised
 
     with Linearised(problem) as linearised:
-        adjoint = Adjoint(linearised, J, pressing)
+        adjoint = Adjoint(linearised, revolved(J), pressing)
         return [adjoint.by(m) for m in some]
 
 

@@ -17,6 +17,7 @@ from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
@@ -46,7 +47,7 @@ class UnitedProblem:
 
     Args:
         F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
-            forces are added by ``dynamics``.
+            forces are added by ``dynamics``. On a mesh declared ``axisymmetric`` it is integrated over whole circles.
         u: displacement, a Function of a vector Lagrange space; holds the solution.
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
@@ -132,6 +133,7 @@ class UnitedProblem:
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")
+        F = revolved(F)
         #: What the bodies do without contact.
         self.bodies = Bodies(
             self.config,
@@ -375,7 +377,8 @@ class UnitedProblem:
         """Force with which the Dirichlet conditions act on the nodes of a part of the mesh: their sum ``(gdim,)`` (collective).
 
         Args:
-            tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero.
+            tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero. Of
+                axisymmetric bodies radial forces cancel around the axis.
         """
         self.bodies.assemble()
         tdim, shape = self.config.tdim, (-1, self.config.gdim)
@@ -383,7 +386,8 @@ class UnitedProblem:
         force = self.bodies.residual.array_r.reshape(shape)[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(shape)[nodes]
-        return np.sum(self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0)), axis=0)
+        sums = self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0))
+        return self.config.whole(np.sum(sums, axis=0))
 
     @property
     def pairs(self) -> list[Interface]:

@@ -56,6 +56,8 @@ class RigidMotions:
         np.maximum.at(radius, own, np.linalg.norm(config.X[: config.n_owned] - self.middle[own], axis=1))
         self.comm.Allreduce(MPI.IN_PLACE, radius, op=MPI.MAX)
         self.radius: Array = radius
+        #: Modes that are no motions of rigid bodies: of axisymmetric ones all but the shift along the axis.
+        self._strained = [0, 2] if config.axisymmetric else []
         self._supports: tuple[Array, Bools] | None = None
         #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; where bodies turn little always the same.
         self._unheld: Any | None = None
@@ -76,7 +78,9 @@ class RigidMotions:
 
     def _modes(self, x: Array, body: Ints) -> Array:
         """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each of their own modes ``(n, n_modes, gdim)``."""
-        return rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
+        modes = rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
+        modes[:, self._strained] = 0.0
+        return modes
 
     @property
     def n_modes(self) -> int:
@@ -124,7 +128,10 @@ class RigidMotions:
             self.middle = self._middles()
         if self.finite or self._unheld is None:
             body, modes, _ = self._held()
-            values, vectors = np.linalg.eigh(reduced(self.comm, self._products(body, modes, modes)))
+            resisted = reduced(self.comm, self._products(body, modes, modes))
+            # the bodies resist them themselves
+            resisted[:, self._strained, self._strained] = 1.0
+            values, vectors = np.linalg.eigh(resisted)
             b, k = np.nonzero(values < OPEN**2)
             self._unheld = self._spread(vectors[b, :, k], b).T.tocsr()
         free = self._unheld

@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
@@ -39,7 +40,7 @@ class Tangent:
     def __init__(self, F: ufl.Form, u: fem.Function, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None):
         J = ufl.derivative(F, u)
         for material in materials:
-            J += material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0])
+            J += revolved(material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0]))
         J = ufl.algorithms.expand_derivatives(J)
         if J.empty():
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
@@ -175,7 +176,8 @@ class Inversions:
 
     def __init__(self, config: Configuration):
         self.config = config
-        self._J = ufl.det(ufl.Identity(config.gdim) + ufl.grad(config.u))
+        G = displacement_gradient(config.u)
+        self._J = ufl.det(ufl.Identity(G.ufl_shape[0]) + G)
         one = fem.Constant(config.mesh, 1.0)
         with compiling("the search for cells turned inside out"):
             self._volume = forms.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
