@@ -122,7 +122,14 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
 
 
 def lever(contact: uem.Contact) -> float:
-    """Bound on the moment that a contact leaves behind: friction of mortar acts where gaps vanish in the mean, not everywhere."""
+    """Bound on the moment that a contact leaves behind: friction of mortar acts where gaps vanish in the mean, not everywhere.
+
+    Friction and corners push at the foot, from which an offset holds contactors off.
+    """
+    pair = contact.pair
+    sideways = pair.frictional or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
+    if pair.projection.offset is not None and sideways:
+        return np.inf
     return 1e-7 if contact.pair.frictional and not contact.pair.discretisation.at_feet else 1e-11
 
 

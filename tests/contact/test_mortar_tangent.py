@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 from mpi4py import MPI
 
 import numpy as np
@@ -77,23 +79,34 @@ def leaning(b, cell):
         disturbed(b, 2, 0.01)
 
 
-def weighted_gap(cell, target, hollow=None):
-    """Of blocks that lean, above a mesh, above one that ends over a facet, or above a rigid ball; of rings with a radius ``hollow``."""
+def weighted_gap(cell, target, hollow=None, offset=0.0):
+    """Of leaning blocks above a mesh, one that ends over a facet, or a rigid ball; of rings with a radius ``hollow``; with an offset."""
     b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, hollow=hollow, contactor=(
         "lower" if target == "end" else "upper"
     ))  # fmt: skip
     if target == "ball":
         b.contact = uem.Contact(b.high, uem.RigidSphere([0.4 + (hollow or 0.0)] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
+    b.contact.offset = offset
     problem = b.pressed()
     leaning(b, cell)
     return WeightedGap(b, problem.system)
 
 
-@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
-@pytest.mark.parametrize("cell", CELLS)
-def test_rows_are_derivatives_of_the_gaps(cell, target):
+def varying(x):
+    """An offset that varies from place to place."""
+    return 0.03 + 0.02 * x[0]
+
+
+SCENES = [
+    *product(CELLS, ("mesh", "ball", "end"), (0.0,)),
+    *product(("triangle", "tetrahedron"), ("mesh", "ball", "end"), (varying,)),
+]
+
+
+@pytest.mark.parametrize("cell,target,offset", SCENES)
+def test_rows_are_derivatives_of_the_gaps(cell, target, offset):
     """What rows are made of against central differences of the weighted gaps, also where the target ends over a facet."""
-    phi = weighted_gap(cell, target)
+    phi = weighted_gap(cell, target, offset)
     phi.leave_out(target)
     first = phi.forces(phi.start)
     for way, (ahead, behind), h in phi.ways(cell):
@@ -101,11 +114,10 @@ def test_rows_are_derivatives_of_the_gaps(cell, target):
         assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
 
 
-@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
-@pytest.mark.parametrize("cell", CELLS)
-def test_curvature_against_differences(cell, target):
+@pytest.mark.parametrize("cell,target,offset", SCENES)
+def test_curvature_against_differences(cell, target, offset):
     """Blocks of the curvature against central differences of the nodal forces at constant multipliers."""
-    phi = weighted_gap(cell, target)
+    phi = weighted_gap(cell, target, offset)
     rows = phi.leave_out(target)
     parts = curvature(rows.points, phi.pressure)
     assert all(np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0 for _, blocks in parts)

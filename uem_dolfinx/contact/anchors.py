@@ -29,7 +29,7 @@ def anchored(
         kept_feet: whether feet stay where they were at the start of the step, so that contactors leave them behind.
     """
     p = kinematics.projection
-    below = points - p.gap[:, None] * p.normal
+    below = points - p.height[:, None] * p.normal
     if not target.n_nodes:
         motion: Motion | None = target.motion
         here = below if motion is None else motion.back(below)

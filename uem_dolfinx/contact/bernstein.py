@@ -79,6 +79,13 @@ class Family:
         none = np.zeros(len(i), dtype=bool)
         return ControlGaps(self, ~alone[i], none, gap, normal, targets, weights).with_active(active)
 
+    def spread(self, values: Array) -> Array:
+        """Integrals of Bernstein's basis times what ``values (n,)`` are integrals of with the shape functions (collective)."""
+        k, g = len(self.child), self.config.gdim
+        none: Bools = np.zeros(k, dtype=bool)
+        all_shared = ControlGaps(self, ~none, none, np.zeros(k), np.zeros((k, g)), np.zeros((k, 0), np.int64), np.zeros((k, 0)))
+        return all_shared.areas(values)
+
 
 @dataclass(frozen=True)
 class ControlGaps:

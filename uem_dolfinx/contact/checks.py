@@ -74,8 +74,10 @@ def check_initial(pair: Interface) -> None:
 def check_prescribed(pair: Interface) -> None:
     """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
 
+    Or away from where it is tied.
+
     Raises:
-        ConflictError: naming the deepest such node of the first rank that has one.
+        ConflictError: naming the deepest or farthest such node of the first rank that has one.
     """
     left_out = pair.trial.active & pair.redundant
     depth = -pair.projection.gap / pair.config.size
@@ -87,6 +89,13 @@ def check_prescribed(pair: Interface) -> None:
             f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
             f"{-pair.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
+        )
+    torn = pair.torn()
+    if torn.max(initial=0.0) > LEFT_OUT * pair.config.size:
+        i = int(torn.argmax())
+        error = ConflictError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is held {torn[i]:.4g} away from where it is tied, "
+            "by Dirichlet conditions or other contacts on both sides of the tie, and neither can give way: release one of them"
         )
     agree(pair.config.comm, error)
 

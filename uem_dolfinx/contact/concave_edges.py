@@ -48,6 +48,8 @@ class ConcaveEdges:
         self.config, self.target, self.free = config, target, free
         #: Coefficients of friction of the contactors ``(n,)``.
         self.mu: Array = np.zeros(len(free))
+        #: How far from the facets contactors are held ``(n,)``; None on them.
+        self.offset: Array | None = None
 
     def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
         """Put contactors that a corner holds into it, and give those that change facets too often averaged normals (collective).
@@ -88,7 +90,8 @@ class ConcaveEdges:
         if reduced(self.config.comm, len(i)):
             own = self.target.project_on(points[i], state.facet[i])
             own = replace(own, normal=self.target.outward(own))
-            own = replace(own, gap=np.einsum("ng,ng->n", own.normal, points[i] - own.foot))
+            height = np.einsum("ng,ng->n", own.normal, points[i] - own.foot)
+            own = replace(own, gap=height if self.offset is None else height - self.offset[i])
             nearest = nearest.with_those(i, own)
         return nearest, *self.place(nearest, points, state)
 
@@ -164,7 +167,8 @@ class ConcaveEdges:
 
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
         """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
-        return find_corners(self.config.comm, self.target, points[which], which, np.column_stack([state.facet[which], others]))
+        c = find_corners(self.config.comm, self.target, points[which], which, np.column_stack([state.facet[which], others]))
+        return c if c is None or self.offset is None else replace(c, offset=self.offset[which])
 
     def _can_be_held(self, c: Corners) -> Bools:
         """Corners whose contactor has a free direction for every facet ``(k,)``."""
@@ -177,6 +181,8 @@ def with_averaged_normals(nearest: Projection, which: Bools, points: Array) -> F
     """The projection with averaged normals for some contactors ``(n,)`` at ``points (n, gdim)``."""
     p = cast("FacetProjection", nearest)
     gap = np.einsum("ng,ng->n", p.averaged, points - p.foot)
+    if p.offset is not None:
+        gap -= p.offset
     return replace(p, normal=np.where(which[:, None], p.averaged, p.normal), gap=np.where(which, gap, p.gap))
 
 

@@ -15,7 +15,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, parameters, values_at
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_field, given_friction, parameters, values_at
 from uem_dolfinx.contact.results import ContactResults
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -29,6 +29,9 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.mortar import Mortar
+    from uem_dolfinx.contact.offsets import Offsets
+    from uem_dolfinx.contact.sliding import Sliding
     from uem_dolfinx.contact.target_corners import CornerInside
 
 #: Default bound on the initial penetration, as part of the model's size.
@@ -38,8 +41,9 @@ BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size
 #: What there is to be set; the first two are the contact's own.
 SETTINGS = (
     "taken", "config", "contactor", "target", "coupling", "sliding", "normals", "max_penetration", "thickness", "chords", "friction",
-    "measure", "name",
+    "measure", "name", "tied", "offset", "adjust",
 )  # fmt: skip
+REACH = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
@@ -63,6 +67,16 @@ class Contact(ContactResults):
             same law; all else is settled once a problem has been made.
         measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
             small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
+        tied: True unites contactors that are within reach of the target with it, in all components and for good: they never open and never
+            slip, whatever pulls; gaps are kept, and turn with the target. What is out of reach stays in contact. ``"after"`` is contact
+            until :meth:`tie` is called.
+        offset: a length, or a function of place as of ``friction``, by which both surfaces together are taken to be thicker than drawn:
+            gaps are less by so much. Where surfaces coincide a positive offset is an interference, a negative one a clearance. It may be
+            set anew between steps, or by the function of the load factor that a problem gets as ``load``.
+        adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``): contactors that are no
+            farther from the target at the start, or no deeper inside, are taken to touch it, free of stress. The mesh stays as it is:
+            each contactor's height is part of its offset from then on; :attr:`adjusted` tells the largest. What is tied keeps its
+            gap, and ``adjust`` is the reach of the tie, which is True without.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -85,6 +99,9 @@ class Contact(ContactResults):
         normals: str = "facet",
         max_penetration: float | None = None,
         thickness: float | None = None,
+        tied: bool | str = False,
+        offset: Field = 0.0,
+        adjust: float | bool = False,
         chords: bool = False,
         friction: Field | FrictionLaw = 0.0,
         measure: str = "reference",
@@ -105,6 +122,16 @@ class Contact(ContactResults):
             chords = given.flag("chords", chords)
             self._friction = given_friction(friction)
             measure = given.word("measure", measure, ("reference", "current"))
+            tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
+            if not isinstance(adjust, (bool, np.bool_)):
+                adjust = given.number("adjust", adjust, REACH)
+            self._offset = given_field("offset", offset)
+            if tied is True and offset != 0.0:
+                raise InputError(
+                    "offset does not go with tied = True, which keeps the gaps that there are: leave one of them out"
+                )
+            if tied is True and as_law(friction).field != 0.0:
+                raise InputError("friction does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
             if coupling == "mortar" and (chords or normals != "facet"):
                 what = "chords = True" if chords else f"normals = '{normals}'"
                 raise InputError(
@@ -112,13 +139,14 @@ class Contact(ContactResults):
                 )
             given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
-        self.coupling, self.measure = coupling, measure
+        self.coupling, self.measure, self.tied, self.adjust = coupling, measure, tied, adjust
         self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
         self.taken = False
         self._pair: Interface | None = None
+        self._offsets: Offsets | None = None
         self._fields: dict[str, fem.Function] = {}
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -126,10 +154,10 @@ class Contact(ContactResults):
             called = f"contact '{self.name}'" if "name" in self.__dict__ else "a Contact"
             if name not in SETTINGS:
                 raise InputError(f"{called} has no '{name}' to be set: expected one of {', '.join(SETTINGS[2:])}")
-            if self.__dict__.get("taken") and name not in ("taken", "friction"):
+            if self.__dict__.get("taken") and name not in ("taken", "friction", "offset"):
                 raise InputError(
                     f"{called}: {name} = {given.shown(value)} comes too late, its problem has been made: make a new Contact, and a new "
-                    "problem of it; only friction may be set between steps"
+                    "problem of it; only friction and offset may be set between steps"
                 )
         super().__setattr__(name, value)
 
@@ -165,6 +193,45 @@ class Contact(ContactResults):
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
         self._friction = value
 
+    @property
+    def offset(self) -> Field:
+        """By how much both surfaces together are taken to be thicker than drawn; set anew it counts from the next step on (collective)."""
+        return self._offset
+
+    @offset.setter
+    def offset(self, value: Field) -> None:
+        if not self.taken:
+            self._offset = given_field("offset", value)
+            return
+        with agreed(self.config.comm):
+            value = given_field("offset", value)
+            if self.tied is True and value != 0.0:
+                raise InputError(
+                    f"contact '{self.name}': offset = {given.shown(value)} does not go with tied = True: leave it out"
+                )
+        given.alike(self.config.comm, f"contact '{self.name}'", offset=value)
+        self._offset = value
+        self._set_offset()
+        self.pair.project()
+
+    def _set_offset(self) -> None:
+        """Hand the present offset to the pair, if there has been any (collective)."""
+        if self._offsets is None and (callable(self._offset) or self._offset != 0.0):
+            from uem_dolfinx.contact.offsets import Offsets
+
+            self._offsets = Offsets(self.pair, self.name)
+        if self._offsets is not None:
+            self._offsets.set(self._offset)
+
+    @property
+    def adjusted(self) -> float:
+        """The largest distance by which ``adjust`` has taken contactors to be nearer to the target, a length (collective).
+
+        Of tied contactors it is the largest gap that is kept.
+        """
+        own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
+        return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
+
     def attach(self, config: Configuration, free: Bools) -> Interface:
         """Build the pair of this contact in a problem (collective).
 
@@ -186,7 +253,7 @@ class Contact(ContactResults):
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
-            friction=parameters(as_law(self.friction)), measure=self.measure,
+            friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -194,12 +261,15 @@ class Contact(ContactResults):
         how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
         discretisation: Discretisation
         # points have no facets to integrate over
+        means: Mortar | None = None
         if self.coupling == "mortar" and self.contactor.dim > 0:
             from uem_dolfinx.contact.mortar import Mortar
 
             surface = TargetFacets(config, self.contactor, "contactor")
             warn_of_slim_tips(config, self.name, surface)
             discretisation = Mortar(config, nodes, target, surface=surface, **how)
+            if self.tied and target.n_nodes:
+                means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"}))
         else:
             from uem_dolfinx.contact.bernstein import Bernstein
             from uem_dolfinx.contact.node_to_surface import NodeToSurface
@@ -218,9 +288,46 @@ class Contact(ContactResults):
                 config, nodes, discretisation, law=law, value=value, areas=lambda: self.surface.reference[nodes], free=free[nodes],
                 keeps_feet=self.sliding != "finite",
             )  # fmt: skip
-        self._pair = Interface(config, nodes, discretisation, friction, **of)
+        self._pair, self._offsets = self._interface(discretisation, means, friction, **of), None
+        if self.adjust and self.tied is not True:
+            from uem_dolfinx.contact.offsets import Offsets
+
+            self._offsets = Offsets(self._pair, self.name)
+            self._offsets.adjust(self.adjust)
+        self._set_offset()
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def _interface(self, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any) -> Interface:
+        """The pair, tied if it is from the start; ``means`` as of ``Tied`` (collective)."""
+        between = self.config, surface_nodes(self.config, self.contactor), discretisation, friction
+        if not self.tied:
+            return Interface(*between, **of)
+        from uem_dolfinx.contact.tied import Tied
+
+        pair = Tied(*between, means=means, reach=None if isinstance(self.adjust, bool) else self.adjust, **of)
+        if self.tied is True:
+            pair.project()
+            pair.tie()
+        return pair
+
+    def tie(self) -> None:
+        """Unite what touches now with the target for good, where it is, from the next step on; what does not stays in contact.
+
+        For contacts that were made with ``tied="after"``, between two steps (collective).
+
+        Raises:
+            InputError: for any other contact.
+            SurfaceError: if nothing touches.
+        """
+        if self.tied != "after":
+            raise InputError(f"contact '{self.name}': tie() is for contacts that are made with tied='after'")
+        from uem_dolfinx.contact.tied import Tied
+
+        pair = self.pair
+        assert isinstance(pair, Tied)
+        pair.tie(pair.committed.active)
+        pair.project()
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         """Owned contactor nodes, and what they may touch (collective)."""
@@ -245,9 +352,9 @@ class Contact(ContactResults):
 
     def look_at_ends(self) -> None:
         """Warn, once, if contactors have slid off the target's end since the start (collective)."""
-        gone = self.pair.off & ~self._off_at_start
+        gone = self.pair.off & ~self._off_at_start & ~self.pair.tied
         if not self._slipped and self.pair.target.n_nodes and reduced(self.config.comm, gone.any(), op=MPI.LOR):
-            self._slipped = warn_of_slipped(self.pair, self._off_at_start, self._areas)
+            self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
 
     def corner_inside(self, stiffness: Array | None) -> CornerInside | None:
         """A convex corner of the target inside the contactor by which the contact lacks force, or lacked it before (collective).

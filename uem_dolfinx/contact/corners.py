@@ -46,6 +46,7 @@ class Corners:
         x: positions of the nodes ``(k, nn, gdim)``.
         dN: derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``.
         ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
+        offset: how far from each facet contactors are held ``(k,)``; None on the facets.
     """
 
     which: Ints
@@ -62,6 +63,7 @@ class Corners:
     x: Array
     dN: Array
     ddN: Array
+    offset: Array | None = None
 
     @property
     def concave(self) -> Bools:
@@ -86,7 +88,8 @@ class Corners:
 
     def gaps(self, points: Array) -> Array:
         """Distances of ``points (k, gdim)`` from the shared place along the axes ``(k, gdim)``."""
-        return np.einsum("krg,kg->kr", self.axes, points - self.foot)
+        place = self.foot if self.offset is None else self.foot + self.offset[:, None] * self.summing
+        return np.einsum("krg,kg->kr", self.axes, points - place)
 
     def pulls(self, force: Array, mu: Array | float = 0.0) -> Array:
         """What each facet contributes to the contact forces, along its own outward normal.

@@ -87,7 +87,7 @@ class Covered:
         facet: of each pair ``(k,)``, ascending.
         D: of the functions ``(m, nn)``.
         M: of their products ``(m, nn, nn)``.
-        G: of their products with the gap ``(m, nn)``.
+        G: of their products with the gap, less the offset ``(m, nn)``.
         N: of their products with the target's shape functions, pair by pair ``(k, nn, nt)``.
         own: of their products with each other and with the gap, pair by pair ``(k, nn, nn + 1)``.
         full: of the functions over the whole facets ``(m, nn)``.
@@ -102,7 +102,9 @@ class Covered:
     full: Array
 
     @classmethod
-    def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array) -> Covered:
+    def of(
+        cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array, offset: Array | None = None
+    ) -> Covered:
         """Integrate.
 
         Args:
@@ -111,11 +113,14 @@ class Covered:
             N: the target's shape functions there ``(q, nt)``.
             facet: contactor facet of each pair ``(k,)``.
             full: of the functions b over the whole facets ``(m, nn)``.
+            offset: of the gap at the points ``(q,)``; None for none.
         """
         s, k, (m, nn) = segments, len(facet), full.shape
         weighted = s.weight[:, None] * b
         own = add_up(s.pair, products(weighted, np.column_stack([b, s.gap])), k)
         M, G = np.split(add_up(facet, own, m).reshape(m, nn, nn + 1), [nn], axis=2)
+        if offset is not None:
+            G = G - add_up(facet[s.pair], weighted * offset[:, None], m)[:, :, None]
         D = add_up(facet[s.pair], weighted, m)
         pairs = add_up(s.pair, products(weighted, N), k).reshape(k, nn, N.shape[1])
         return cls(facet, D, M, G[:, :, 0], pairs, own.reshape(k, nn, nn + 1), full)

@@ -20,6 +20,7 @@ from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.state import FrictionState, PairState
+from uem_dolfinx.contact.told import Told
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 POSITION_ROUNDING = 4.0 * np.finfo(float).eps
 
 
-class Interface:
+class Interface(Told):
     """Contactors against one target.
 
     Args:
@@ -57,6 +58,7 @@ class Interface:
         barred: contactors that came back into the target from past its end with a blow; they are left out until they are in front of it
             again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
+        tied: contactors that are united with the target in all components for good, beside contact ``(n,)``.
     """
 
     kinematics: Kinematics
@@ -80,7 +82,7 @@ class Interface:
         self.trial = self.committed = replace(state, friction=FrictionState.initial(n, g)) if friction else state
         self.initial_overlap, self.mutual = 0.0, False
         none: Bools = np.zeros(n, dtype=bool)
-        self.redundant = self.reserved = self.barred = none
+        self.redundant = self.reserved = self.barred = self.tied = none
 
     @property
     def frictional(self) -> bool:
@@ -155,11 +157,6 @@ class Interface:
             correction = correction + self.friction.return_vectors(self.trial)
         correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
         return correction
-
-    @property
-    def n_active(self) -> int:
-        """Number of active contactors over all ranks (collective)."""
-        return int(reduced(self.config.comm, int(self.trial.active.sum())))
 
     @property
     def pattern(self) -> Ints:
@@ -337,7 +334,7 @@ class Interface:
         """
         lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
         if lacks:
-            self.reserved = self.kinematics.near(self.trial) if known else self.trial.active.copy()
+            self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
         return own if self.friction is None else self.friction.equations(own, self.trial, self.kinematics)
 

@@ -34,12 +34,14 @@ class Traction(NamedTuple):
         nodal: of the node along the normal ``(n,)``.
         force: on the contactor ``(n, gdim)``.
         tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
+        bond: multipliers of tied contactors' equations ``(n, gdim)``; None where nothing is ever tied.
     """
 
     lam: Array
     nodal: Array
     force: Array
     tau: Array | None = None
+    bond: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,11 @@ class Constraints:
     def without_friction(cls, trial: UnitingEquations, test: UnitingEquations, contactor: Ints, kind: Ints) -> Constraints:
         """Equations across the target alone."""
         return cls(trial, test, test, trial, trial, contactor, kind, np.full(len(kind), -1))
+
+    @property
+    def tied(self) -> Bools:
+        """Which of the equations hold for good ``(m,)``."""
+        return np.zeros(len(self), dtype=bool)
 
     def across(self) -> Constraints:
         """The test rows across the target alone, without friction."""
@@ -256,6 +263,9 @@ class Discretisation(Protocol):
 
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take what gaps are less than heights ``(n,)``; contactors are to be placed again."""
 
     def begin_step(self) -> None:
         """A step begins, for the first time or anew; contactors are placed again."""

@@ -85,8 +85,13 @@ class Mortar(Contactors):
             rows = self._united[2]
         elif self._kept is None:
             nearest = self.take_feet(points)
-            rows = self._kept = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
-            self._kept_at = self.target.motion
+            rows = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
+            self._kept, self._kept_at = rows, self.target.motion
+            if self.offset is not None and not self.target.n_nodes:
+                # of heights over a rigid surface, which offsets are taken from anew
+                self._kept = replace(
+                    rows, equations=replace(rows.equations, gap=rows.equations.gap + self._weighted_offset(rows))
+                )
         else:
             nearest = self.on_target(points, self.anchor)
             rows = self._follow(self._kept, nearest)
@@ -118,8 +123,10 @@ class Mortar(Contactors):
             # what the nodes have come nearer, as a displacement along the rows
             lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
             way = np.zeros((n, self.config.gdim))
-            way[self.nodes] = ((nearest.gap - self.anchor.gap) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
+            way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
             gap = eq.gap + self.along(eq, way)
+        if self.offset is not None:
+            gap = gap - self._weighted_offset(rows)
         moved = replace(eq, gap=gap)
         return replace(rows, equations=moved, plain=moved, normal=eq.direction)
 
@@ -139,7 +146,7 @@ class Mortar(Contactors):
         """Equations of all contactors; ``before (m, nn)`` are shares of facets that the target covered before (collective)."""
         surface, config, nn = self.surface, self.config, self.surface.dofs.shape[1]
         x = surface.x
-        away = np.linalg.norm(points - nearest.foot, axis=1) if self.target.n_nodes else np.abs(nearest.gap)
+        away = np.linalg.norm(points - nearest.foot, axis=1) if self.target.n_nodes else np.abs(nearest.height)
         away = config.from_owners(self.nodes, away[:, None], surface.dofs.ravel())[:, 0].reshape(-1, nn)
         size = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) * 2
         near = np.ones(len(x), dtype=bool)
@@ -154,22 +161,48 @@ class Mortar(Contactors):
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
         segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
         b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
-        radius = None
+        radius, offset = None, None
         if config.axisymmetric:
             radius = np.einsum("qa,qa->q", phi, x[facets][pairs[segments.pair], :, 0])
             segments = replace(segments, weight=2 * np.pi * radius * segments.weight)
-        covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]))
-        dofs = surface.dofs[facets]
+        dofs, offsets = surface.dofs[facets], self._offsets(facets)
+        if offsets is not None:
+            offset = np.einsum("qa,qa->q", phi, offsets[pairs[segments.pair]])
+        covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]), offset)
         part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
         ratio = part / np.where(full > 0, full, 1.0)
-        duals = dual_functions(covered, self._precedence(ratio[dofs], dofs), before[facets])
+        duals = dual_functions(covered, self.precedence(ratio[dofs], dofs), before[facets])
         other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
             segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
-            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius,
+            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius, offsets,
         )  # fmt: skip
         rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
         return replace(rows, facing=facing)
+
+    def _offsets(self, facets: Ints) -> Array | None:
+        """Offsets at the nodes of facets ``(m, nn)``; None for none (collective)."""
+        if self.offset is None:
+            return None
+        dofs = self.surface.dofs[facets]
+        return self.config.from_owners(self.nodes, self.offset[:, None], dofs.ravel()).reshape(dofs.shape)
+
+    def _weighted_offset(self, rows: WeightedRows) -> Array:
+        """What the present offsets take from the gaps of rows, which may have been made with others ``(n,)`` (collective)."""
+        at, offsets = rows.points, self._offsets(rows.facets)
+        assert offsets is not None and self.offset is not None
+        coefficients = at.duals.C @ self.basis.T
+        weighted = np.einsum("mij,mj->mi", coefficients, offsets)
+        own = np.einsum("mii,mg->mig", coefficients, at.planes.normal)
+        parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, -1)
+        total = self.config.add_at_owners(at.nodes.ravel(), parts)[self.nodes]
+        length = np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
+        return np.where(rows.covered, total[:, 0] / length, self.offset)
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again."""
+        super().set_offset(offset)
+        self._united = None
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Segments against a mesh (collective)."""
@@ -206,7 +239,7 @@ class Mortar(Contactors):
         nodes, y = np.zeros((m, 0), np.int64), np.zeros((m, 0, g))
         return Pieces(s, np.arange(m), p.normal[i], none, nodes, y, p.hessians(i), np.zeros((0, 2), np.int64))
 
-    def _precedence(self, ratio: Array, dofs: Indices) -> Array:
+    def precedence(self, ratio: Array, dofs: Indices) -> Array:
         """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
 
         A node's equation may take in nodes that come after it, so that no equation follows itself: middles come before vertices.

@@ -75,8 +75,8 @@ class _Ends:
         """Of places on facets ``e (q,)``: ``l_f + w . b``, h ``(q,)``, how h changes with b ``(q, nc)``, and ``g - b . c`` ``(q,)``."""
         duals = self.at.duals
         fore, more, w, c = (values[e] for values in self._of_facets())
-        wb, left = np.einsum("qb,qb->q", w, s.b), s.gap - np.einsum("qb,qb->q", s.b, duals.gap[e])
-        h = fore * s.gap + np.einsum("qb,qb->q", more * s.b, c) + wb * left
+        wb, left = np.einsum("qb,qb->q", w, s.b), s.gap - s.offset - np.einsum("qb,qb->q", s.b, duals.gap[e])
+        h = fore * (s.gap - s.offset) + np.einsum("qb,qb->q", more * s.b, c) + wb * left
         return fore + wb, h, more * c + w * left[:, None] - wb[:, None] * c, left
 
     def _of_facets(self) -> tuple[Array, Array, Array, Array]:
@@ -94,11 +94,14 @@ class _Ends:
         press, h, with_b, _ = self._factors(e, s)
         v, grown = -s.way, s.motions.of_area(n / size[:, None])
         rise = s.motions.along(s.t - n) + 2 * s.gap[:, None, None] * grown
-        half = sum_of_products(s.pair, 0.5 * s.weight * press, v, rise, k)
-        half += sum_of_products(s.pair, s.weight * h, grown, v, k)
         # places on the contactor facet, and how the functions change there
         tab = at.shape.tabulate(s.xi)
         over = dual_tangents(tangents(tab, at.x[e]), n)
+        if at.offsets is not None:
+            for f, slope in enumerate(np.einsum("qaf,qa->fq", tab.dN, at.offsets[e])):
+                rise = rise + slope[:, None, None] * s.motions.along(over[:, f])
+        half = sum_of_products(s.pair, 0.5 * s.weight * press, v, rise, k)
+        half += sum_of_products(s.pair, s.weight * h, grown, v, k)
         of_b = np.einsum("qb,qbf->qf", with_b, np.einsum("qaf,ab->qbf", tab.dN, np.linalg.inv(basis_of(at.shape).T)))
         if at.radius is not None:
             # circles grow as the place goes outward, and with the nodes

@@ -6,6 +6,8 @@ minus its product with n, there is ``t . dy/deta = 0`` and ``t . n = -1``, so th
 
     d gap = t . (dx - dy + gamma da) + gamma n . da.
 
+An offset is part of what is open, and of no height: areas grow with gaps less it.
+
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
 in the second derivatives. The ends of the target move too, and dual functions with them (``mortar_ends``). Parts of quadratic
 facets do not all grow as these do, and change dual functions as ends do; second derivatives have what is of first order in them.
@@ -59,6 +61,7 @@ class SegmentPoints:
         sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
         shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
         radius: of the circles that points of axisymmetric bodies stand for, which their weights hold ``(q,)``; None of others.
+        offsets: of the gap at the contactor facets' nodes ``(m, nc)``; None for none.
     """
 
     segments: Segments
@@ -79,6 +82,16 @@ class SegmentPoints:
     sign: Array
     shape_operator: Array | None
     radius: Array | None = None
+    offsets: Array | None = None
+
+    @cached_property
+    def offset(self) -> Array:
+        """Of the gap at the points ``(q,)``."""
+        return self._offset_at(self.facet[self.segments.pair], self.phi)
+
+    def _offset_at(self, e: Ints, phi: Array) -> Array:
+        """Offsets at points of facets ``e (q,)`` with the shape functions ``phi (q, nc)``: ``(q,)``."""
+        return np.zeros(len(e)) if self.offsets is None else np.einsum("qa,qa->q", phi, self.offsets[e])
 
     @cached_property
     def turning(self) -> Array:
@@ -151,7 +164,7 @@ class SegmentPoints:
         by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
         by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
         if self.unequal:
-            grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap)
+            grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap - self.offset)
             stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
             by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
         if self.other is not None:
@@ -163,7 +176,7 @@ class SegmentPoints:
         which = self.partly_covered()
         sides = self.sides(shape, which).at_ends()
         e = self.facet[which][sides.pair]
-        force = sides.weight[:, None] * self.duals.at_end(e, sides.b, sides.gap)
+        force = sides.weight[:, None] * self.duals.at_end(e, sides.b, sides.gap - sides.offset)
         way = -force[:, :, None, None] * sides.way[:, None]
         nc = self.nodes.shape[1]
         np.add.at(on_facet, e, way[:, :, :nc])
@@ -190,7 +203,7 @@ class SegmentPoints:
         pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1) & some)
         e, k = self.facet[pressing], len(pressing)
         amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
-        pair, force, gap, t, eta, motions = self._loaded(pressing, amount)
+        pair, force, gap, offset, t, eta, motions = self._loaded(pressing, amount)
         n, size = self.planes.normal[e], self.planes.size[e]
         turned = t + 2 * n[pair] if nt else n[pair]
         half = sum_of_products(pair, force, motions.along(t), motions.of_area(turned / size[pair, None]), k)
@@ -207,14 +220,17 @@ class SegmentPoints:
             for row, unit in zip(np.moveaxis(shape_operator, 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
         if self.unequal:
-            gaps = motions.along(t) + motions.of_area(((2 if nt else 1) * gap / size[pair])[:, None] * n[pair])
+            gaps = motions.along(t) + motions.of_area((((2 if nt else 1) * gap - offset) / size[pair])[:, None] * n[pair])
             half += self._stretched(pressing, pair, pressure, gaps)
         blocks = half + half.transpose(0, 2, 1)
         # what is not closed, with the second order of the facet's size and direction: once for each facet
         _, first, of_facet = np.unique(e, return_index=True, return_inverse=True)
-        blocks.reshape(k, nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += self._opened(
-            e[first], add_up(of_facet[pair], np.column_stack([force * gap, (force * gap)[:, None] * turned]), len(first))
-        )
+        open_force = np.column_stack([force * gap, (force * gap)[:, None] * turned])
+        opened = self._opened(e[first], add_up(of_facet[pair], open_force, len(first)), self.other is not None)
+        if self.offsets is not None:
+            less = np.column_stack([force * offset, (force * offset)[:, None] * n[pair]])
+            opened -= self._opened(e[first], add_up(of_facet[pair], less, len(first)), False)
+        blocks.reshape(k, nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += opened
         nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
         return nodes, -blocks
 
@@ -233,8 +249,8 @@ class SegmentPoints:
         out[:, :rows] += (means @ self.duals.inverse)[e] @ projected
         return out
 
-    def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Motions]:
-        """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, t, eta and motions.
+    def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Array, Motions]:
+        """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, offsets, t, eta and motions.
 
         Where all facets are affine and grow evenly, t is the same all over a pair: one point stands for all, with sums for values.
         """
@@ -246,22 +262,24 @@ class SegmentPoints:
         force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * s.weight[q]
         phi, N, gap, size, turning = self.phi[q], self.N[q], s.gap[q], self.planes.size[e], self.turning[e]
         if self.other is None or self.unequal or not (self.shape.affine and self.other.affine):
-            return pair, force, gap, self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
-        total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap]), k)
+            return pair, force, gap, self.offset[q], self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
+        total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap, self.offset[q]]), k)
         one = q[np.searchsorted(pair, np.arange(k))]
-        phi, N, gap = np.split(total, [phi.shape[1], phi.shape[1] + N.shape[1]], axis=1)
-        return np.arange(k), np.ones(k), gap[:, 0], self.to_gap[one], s.eta[one], Motions(phi, N, gap[:, 0] / size, turning)
+        phi, N, both = np.split(total, [phi.shape[1], phi.shape[1] + N.shape[1]], axis=1)
+        gap, offset = both.T
+        return np.arange(k), np.ones(k), gap, offset, self.to_gap[one], s.eta[one], Motions(phi, N, gap / size, turning)
 
-    def _opened(self, e: Ints, open_force: Array) -> Array:
+    def _opened(self, e: Ints, open_force: Array, high: bool) -> Array:
         """Second derivatives of open gaps with the sizes and directions of contactor facets ``e (p,)``, ``(p, nc, gdim, nc, gdim)``.
 
         Args:
             e: facets.
-            open_force: forces times gaps, and these times ``t + 2 n``, or n on a rigid target ``(p, 1 + gdim)``.
+            open_force: forces times gaps, and these times ``t + 2 n``, or n unless they are ``high`` ``(p, 1 + gdim)``.
+            high: whether gaps are heights over a mesh, which grow with the area vectors.
         """
         turn, n, size = self.turning[e], self.planes.normal[e], self.planes.size[e]
         square = np.einsum("pigh,pjgk->pihjk", turn, turn)
-        if self.other is not None:
+        if high:
             square *= 2.0
         else:
             grown = (n[:, None, None] @ turn)[:, :, 0]
@@ -324,7 +342,8 @@ class SegmentPoints:
         if self.radius is not None:
             weight = 2 * np.pi * np.einsum("qa,qa->q", phi, self.x[e[pair], :, 0]) * weight
         return Sides(
-            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), N=tab.N, gap=gap, t=t, slope=np.einsum("qg,qg->q", t, outward),
+            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), N=tab.N, gap=gap, offset=self._offset_at(e[pair], phi), t=t,
+            slope=np.einsum("qg,qg->q", t, outward),
             outward=outward, motions=motions, way=motions.along(outward), ahead=ahead,
             shift=shift, cut=cut, weight=weight, end=alone,
         )  # fmt: skip

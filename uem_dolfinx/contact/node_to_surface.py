@@ -59,6 +59,12 @@ class NodeToSurface(OnTarget):
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
         return cls(other.config, other.nodes, other.target, free=other.free_of_owned, **how)
 
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``, at corners too; contactors are to be placed again."""
+        super().set_offset(offset)
+        if self.concave_edges is not None:
+            self.concave_edges.offset = offset
+
     def with_friction(self, mu: Array) -> None:
         """Take the slopes of the cones ``(n,)``, with which contactors leave corners."""
         super().with_friction(mu)
@@ -95,7 +101,7 @@ class NodeToSurface(OnTarget):
         if f is None or not isinstance(self.target, MeshTarget) or not isinstance(nearest, FacetProjection):
             return nearest
         i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
-        own = self.target.at(points[i], f.facet[i], f.xi[i])
+        own = self.raised(self.target.at(points[i], f.facet[i], f.xi[i]), i)
         return nearest.with_those(i, replace(own, beyond=np.zeros_like(own.beyond)))
 
     def _target_moves(self, p: Projection) -> Bools | None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.parallel import reduced
 
 
@@ -29,6 +32,7 @@ class OnTarget:
         prescribed: whether any contactor on any rank has a Dirichlet condition.
         frictional: whether there is friction.
         anchor: projection whose feet a contact with small or fixed sliding keeps.
+        offset: by how much both surfaces together are taken to be thicker at the contactors ``(n,)``; None for nothing.
     """
 
     ordered_by = -1
@@ -40,6 +44,7 @@ class OnTarget:
         self.free, self.free_of_owned, self.frictional = free[nodes], free, False
         self.prescribed = bool(reduced(config.comm, int(not self.free.all())))
         self.anchor: Projection | None = None
+        self.offset: Array | None = None
         #: Whether the next step finds feet of small sliding anew.
         self._renewing = False
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
@@ -57,19 +62,34 @@ class OnTarget:
     def on_target(self, points: Array, anchor: Projection | None = None) -> Projection:
         """The contactors on the nearest places of the target, or with the feet of ``anchor``; as before if nothing moved (collective)."""
         if not self.target.n_nodes:
-            return self.target.project(points) if anchor is None else self.target.follow(points, anchor)
+            return self.raised(self.target.project(points) if anchor is None else self.target.follow(points, anchor))
         x, last = self.config.x[self.target.dofs], self._projected
         same = last is not None and last[2] is anchor and np.array_equal(points, last[0]) and np.array_equal(x, last[1])
         if last is None or not reduced(self.config.comm, same, op=MPI.LAND):
             found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
-            self._projected = last = points, x, anchor, found
+            if anchor is None and self.offset is not None and isinstance(found, FacetProjection):
+                found = found.across_edges(points)
+            raised = self.raised(found)
+            self._projected = last = points, x, anchor, raised
         return last[3]
 
     def take_feet(self, points: Array) -> Projection:
         """The contactors on the nearest places of the target, whose feet are kept from now on (collective)."""
         self.anchor = found = self.target.project(points)
-        self._projected = points, self.config.x[self.target.dofs], found, found
-        return found
+        raised = self.raised(found)
+        self._projected = points, self.config.x[self.target.dofs], found, raised
+        return raised
+
+    def raised(self, projection: Any, which: Ints | None = None) -> Any:
+        """The projection of all contactors, or of ``which (k,)``, with gaps less their offsets."""
+        if self.offset is None:
+            return projection
+        offset = self.offset if which is None else self.offset[which]
+        return replace(projection, gap=projection.height - offset, offset=offset)
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again."""
+        self.offset, self._projected = offset, None
 
     def begin_step(self) -> None:
         """Small sliding finds its feet anew in every step that follows one that was kept."""

@@ -115,7 +115,7 @@ class ContactResults:
         """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
         current = self.measure == "current"
         areas = self.surface.current[self.pair.nodes] if current else self._areas
-        return self.pair.kinematics.areas(areas, current)
+        return self.pair.areas(areas, current, self._areas)
 
     @property
     def nodes(self) -> Indices:
@@ -132,10 +132,10 @@ class ContactResults:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
         The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
-        whether of the reference or of the current surface.
+        whether of the reference or of the current surface. It is negative where tied surfaces pull.
         """
         areas = self.measured_areas()
-        return np.where(areas > 0, self.pair.trial.lam / np.where(areas > 0, areas, 1.0), 0.0)
+        return np.where(areas > 0, self.pair.pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
@@ -153,12 +153,12 @@ class ContactResults:
 
     @property
     def active(self) -> fem.Function:
-        """1 at active contactors, 0 elsewhere (collective)."""
-        return self._field("active", self.pair.trial.active)
+        """1 at active and tied contactors, 0 elsewhere (collective)."""
+        return self._field("active", self.pair.united)
 
     @property
     def status(self) -> fem.Function:
-        """0 at open contactors, 1 where they stick, 2 where they slip, as all do without friction; 0 off the contactor (collective).
+        """0 at open contactors, 1 where they stick or are tied, 2 where they slip, as all do without friction (collective).
 
         With friction a contactor that a corner of the target holds in the plane sticks.
         """
@@ -168,13 +168,12 @@ class ContactResults:
             if state.friction is None
             else state.friction.stick | (state.in_corner & (self.config.gdim == 2))
         )
-        return self._field("status", np.where(state.active, np.where(sticks, 1.0, 2.0), 0.0))
+        return self._field("status", np.where(self.pair.united, np.where(sticks | self.pair.tied, 1.0, 2.0), 0.0))
 
     @property
     def traction(self) -> fem.Function:
-        """Force of friction per area that ``pressure`` is measured on, as a vector field on the contactor (collective)."""
-        pair, areas = self.pair, self.measured_areas()[:, None]
-        tau = 0.0 * pair.trial.force if pair.trial.friction is None else pair.trial.friction.tau
+        """Force of friction, or of a tie, along the target per area that ``pressure`` is measured on, a vector field (collective)."""
+        tau, areas = self.pair.pressing()[1], self.measured_areas()[:, None]
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
     @property
@@ -226,7 +225,8 @@ class ContactResults:
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         x, f = self.pair.points, self.pair.trial.force
         if on == "target":
-            x, f = p.foot, -f
+            # a gap that a tie keeps is part of the target
+            x, f = np.where(self.pair.tied[:, None], x, p.foot), -f
             centre = target.reference(g) if about is None else centre
         return sum_up(self.config.comm, self.config.whole(x) - centre, self.config.whole(f))
 

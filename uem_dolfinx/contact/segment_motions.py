@@ -61,6 +61,7 @@ class Sides:
         b: functions of the contactor's basis there ``(q, nc)``.
         N: the target's shape functions ``(q, nt)``.
         gap: ``(q,)``.
+        offset: of the gap ``(q,)``, or zero.
         t: change of the gap with the place ``(q, gdim)``.
         slope: of the gap outward across the side ``(q,)``.
         outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
@@ -78,6 +79,7 @@ class Sides:
     b: Array
     N: Array
     gap: Array
+    offset: Array
     t: Array
     slope: Array
     outward: Array

@@ -132,6 +132,7 @@ class PairState:
         cover: which of its facets a rigid target covers, or where a mesh leaves it a dual function, one bit each in an order that no
             partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
+        bond: multipliers of the equations of tied contactors ``(n, gdim)``; None where nothing is ever tied.
     """
 
     active: Bools
@@ -145,6 +146,7 @@ class PairState:
     at_end: Bools
     cover: Ints
     friction: FrictionState | None = None
+    bond: Array | None = None
 
     @property
     def in_corner(self) -> Bools:
@@ -174,6 +176,8 @@ class PairState:
             keys_of: what tells facets in any partition, from their present numbers ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
+        if self.bond is None:
+            del kept["bond"]
         if self.friction is not None:
             kept |= {OF_FRICTION + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
         return {name: _renumbered(name, array, keys_of) for name, array in kept.items()}
@@ -193,7 +197,7 @@ class PairState:
             if of_friction
             else None
         )
-        own = [f.name for f in fields(cls) if f.name != "friction"]
+        own = [f.name for f in fields(cls) if f.name != "friction" and f.name in arrays]
         return cls(**{name: arrays[name] for name in own}, friction=friction)
 
 

@@ -25,8 +25,9 @@ from uem_dolfinx.parallel import reduced
 
 
 def contactor_nodes(contacts: Sequence[Contact]) -> Indices:
-    """Owned nodes that are contactors of any contact ``(n,)``."""
-    return np.unique(np.concatenate([np.zeros(0, np.int32), *(contact.pair.nodes for contact in contacts)]))
+    """Owned nodes that are contactors of any contact and not tied ``(n,)``."""
+    loose = (contact.pair.nodes[~contact.pair.tied] for contact in contacts)
+    return np.unique(np.concatenate([np.zeros(0, np.int32), *loose]))
 
 
 def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
@@ -35,7 +36,8 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
     Raises:
         MassError: if a body cannot do without the mass of its contactors, with the part of them, if any, whose mass it could spare.
     """
-    config, of_all = mass.config, [contact for contact in contacts if contact.of_all_surfaces]
+    config, contacts = mass.config, [contact for contact in contacts if contact.tied is not True]
+    of_all = [contact for contact in contacts if contact.of_all_surfaces]
     named = [contact for contact in contacts if not contact.of_all_surfaces]
     contactors, spare = contactor_nodes(named), np.zeros(config.n_owned, bool)
     for contact in contacts:
@@ -73,7 +75,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
     """
     config, K = mass.config, None
     massy: Bools = np.asarray(mass.of_nodes.any(axis=1))
-    for contact in contacts:
+    for contact in (contact for contact in contacts if contact.tied is not True):
         kept = _followed(config, contact)[: config.n_owned] & massy
         bare = not massy[contact.pair.nodes].any()
         if not reduced(config.comm, int(kept.any())) or not reduced(config.comm, int(bare), op=MPI.MIN):

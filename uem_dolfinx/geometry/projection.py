@@ -11,13 +11,25 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
 
+#: The way from its foot to a point at a height is along the facet's normal unless its cosine differs from one by more.
+#: [convention; cosine; test_offset.py::test_over_an_edge]
+ALONG_NORMAL = 1e-12
+
 
 class Projection(Protocol):
     """Where points stand relative to a target: the one thing the uniting equations ask of it."""
 
     @property
     def gap(self) -> Array:
-        """Signed distance ``(n,)``, positive outside."""
+        """Signed distance less the ``offset`` ``(n,)``, positive outside."""
+
+    @property
+    def offset(self) -> Array | None:
+        """By how much the surfaces are taken to be thicker ``(n,)``; None for nothing."""
+
+    @property
+    def height(self) -> Array:
+        """Signed distance ``(n,)``."""
 
     @property
     def normal(self) -> Array:
@@ -139,6 +151,12 @@ class FacetProjection:
     dN: Array
     ddN: Array
     shape_operator: Array
+    offset: Array | None = None
+
+    @property
+    def height(self) -> Array:
+        """Signed distance ``(n,)``."""
+        return self.gap if self.offset is None else self.gap + self.offset
 
     @cached_property
     def facet_size(self) -> Array:
@@ -159,11 +177,22 @@ class FacetProjection:
 
     def with_those(self, which: Ints, other: FacetProjection) -> FacetProjection:
         """Copy with the points ``which (k,)`` where another projection, of k points, has them."""
-        return self.with_rows(which, {f.name: getattr(other, f.name) for f in fields(self)})
+        return self.with_rows(which, {f.name: v for f in fields(self) if (v := getattr(other, f.name)) is not None})
+
+    def across_edges(self, points: Array) -> FacetProjection:
+        """Of ``points (n, gdim)`` that stay at a height, those in front of a convex edge with the normal along the way from it."""
+        away = points - self.foot
+        length, lean = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.normal)
+        beside = (
+            (np.abs(lean) < (1.0 - ALONG_NORMAL) * length) & ~self.beyond.any(axis=1) & (length > ALONG_NORMAL * self.facet_size)
+        )
+        side = np.where(lean < 0.0, -1.0, 1.0)
+        n = side[:, None] * away / np.where(length > 0.0, length, 1.0)[:, None]
+        return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
 
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""
-        return FacetProjection(*(getattr(self, f.name)[which] for f in fields(self)))
+        return replace(self, **{f.name: v[which] for f in fields(self) if (v := getattr(self, f.name)) is not None})
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
@@ -188,7 +217,7 @@ class FacetProjection:
         return np.concatenate([ds[:, None], -on_target], axis=1).reshape(k, size, size)
 
     def _at(self, which: Ints) -> list[Array]:
-        return [getattr(self, f)[which] for f in ("normal", "gap", "weights", "dN", "ddN", "x", "shape_operator")]
+        return [getattr(self, f)[which] for f in ("normal", "height", "weights", "dN", "ddN", "x", "shape_operator")]
 
 
 def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, shape_operator: Array) -> Array:

@@ -69,6 +69,12 @@ class RigidProjection:
     points: Array
     shape_operator: Array
     motion: Motion | None = None
+    offset: Array | None = None
+
+    @property
+    def height(self) -> Array:
+        """Signed distance ``(n,)``."""
+        return self.gap if self.offset is None else self.gap + self.offset
 
     @property
     def foot(self) -> Array:
@@ -223,8 +229,10 @@ class RigidSurface:
             then, now = old.motion or still, self.motion or still
             Q = now.Q @ then.Q.T
             touched, normal, shape_operator = now.carry(then.back(touched)), normal @ Q.T, Q @ shape_operator @ Q.T
-        gap = old.gap + np.einsum("ng,ng->n", normal, points - touched)
-        return replace(old, gap=gap, normal=normal, points=points.copy(), shape_operator=shape_operator, motion=self.motion)
+        gap = old.height + np.einsum("ng,ng->n", normal, points - touched)
+        return replace(
+            old, gap=gap, offset=None, normal=normal, points=points.copy(), shape_operator=shape_operator, motion=self.motion
+        )
 
     def continued(self, projection: RigidProjection, which: Ints) -> RigidProjection:
         """The surface has no end."""

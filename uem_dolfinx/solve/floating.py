@@ -203,12 +203,13 @@ class FloatingBodies:
         motions, config, comm = self.motions, self._bodies.config, self._bodies.comm
         assert motions is not None
         ahead = [pair.approach for pair in self._pairs]
-        united = [pair.equations().resisting for pair in self._pairs]
-        united = [e.select(e.active) for e in united]
+        equations = [pair.equations() for pair in self._pairs]
+        united = [e.resisting.select(e.resisting.active) for e in equations]
         rows = UnitingEquations.join(ahead + united, config.gdim)
-        kind = np.repeat(
-            [AHEAD] * len(ahead) + [HELD if pair.frictional else UNITED for pair in self._pairs], [len(e) for e in ahead + united]
-        )
+        kinds = [np.full(len(e), AHEAD) for e in ahead]
+        for pair, e in zip(self._pairs, equations):
+            kinds.append(np.where(e.tied | pair.frictional, HELD, UNITED)[e.resisting.active])
+        kind = np.concatenate(kinds)
         R, force, scale = motions.rates(rows), *motions.forces(self._residual)
         loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._residual).any()
         if not (loose or freely):

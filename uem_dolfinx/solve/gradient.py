@@ -126,6 +126,8 @@ def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
                 )
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
+        if any(contact.tied for contact in problem.contacts):
+            raise InputError("gradients do not know how a tie changes with what it ties: expected contacts that are not tied")
         if not problem.progress.steps:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         if what == "controls":
@@ -198,3 +200,5 @@ def _check_shape(problem: UnitedProblem) -> None:
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )
+    if any(contact.adjust or callable(contact.offset) for contact in problem.contacts):
+        raise InputError("a gradient by the shape needs an offset that is a number, and no adjust: others change with the shape")

@@ -43,7 +43,7 @@ def refuse_passages(
 
     Args:
         config: configuration of the displacement at the end of the step.
-        pairs: of all contacts; those that keep their facets for a step cannot pass.
+        pairs: of all contacts; those that keep their facets for a step cannot pass, nor can what is tied.
         start: displacement at the beginning ``(n_local incl. ghosts,)``.
         motions: of the pairs' rigid targets at the beginning.
         moving: whether bodies have inertia, so that none may cut a crest short.
@@ -108,7 +108,7 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     reach = PASSAGE_DEPTH * target.stride
     # only those that the target could have met on its way
     p = pair.projection
-    near = np.flatnonzero((length > target.stride) & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
+    near = np.flatnonzero((length > target.stride) & ~pair.tied & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
     depth = np.zeros(len(points))
     if not any(comm.allgather(len(near))):
         return depth
@@ -235,7 +235,7 @@ def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest
             new = active & ~pair.committed.active & (p.gap >= 0.0)
             behind[new] = np.einsum("ng,ng->n", end - x, pair.projection.normal)[new]
         outside = (p.gap >= 0.0) | (k == 0) | ((k == places) & active)
-        passed = outside & (deepest > PASSAGE_DEPTH * target.stride)
+        passed = outside & (deepest > PASSAGE_DEPTH * target.stride) & ~pair.tied
         passed &= (_dot(entry, p.normal) < LOOKING_AWAY) | (moving & ~active)
         depth = np.where(passed, np.maximum(depth, deepest), depth)
         deepest = np.where(outside, 0.0, np.maximum(deepest, -p.gap))

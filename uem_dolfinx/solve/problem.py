@@ -338,6 +338,8 @@ class UnitedProblem:
         """
         stiffness, start = fem.Function(self.config.V), fem.Function(self.config.V)
         functions = {"displacement": self.u, "stiffness": stiffness}
+        for i, pair in enumerate(self.pairs, 1):
+            functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
         ramped = self.dynamics is None
         if self.dynamics is None:
             functions |= {"load start": start}

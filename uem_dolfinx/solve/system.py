@@ -25,7 +25,7 @@ from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import Bodies
-from uem_dolfinx.solve.exchanges import Exchanges, active_here, count
+from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
@@ -244,7 +244,8 @@ class BodySystem:
         if apart is not None:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
         largest = max((pair.largest_gap_here() for pair in self.pairs), default=0.0)
-        told = gathered(self.comm, np.array([active_here(self.pairs), largest])) if self.pairs else np.zeros((1, 2))
+        united = sum(int(pair.united.sum()) for pair in self.pairs)
+        told = gathered(self.comm, np.array([united, largest])) if self.pairs else np.zeros((1, 2))
         return trial, *slip_terms(self.pairs, self.config.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
@@ -344,7 +345,7 @@ class BodySystem:
 
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
-        active = [pair.nodes[pair.trial.active] for pair in self.pairs]
+        active = [pair.nodes[pair.united] for pair in self.pairs]
         return self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:

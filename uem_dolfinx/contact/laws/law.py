@@ -63,6 +63,11 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
     return law if hasattr(friction, "limit") else law.field
 
 
+def given_field(what: str, value: Any) -> Field:
+    """A number or a function of place that was given; refuse all else."""
+    return cast(Field, value) if callable(value) else given.number(what, value)
+
+
 def parameters(law: FrictionLaw) -> list[Any]:
     """What a law was made with, ``field`` first; what was left out aside."""
     others = [value for name, value in getattr(law, "__dict__", {}).items() if name != "field" and value is not None]
@@ -79,11 +84,24 @@ def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str
         raise InputError(f"contact '{name}': {type(law).__name__} needs areas, and points have none: give facets")
     if not callable(law.field):
         return np.full(len(nodes), law.field) if law.field > 0 else None
+    value = asked_at(config, nodes, f"contact '{name}': friction", law.field, given.NOT_NEGATIVE)
+    return value if reduced(config.comm, int((value > 0).any())) else None
+
+
+def asked_at(
+    config: Configuration, nodes: Indices, words: str, f: Callable[[Array], npt.ArrayLike], within: given.Range
+) -> Array:
+    """What a function of place, which ``words`` name, returns at the reference places of ``nodes (n,)``: ``(n,)`` (collective).
+
+    Raises:
+        InputError, UserFunctionError: if it returns anything else than so many numbers of the range, or raises.
+    """
     places = np.zeros((3, len(nodes)))
     places[: config.gdim] = config.X[nodes].T
-    words = f"contact '{name}': friction"
-    value = np.array(ask_together(config.comm, words, law.field, places), dtype=float)
+    value = np.array(ask_together(config.comm, words, f, places), dtype=float)
     with agreed(config.comm):
-        if value.shape != (len(nodes),) or not given.NOT_NEGATIVE.holds(value).all():
-            raise InputError(f"{words}(x) has shape {value.shape}: expected {len(nodes)} numbers, 0 or positive and finite")
-    return value if reduced(config.comm, int((value > 0).any())) else None
+        if value.shape != (len(nodes),) or not within.holds(value).all():
+            raise InputError(
+                f"{words}(x) has shape {value.shape}: expected {len(nodes)} numbers, {within.words.replace('a ', '')}"
+            )
+    return value

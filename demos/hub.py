@@ -1,0 +1,142 @@
+"""Hub on a shaft: a press fit by an offset, a torque until it slips, and the fit released again.
+
+python3 demos/hub.py --plot hub.png
+"""
+
+# %% [markdown]
+# # A hub on a shaft
+#
+# A hollow shaft of radii a and b in a hub of radii b and c, drawn with the same radius at the seat: the interference is a number,
+# `offset`, which takes both surfaces together to be thicker than drawn. So one mesh serves for every fit. What the meshes, which do not
+# match, leave between them is less than a thousandth of it, and `adjust` takes it away.
+#
+# 1. The fit: the offset grows to delta with the load factor. The shaft's hole and the hub's outside are held, and with Lamé's
+#    displacements u = A r + B / r of both rings the pressure p follows from u_hub - u_shaft = delta at the seat.
+# 2. The torque: the shaft's hole is turned. Friction carries T = mu p (2 pi b) b at most, per unit of thickness; from there on the
+#    seat slips.
+# 3. The release: the offset is set to -delta, a clearance. Nothing holds the hub to the shaft any more, and no stress is left.
+
+# %%
+import common
+import numpy as np
+import ufl
+from common import comm
+from dolfinx import fem
+
+import uem_dolfinx as uem
+
+args = common.arguments(__doc__, n_shaft=48, n_hub=40, layers=4, degree=2, coupling=("mortar", "node_to_surface"), steps=6)
+a, b, c, delta, mu = 10.0, 20.0, 40.0, 0.02, 0.15  # mm
+E, nu = 2.1e5, 0.3  # MPa
+
+# %% [markdown]
+# ## Lamé's pressure
+# In plane strain, with lam and G: the radial stress of u = A r + B / r is 2 (lam + G) A - 2 G B / r^2. Unknown are A and B of the
+# shaft, A and B of the hub, and p.
+
+# %%
+lam, G = E * nu / (1 + nu) / (1 - 2 * nu), E / 2 / (1 + nu)
+
+
+def radial(r):
+    """Radial stress over A and B."""
+    return [2 * (lam + G), -2 * G / r**2]
+
+
+equations = np.array([
+    [a, 1 / a, 0, 0, 0],
+    [*radial(b), 0, 0, 1],
+    [0, 0, *radial(b), 1],
+    [0, 0, c, 1 / c, 0],
+    [-b, -1 / b, b, 1 / b, 0],
+])  # fmt: skip
+p = float(np.linalg.solve(equations, [0, 0, 0, 0, delta])[-1])
+most = mu * p * 2 * np.pi * b**2
+
+# %% [markdown]
+# ## The scene
+
+# %%
+mesh, tags = uem.read_gmsh(
+    common.MESHES / "hub.geo", comm, gdim=2,
+    parameters={"a": a, "b": b, "c": c, "n_shaft": args.n_shaft, "n_hub": args.n_hub, "layers": args.layers, "order": args.degree},
+)  # fmt: skip
+V = uem.function_space(mesh, args.degree, (2,))
+u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
+material = uem.LinearElastic(E, nu, kind="plane_strain")
+turned = fem.Function(V)
+bcs = [uem.dirichlet(V, tags["outside"]), fem.dirichletbc(turned, fem.locate_dofs_topological(V, 1, tags["hole"].entities))]
+contact = uem.Contact(tags["seat"], tags["bore"], coupling=args.coupling, sliding="small", friction=mu, adjust=True, name="fit")
+problem = uem.UnitedProblem(material.residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hub_", verbose=args.verbose)
+
+
+def mean_pressure() -> float:
+    """Of the seat: the sum of the radial forces over its length."""
+    x, f = contact.points, contact.force.x.array.reshape(-1, 2)[contact.nodes]
+    return -float(comm.allreduce(np.einsum("ng,ng->", x, f) / b)) / (2 * np.pi * b)
+
+
+# %% [markdown]
+# ## The steps
+# By 1.5 times the angle at which the fit slips.
+
+# %%
+def fit(factor: float) -> None:
+    """Step 1: the interference grows."""
+    contact.offset = factor * delta
+
+
+problem.load = fit
+for _ in uem.load_steps(problem, 2):
+    pass
+fitted = mean_pressure()
+
+# angle over torque of a ring between two radii
+compliance = (1 / a**2 - 1 / c**2) / (4 * np.pi * G)
+angle = 1.5 * most * compliance
+rows = []
+
+
+def turn(factor: float) -> None:
+    """Step 2: the hole turns."""
+    turned.interpolate(lambda x: factor * angle * np.stack([-x[1], x[0]]))
+
+
+problem.load = turn
+for step in uem.load_steps(problem, args.steps):
+    torque, slipping = -float(contact.resultant().moment[0]), contact.status.x.array[contact.nodes] == 2
+    rows.append({
+        "angle": step.factor * angle, "torque": abs(torque), "elastic": min(step.factor * angle / compliance, most),
+        "slipping": int(comm.allreduce(int(slipping.sum()))), "newton": step.newton_iterations,
+    })  # fmt: skip
+if args.plot:
+    x = ufl.SpatialCoordinate(mesh)
+    shear = ufl.dot(ufl.as_vector((-x[1], x[0])), material.stress(u) * x) / (ufl.dot(x, x) * p)
+    with uem.figure(args.plot, comm, panels=2) as (left, right):
+        uem.plot_scene(problem, left, field=shear, label="shear stress / p", levels=np.linspace(-0.5, 0.1, 13), arrows=False)
+        if right is not None:
+            right.plot(*([1e3 * r[k] / scale for r in rows] for k, scale in (("angle", 1.0), ("torque", 1e3 * most))), "o-", ms=4)
+            right.plot([1e3 * r["angle"] for r in rows], [r["elastic"] / most for r in rows], "k--", lw=0.8, label="in closed form")
+            right.set(xlabel="angle in mrad", ylabel="torque / (2 pi mu p b^2)")
+            right.legend(frameon=False)
+if args.output:
+    with uem.ResultsWriter(f"{args.output}/hub", problem) as writer:
+        writer.write(1.0)
+
+problem.load = None
+contact.offset = -delta
+problem.solve()
+stress = fem.Function(uem.function_space(mesh, ("DG", 0)))
+uem.interpolate(stress, ufl.sqrt(ufl.inner(material.stress(u), material.stress(u))) / p)
+
+# %%
+results = {
+    "pressure_lame": p,
+    "fit_error": abs(fitted / p - 1),
+    "torque_error": abs(rows[-1]["torque"] / most - 1),
+    "released_stress": float(comm.allreduce(np.abs(stress.x.array).max(initial=0.0), op=common.MPI.MAX)),
+    "steps": rows,
+}
+common.report(args, results)
+assert max(results["fit_error"], results["torque_error"]) < 0.005
+assert results["released_stress"] < 1e-10

@@ -1,0 +1,70 @@
+"""Offsets of gaps: surfaces that are taken to be thicker or thinner than they were drawn, and gaps that are taken to be closed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.law import Field, asked_at
+from uem_dolfinx.contact.mortar import Mortar
+from uem_dolfinx.contact.weighted_gaps import MortarKinematics
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.interface import Interface
+
+
+class Offsets:
+    """What the gaps of one interface are less than heights over the target.
+
+    Args:
+        pair: the interface.
+        name: of its contact, for messages.
+
+    Attributes:
+        adjusted: heights of contactors that are taken to touch ``(n,)``.
+    """
+
+    def __init__(self, pair: Interface, name: str):
+        self._pair, self._name = pair, name
+        self.adjusted: Array = np.zeros(len(pair.nodes))
+
+    def set(self, offset: Field) -> None:
+        """Take an offset, besides what has been adjusted; contactors are to be placed again (collective)."""
+        config, nodes, words = self._pair.config, self._pair.nodes, f"contact '{self._name}': offset"
+        value = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
+        total = value + self.adjusted
+        some = reduced(config.comm, bool(total.any()), op=MPI.LOR)
+        self._pair.discretisation.set_offset(total if some else None)
+
+    def adjust(self, reach: float | bool) -> None:
+        """Take contactors to touch that are no farther from the target, or above it, than ``reach`` (collective).
+
+        Args:
+            reach: a length; True is a side of a target's facet, or on a rigid surface the bound on the initial penetration.
+        """
+        pair = self._pair
+        pair.project()
+        p, d = pair.projection, pair.discretisation
+        height = heights_of(d, pair) if isinstance(d, Mortar) else p.height
+        most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach
+        self.adjusted = np.where((np.abs(height) <= most) & ~pair.off, height, 0.0)
+
+
+def heights_of(d: Mortar, pair: Interface) -> Array:
+    """Heights of contactors over the target whose means, weighted with dual functions, are those of the gaps ``(n,)`` (collective).
+
+    Functions of degree 2 have them in Bernstein's basis first, whose coefficients at the middles are made of those around.
+    """
+    assert isinstance(pair.kinematics, MortarKinematics)
+    config, dofs, rows = d.config, d.surface.dofs, pair.kinematics.rows
+    means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
+    at = config.from_owners(d.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
+    nodal = at @ np.linalg.inv(d.basis.T).T
+    total, count = (config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
+    return np.asarray(total[d.nodes] / count[d.nodes])
