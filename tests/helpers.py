@@ -105,7 +105,7 @@ def coulomb(pair: Interface, length: float, force: float) -> None:
     assert friction is not None and pair.friction is not None
     along = pair.friction
     tau, slip, s = along.frame.tangential(friction.tau), along.frame.slip, along.directions(trial)
-    bound, slipping = along.bound(trial.lam), along.slipping(trial)
+    bound, slipping = along.bound(trial), along.slipping(trial)
     stuck = along.active(trial) & friction.stick
     assert highest(comm, (np.linalg.norm(tau, axis=1) - bound)[~trial.in_corner]) <= force
     assert highest(comm, np.linalg.norm(slip[stuck], axis=1)) <= length

@@ -41,9 +41,9 @@ __all__ = [
     "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
     "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
     "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
-    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "SurfaceError", "Tag", "TagError", "Tags",
-    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate", "axisymmetric",
-    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
+    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError",
+    "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
+    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
     "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark",
     "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test",
     "time_steps", "timing", "timings", "write_checkpoint",
@@ -116,6 +116,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
@@ -125,7 +126,7 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
-    "read_mesh": "geometry.mesh_files",
+    "Stribeck", "contact.laws.stribeck", "geometry.mesh_files", "read_mesh",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",

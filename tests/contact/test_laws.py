@@ -116,7 +116,7 @@ def test_a_law_from_outside():
         )
         np.testing.assert_allclose(np.array(own.resultant().force), np.array(other.resultant().force), rtol=1e-12)
         pair = other.pair
-        bound = np.minimum(0.3 * pair.trial.lam, STRESS * pair.friction.area)
+        bound = np.minimum(0.3 * pair.trial.lam, STRESS * pair.friction.limits.area)
         borne = np.linalg.norm(pair.trial.friction.tau, axis=1)
         assert (borne <= bound * (1 + 1e-8)).all()
 
@@ -146,7 +146,7 @@ def test_laws_that_are_set_anew():
     # all that it was made with
     contact, _ = dragged("quadrilateral", uem.Coulomb(0.3, limit=10.0), press=0.04)
     contact.friction = uem.Coulomb(0.3, limit=STRESS)
-    assert contact.pair.friction.law.most == STRESS
+    assert contact.pair.friction.limits.law.most == STRESS
     raised(uem.InputTypeError, "limit", lambda: uem.Coulomb(0.3, limit="soft"))
     raised(uem.InputError, "limit = -1.0: expected a positive number", lambda: uem.Coulomb(0.3, limit=-1.0))
     contact, _ = dragged("quadrilateral", uem.Tresca(STRESS))

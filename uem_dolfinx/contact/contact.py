@@ -15,7 +15,17 @@ from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_field, given_friction, parameters, values_at
+from uem_dolfinx.contact.laws.law import (
+    Field,
+    FrictionLaw,
+    as_law,
+    follows_load,
+    given_field,
+    given_friction,
+    of_rate,
+    parameters,
+    values_at,
+)
 from uem_dolfinx.contact.results import ContactResults
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -32,6 +42,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.mortar import Mortar
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.sliding import Sliding
+    from uem_dolfinx.contact.state import PairState
     from uem_dolfinx.contact.target_corners import CornerInside
 
 #: Default bound on the initial penetration, as part of the model's size.
@@ -61,10 +72,14 @@ class Contact(ContactResults):
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
             than this lies behind the body, not in it. None takes the body to have no back.
-        friction: Coulomb's coefficient, a number, or a function of place that is given points ``(3, n)`` of the reference
-            configuration and returns ``(n,)``; or a law of friction: ``Coulomb`` with a limit, ``Tresca``. With 0
-            the contact is the one without friction. It may be set anew between steps, of a contact that was made with friction, by the
-            same law; all else is settled once a problem has been made.
+        friction: Coulomb's coefficient, a number, a function of place that is given points ``(3, n)`` of the reference configuration and
+            returns ``(n,)``, or a function of place and of the load factor, in time steps of the time, that counts for the step that
+            ends there; or a law of friction, made with any of these: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the
+            contact is the one without friction. It may be set anew between steps, of a contact that was made with friction, by the same
+            law; all else is settled once a problem has been made.
+        wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of place as of ``friction``: after every
+            step the contactor has lost the volume ``wear N s`` under the force N that slips by s, with friction or without, and gaps
+            are larger by its depth. :attr:`wear` and :attr:`worn_volume` tell it. The target does not wear.
         measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
             small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
         tied: True unites contactors that are within reach of the target with it, in all components and for good: they never open and never
@@ -104,6 +119,7 @@ class Contact(ContactResults):
         adjust: float | bool = False,
         chords: bool = False,
         friction: Field | FrictionLaw = 0.0,
+        wear: Field = 0.0,
         measure: str = "reference",
         name: str | None = None,
     ):
@@ -120,7 +136,7 @@ class Contact(ContactResults):
             if thickness is not None:
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
-            self._friction = given_friction(friction)
+            self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
@@ -130,6 +146,8 @@ class Contact(ContactResults):
                 raise InputError(
                     "offset does not go with tied = True, which keeps the gaps that there are: leave one of them out"
                 )
+            if tied is True and wear != 0.0:
+                raise InputError("wear does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
             if tied is True and as_law(friction).field != 0.0:
                 raise InputError("friction does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
             if coupling == "mortar" and (chords or normals != "facet"):
@@ -183,7 +201,7 @@ class Contact(ContactResults):
             law = as_law(value)
             given.kind("friction", value, type(law) is type(before), f"a value for the law {type(before).__name__}")
         given.alike(self.config.comm, f"contact '{self.name}'", friction=parameters(law))
-        mu = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0)
+        mu = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0, self._at)
         if mu is not None and not self.pair.frictional:
             raise InputError(
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
@@ -192,6 +210,25 @@ class Contact(ContactResults):
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
         self._friction = value
+
+    def take_load(self, at: float, known: bool = False) -> None:
+        """Take friction at a load factor or a time, if it follows these (collective).
+
+        Args:
+            at: load factor, in dynamics the time.
+            known: whether the contact's committed state has been reached with it; else the next step begins with it.
+        """
+        self._at = at
+        law = as_law(self._friction)
+        if not follows_load(law):
+            return
+        value = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0, at)
+        friction = self.pair.friction
+        assert value is not None and friction is not None
+        if known:
+            friction.set(law, value)
+        elif reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
+            self.pair.set_friction(law, value)
 
     @property
     def offset(self) -> Field:
@@ -232,21 +269,26 @@ class Contact(ContactResults):
         own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
         return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
-    def attach(self, config: Configuration, free: Bools) -> Interface:
+    def attach(
+        self, config: Configuration, free: Bools, *, at: float = 0.0, duration: Callable[[], float] | None = None
+    ) -> Interface:
         """Build the pair of this contact in a problem (collective).
 
         Args:
             config: configuration of the displacement.
             free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+            at: load factor, in dynamics the time.
+            duration: length of the present step, a time; None in statics.
 
         Raises:
+            InputError: if friction depends on the speed of slip, and steps have no length.
             TagError: if a tag is empty or of the wrong dimension.
             SpaceError: if a tag belongs to another mesh.
             SurfaceError: if contactor and target share nodes, or a rigid target is of another dimension.
             UserFunctionError: of a rigid target's functions.
             OrientationError: if a target facet lies inside a body.
         """
-        self.config, facets = config, config.tdim - 1
+        self.config, self._at, facets = config, at, config.tdim - 1
         # of a problem that could not be made
         self._fields, _ = {}, self.__dict__.pop("surface", None)
         given.alike(
@@ -254,6 +296,7 @@ class Contact(ContactResults):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
+            wear=self._wear,
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -280,14 +323,31 @@ class Contact(ContactResults):
         bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
         law, friction = as_law(self.friction), None
-        value = values_at(law, config, nodes, self.name, self.contactor.dim > 0)
+        value = values_at(law, config, nodes, self.name, self.contactor.dim > 0, at)
+        wears = callable(self._wear) or self._wear > 0.0
+        if value is None and wears:
+            # slip is followed where there is no friction, too
+            value = np.zeros(len(nodes))
         if value is not None:
+            from uem_dolfinx.contact.limits import Limits
             from uem_dolfinx.contact.sliding import Sliding
 
+            if of_rate(law) and duration is None:
+                raise InputError(
+                    f"contact '{self.name}': {type(law).__name__} needs the speed of slip, and statics has none: give the problem dynamics "
+                    "and take time steps, or take a law without speed"
+                )
+            limits = Limits(lambda: self.surface.reference[nodes], duration)
             friction = Sliding(
-                config, nodes, discretisation, law=law, value=value, areas=lambda: self.surface.reference[nodes], free=free[nodes],
+                config,
+                nodes,
+                discretisation,
+                law=law,
+                value=value,
+                limits=limits,
+                free=free[nodes],
                 keeps_feet=self.sliding != "finite",
-            )  # fmt: skip
+            )
         self._pair, self._offsets = self._interface(discretisation, means, friction, **of), None
         if self.adjust and self.tied is not True:
             from uem_dolfinx.contact.offsets import Offsets
@@ -295,6 +355,14 @@ class Contact(ContactResults):
             self._offsets = Offsets(self._pair, self.name)
             self._offsets.adjust(self.adjust)
         self._set_offset()
+        if wears:
+            from uem_dolfinx.contact.offsets import Offsets
+            from uem_dolfinx.contact.wear import Wear
+
+            self._offsets = self._offsets or Offsets(self._pair, self.name)
+            of = {"tag": self.contactor, "areas": self.surface, "lower": self._offsets.wear, "name": self.name}
+            assert friction is not None
+            friction.wear = Wear(config, nodes, self._wear, **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 
@@ -355,6 +423,12 @@ class Contact(ContactResults):
         gone = self.pair.off & ~self._off_at_start & ~self.pair.tied
         if not self._slipped and self.pair.target.n_nodes and reduced(self.config.comm, gone.any(), op=MPI.LOR):
             self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
+
+    def look_at_wear(self, before: PairState, stiffness: Array | None) -> None:
+        """Warn, once, if the step from the state ``before`` has worn too much; ``stiffness`` as of ``corner_inside`` (collective)."""
+        wear = None if self.pair.friction is None else self.pair.friction.wear
+        if wear is not None and stiffness is not None:
+            wear.look_at_step(before, self.pair.committed, self.pair.kinematics.normal, stiffness)
 
     def corner_inside(self, stiffness: Array | None) -> CornerInside | None:
         """A convex corner of the target inside the contactor by which the contact lacks force, or lacked it before (collective).

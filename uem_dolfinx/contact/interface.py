@@ -407,8 +407,14 @@ class Interface(Told):
         self.committed = replace(fresh, at_end=self._at_end(fresh))
         self.restore()
         self.discretisation.commit()
+        self._wear()
         if not self.trial.active.any():
             self.reserved = np.zeros_like(self.reserved)
+
+    def _wear(self) -> None:
+        """Let gaps be larger by what the committed state has worn (collective)."""
+        if self.friction is not None and self.friction.wear is not None:
+            self.friction.wear.apply(self.committed)
 
     def restore(self) -> None:
         """Go back to the committed state; to be followed by ``project``."""
@@ -425,6 +431,7 @@ class Interface(Told):
         if self.friction is not None:
             self.friction.forget()
         self.restore()
+        self._wear()
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""

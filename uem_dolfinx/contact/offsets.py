@@ -28,18 +28,29 @@ class Offsets:
 
     Attributes:
         adjusted: heights of contactors that are taken to touch ``(n,)``.
+        worn: depths that have been worn off ``(n,)``.
     """
 
     def __init__(self, pair: Interface, name: str):
         self._pair, self._name = pair, name
+        self._given: Array = np.zeros(len(pair.nodes))
         self.adjusted: Array = np.zeros(len(pair.nodes))
+        self.worn: Array = np.zeros(len(pair.nodes))
 
     def set(self, offset: Field) -> None:
-        """Take an offset, besides what has been adjusted; contactors are to be placed again (collective)."""
+        """Take an offset, besides what has been adjusted and worn; contactors are to be placed again (collective)."""
         config, nodes, words = self._pair.config, self._pair.nodes, f"contact '{self._name}': offset"
-        value = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
-        total = value + self.adjusted
-        some = reduced(config.comm, bool(total.any()), op=MPI.LOR)
+        self._given = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
+        self._hand_over()
+
+    def wear(self, worn: Array) -> None:
+        """Take depths that have been worn off ``(n,)``; contactors are to be placed again (collective)."""
+        self.worn = worn
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        total = self._given + self.adjusted - self.worn
+        some = reduced(self._pair.config.comm, bool(total.any()), op=MPI.LOR)
         self._pair.discretisation.set_offset(total if some else None)
 
     def adjust(self, reach: float | bool) -> None:

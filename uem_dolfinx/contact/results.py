@@ -192,6 +192,18 @@ class ContactResults:
         return float(reduced(self.config.comm, 0.0 if friction is None else float(friction.work.sum())))
 
     @property
+    def wear(self) -> fem.Function:
+        """Depth that has been worn off the contactor in all committed steps, as a scalar field, a length (collective)."""
+        friction = self.pair.committed.friction
+        return self._field("wear", 0.0 if friction is None else friction.worn)
+
+    @property
+    def worn_volume(self) -> float:
+        """Volume that has been worn off the contactor in all committed steps, the integral of ``wear`` as drawn (collective)."""
+        wear = None if self.pair.friction is None else self.pair.friction.wear
+        return 0.0 if wear is None else wear.volume(self.pair.committed)
+
+    @property
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
         if "force" not in self._fields:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -20,16 +21,16 @@ from uem_dolfinx.contact.corners import friction_in
 from uem_dolfinx.contact.frame import Frame
 from uem_dolfinx.contact.friction_rows import with_friction
 from uem_dolfinx.contact.kinematics import Constraints, Discretisation, Kinematics, Traction
-from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
+from uem_dolfinx.contact.limits import Limits
 from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import FrictionState, LastStep, PairState, Pivot
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import reduced
 
-#: What is left of a limit that is proportional to the force along the normal, below this part of it, is rounding.
-#: [bound; limit of friction; -]
-ROUNDING = 1e-14
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.wear import Wear
 
 
 class Sliding:
@@ -41,13 +42,14 @@ class Sliding:
         discretisation: what ties them to their target.
         law: of friction.
         value: of its parameter at the contactors ``(n,)``.
-        areas: of the contactors' reference surface ``(n,)``, asked for by laws that need them (collective).
+        limits: how much of it contactors bear.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
         keeps_feet: whether feet stay where they were at the start of the step.
 
     Attributes:
         frame: directions along the target and relative motions, of the last placement.
         pivot: what the exchanges of the present linearised problem have done.
+        wear: of the contactors; None without.
         left_out: tangents whose equations depend on others and were left out ``(n, gdim - 1)``.
     """
 
@@ -61,16 +63,15 @@ class Sliding:
         *,
         law: FrictionLaw,
         value: Array,
-        areas: Callable[[], Array],
+        limits: Limits,
         free: Bools,
         keeps_feet: bool,
     ):
         self.config, self.nodes, self.discretisation = config, nodes, discretisation
         self.free, self.keeps_feet = free, keeps_feet
         n, g = len(nodes), config.gdim
-        self._areas_of = areas
-        #: Limits that stay while forces along the normal change ``(n,)``.
-        self._held: Array | None = None
+        self.limits = limits
+        self.wear: Wear | None = None
         self.set(law, value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
         self._other_normals: Array = np.zeros((n, 0, g))
@@ -81,10 +82,12 @@ class Sliding:
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Take a law, and the values of its parameter ``(n,)``."""
-        self.law, self.value = law, value
-        self.area = self._areas = self._areas_of() if law.per_area else np.zeros(len(value))
-        _, slope = self.law.limit(value, np.zeros(len(value)), self.area)
-        self.discretisation.with_friction(slope)
+        self.discretisation.with_friction(self.limits.set(law, value))
+
+    @property
+    def value(self) -> Array:
+        """Of the law's parameter at the contactors ``(n,)``, 0 where there is no friction."""
+        return self.limits.value
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -95,8 +98,7 @@ class Sliding:
         elif self._last is None:
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
-        if self.law.per_area:
-            self.area = kinematics.areas(self._areas, False)
+        self.limits.grow(kinematics)
         self.replace(kinematics)
 
     def replace(self, kinematics: Kinematics) -> None:
@@ -109,6 +111,8 @@ class Sliding:
             way = self._last.ties
             away = way.relative(self._way_since(self._last))
         self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.prescribed)
+        if of_rate(self.limits.law):
+            self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.force_per_multiplier)
 
     def _way_since(self, last: LastStep) -> Array:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
@@ -146,33 +150,16 @@ class Sliding:
         stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
         return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
 
-    # -- the law ---------------------------------------------------------------------------------------------------------
-
-    def bound(self, lam: Array) -> Array:
-        """Largest force along the target with forces ``lam (n,)`` along the normal ``(n,)``."""
-        return self.law.limit(self.value, np.maximum(lam, 0.0), self.area)[0] if self._held is None else self._held
+    def bound(self, state: PairState, lam: Array | None = None) -> Array:
+        """Largest force along the target of a state, or of it with other forces ``lam (n,)`` along the normal ``(n,)``."""
+        return self.limits.of(state.lam if lam is None else lam, self.slipping(state))[0]
 
     def hold_limits(self, lam: Array | None) -> Array:
-        """Let limits be those of forces ``lam (n,)`` along the normal whatever these become, as in Tresca's law; None lets them follow.
-
-        Returns:
-            By how much a limit that was held has changed at most, and the largest one, on this rank ``(2,)``.
-        """
-        before, self._held = self._held, None
-        if lam is None:
-            return np.zeros(2)
-        self._held = self.bound(lam)
-        change = self._held if before is None else np.abs(self._held - before)
-        return np.array([change.max(initial=0.0), self._held.max(initial=0.0)])
+        """Let limits be those of forces ``lam (n,)`` along the normal; see ``Limits.hold``."""
+        return self.limits.hold(lam)
 
     def _cone(self, state: PairState) -> tuple[Array, Array]:
-        """The limit as a linear function of the force along the normal, about that of the state: its value at 0 and slope ``(n,)``."""
-        lam = np.maximum(state.lam, 0.0)
-        if self._held is not None:
-            return self._held, np.zeros_like(lam)
-        limit, slope = self.law.limit(self.value, lam, self.area)
-        rest = limit - slope * lam
-        return np.where(np.abs(rest) > ROUNDING * limit, rest, 0.0), slope
+        return self.limits.cone(state.lam, self.slipping(state))
 
     def _limit(self, state: PairState, lam: Array) -> Array:
         rest, slope = self._cone(state)
@@ -214,7 +201,7 @@ class Sliding:
         if du is not None and seen.tau is not None:
             away, tau = away + self.frame.way.relative(du), seen.tau
         lam, forced = seen.lam, self.frame.forced(away, self._lost)
-        by = friction.Seen(lam, self.frame.tangential(tau), self.bound(lam), self.frame.along(away), forced)
+        by = friction.Seen(lam, self.frame.tangential(tau), self.bound(state, lam), self.frame.along(away), forced)
         turned = replace(_of(state), direction=self.directions(state))
         forces, lengths = rounding
         active = self.active(state)
@@ -259,7 +246,7 @@ class Sliding:
         # begin to slip turn as long as the force q is beyond the cone; bodies that slide without end are held
         q, beyond = pivot.stiffness[:, None] * slip - tau / share, ~pivot.turned
         if space:
-            beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(lam) / share[:, 0])
+            beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(state, lam) / share[:, 0])
         turns = violated.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
         # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
         back = (violated.enter & (committed.active | pivot.released | forced) | violated.slide & forced) & (size > 0)
@@ -341,11 +328,11 @@ class Sliding:
         limit = self._limit(state, across.lam) / share
         tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
         np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.test.direction[i])
-        if du is not None and self.config.gdim == 3:
-            projector, stiffness, part = self._turning(state, kinematics)
+        if du is not None and self._follows_slip:
+            sideways, part, stiffness = self._turning(state, kinematics)
             i = np.flatnonzero(self.slipping(state))
-            taken = stiffness[:, None] * self.frame.way.relative(du)[i] + part[:, None] * self.pivot.tau[i]
-            tau[i] -= np.einsum("kgh,kh->kg", projector, taken)
+            taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
+            tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
         return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
 
     def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array] | None:
@@ -356,25 +343,40 @@ class Sliding:
         size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
         return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
 
+    @property
+    def _follows_slip(self) -> bool:
+        """Whether friction changes as contactors that slip move: in space its direction, and by laws of rate its size."""
+        return self.config.gdim == 3 or of_rate(self.limits.law)
+
     def _turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
-        """Of contactors that slip: projectors across their directions ``(k, g, g)``, and what ``turn_stiffness`` returns."""
+        """How friction changes as contactors that slip move over the target.
+
+        Returns:
+            Projectors across their directions ``(k, g, g)``, the part of the force across them that is taken away ``(k,)``, and
+            stiffnesses, across them and, by laws of rate, along them ``(k, g, g)``.
+        """
         i = np.flatnonzero(self.slipping(state))
         T, s = self.frame.tangents[i], self.directions(state)[i]
-        across = np.einsum("krg,krh->kgh", T, T) - s[:, :, None] * s[:, None, :]
-        across[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
-        bound = (self.bound(state.lam) / kinematics.force_per_multiplier)[i]
-        return across, *friction.turn_stiffness(np.linalg.norm(self.pivot.q[i], axis=1), bound, self.pivot.stiffness[i])
+        forwards = s[:, :, None] * s[:, None, :]
+        sideways = np.einsum("krg,krh->kgh", T, T) - forwards
+        sideways[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
+        share = kinematics.force_per_multiplier
+        bound, _, rate = self.limits.of(state.lam, self.slipping(state))
+        size = np.linalg.norm(self.pivot.q[i], axis=1)
+        stiffness, part = friction.turn_stiffness(size, (bound / share)[i], self.pivot.stiffness[i])
+        along = (rate / share**2)[i]
+        return sideways, part, stiffness[:, None, None] * sideways + along[:, None, None] * forwards
 
     def slip_terms(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array, Array] | None:
-        """What holds the directions of slip back in space; see ``Interface``."""
-        if self.config.gdim == 2:
+        """What slip adds to tangent and residual: directions that are held back, and friction that grows with the speed."""
+        if not self._follows_slip:
             return None
         i = np.flatnonzero(self.slipping(state))
-        across, stiffness, part = self._turning(state, kinematics)
+        sideways, part, stiffness = self._turning(state, kinematics)
         nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
         (k, m), g = share.shape, self.config.gdim
-        blocks = np.einsum("k,ka,kb,kgh->kagbh", stiffness, share, moved, across).reshape(k, m * g, m * g)
-        forces = np.einsum("k,ka,kgh,kh->kag", part, share, across, self.pivot.tau[i]).reshape(k, m * g)
+        blocks = np.einsum("ka,kb,kgh->kagbh", share, moved, stiffness).reshape(k, m * g, m * g)
+        forces = np.einsum("k,ka,kgh,kh->kag", part, share, sideways, self.pivot.tau[i]).reshape(k, m * g)
         return nodes, blocks, forces
 
     def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
@@ -410,10 +412,15 @@ class Sliding:
         # one that has stuck all along is where its anchor is, whatever rounding says
         stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
-        slipped = f.slipped + np.where(held[:, None], end, np.where(self.slipping(state)[:, None], self.frame.slip / share, 0.0))
+        slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
+        slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
         taken = friction.work(_of(committed).tau, tau, start, end, held)
         self._last = None
-        now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken)
+        worn = f.worn
+        if self.wear is not None:
+            ways = (np.linalg.norm(self.frame.along(way), axis=1) for way in (start, end))
+            worn = worn + self.wear.depths(committed.lam, state.lam, *ways)
+        now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
         return replace(state, friction=now)
 
     def forget(self) -> None:

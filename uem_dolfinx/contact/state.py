@@ -40,6 +40,7 @@ class FrictionState:
         anchor: what is to be added to that place; on a rigid target the anchor at the target's reference position ``(n, gdim)``.
         slipped: relative motion along the target while slipping, summed over all steps ``(n, gdim)``.
         work: that friction has taken from the bodies ``(n,)``.
+        worn: depth that slip has worn off ``(n,)``.
     """
 
     stick: Bools
@@ -50,6 +51,7 @@ class FrictionState:
     anchor: Array
     slipped: Array
     work: Array
+    worn: Array
 
     @classmethod
     def initial(cls, n: int, gdim: int) -> FrictionState:
@@ -63,6 +65,7 @@ class FrictionState:
             anchor=np.zeros((n, gdim)),
             slipped=np.zeros((n, gdim)),
             work=np.zeros(n),
+            worn=np.zeros(n),
         )
 
 

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.law import as_law, follows_load
 from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
@@ -154,6 +155,12 @@ class AlongArc:
     def __init__(self, problem: UnitedProblem):
         if not isinstance(problem.system, BodySystem):
             raise InputError("arc_length needs contact by elimination: leave out the problem's method")
+        for contact in problem.contacts:
+            if follows_load(as_law(contact.friction)):
+                raise InputError(
+                    f"arc_length leads loads, and friction of contact '{contact.name}' follows the load factor: expected friction that "
+                    "does not"
+                )
         self._problem, self._arc, self._owned = problem, ArcLength(problem), problem.config.n_owned * problem.config.gdim
         self.tried, self.most = 0.0, MOST_STEPS
 

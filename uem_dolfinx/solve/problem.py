@@ -145,7 +145,8 @@ class UnitedProblem:
         )
         self.solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
-        pairs = [contact.attach(self.config, free) for contact in self.contacts]
+        clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
+        pairs = [contact.attach(self.config, free, **clock) for contact in self.contacts]
         if dynamics is not None:
             from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 
@@ -185,7 +186,7 @@ class UnitedProblem:
     # -- one step ----------------------------------------------------------------------------------------------------
 
     def set_load(self, at: float) -> None:
-        """Set loads, and what else ``load`` sets, of a load factor or a time; a UserFunctionError if it raises (collective)."""
+        """Set loads, what else ``load`` sets, and friction, of a load factor or a time; a UserFunctionError if one raises (collective)."""
         if isinstance(self.load, Mapping):
             for constant, value in self.load.items():
                 now = ask_together(self.comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
@@ -193,6 +194,8 @@ class UnitedProblem:
                     set_constant(constant, now)
         elif self.load is not None:
             ask_together(self.comm, f"load({at:.6g})", self.load, at)
+        for contact in self.contacts:
+            contact.take_load(at)
 
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
@@ -311,13 +314,15 @@ class UnitedProblem:
             material.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
+        before = [pair.committed for pair in self.pairs]
         for pair in self.pairs:
             pair.commit()
             pair.project()
         self.motions = self._rigid_motions()
-        for contact in self.contacts:
+        for contact, state in zip(self.contacts, before):
             contact.look_at_ends()
             contact.look_at_corners(self.bodies.stiffness)
+            contact.look_at_wear(state, self.bodies.stiffness)
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -370,6 +375,8 @@ class UnitedProblem:
             if self.dynamics is not None:
                 self.dynamics.from_checkpoint(state.numbers)
                 self.step_control.from_checkpoint(state.numbers)
+            for contact in self.contacts:
+                contact.take_load(self.progress.factor if self.dynamics is None else self.dynamics.time, known=True)
 
         state.collect.append(collect)
         state.restore.append(restore)

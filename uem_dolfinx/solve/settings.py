@@ -21,7 +21,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.laws.law import as_law, parameters
+from uem_dolfinx.contact.laws.law import as_law, follows_load, parameters
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.given import described
 from uem_dolfinx.restart.numbering import DIGEST
@@ -80,7 +80,12 @@ class Settings:
                 words[f"{name}, {what}"] = str(getattr(contact, what))
             for k, value in enumerate(parameters(as_law(contact.friction))[1:], 2):
                 words[f"{name}, parameter {k} of friction"] = described(value)
-            values[f"{name}, friction"] = _extent(np.zeros(0) if contact.pair.friction is None else contact.pair.friction.value)
+            if follows_load(as_law(contact.friction)):
+                words[f"{name}, friction"] = "follows the load"
+            else:
+                values[f"{name}, friction"] = _extent([] if contact.pair.friction is None else contact.pair.friction.value)
+            if contact.pair.friction is not None and contact.pair.friction.wear is not None:
+                values[f"{name}, wear"] = _extent(contact.pair.friction.wear.k)
         if (d := self._dynamics) is not None:
             words |= {
                 "scheme": str(d.scheme),

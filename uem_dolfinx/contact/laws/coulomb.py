@@ -1,4 +1,4 @@
-"""Coulomb's law: friction up to a coefficient times the force along the normal, and up to a stress if one is given."""
+"""Coulomb's law: friction up to a coefficient times the force along the normal, and up to a stress or a force if one is given."""
 
 from __future__ import annotations
 
@@ -10,36 +10,50 @@ import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import InputError
 
 
 @dataclass(frozen=True, init=False)
 class Coulomb:
-    """A contactor slips where the force along the target reaches ``mu lam``, or ``limit A`` if that is less.
+    """A contactor slips where the force along the target reaches ``mu lam``, or ``limit A`` or ``force`` if that is less.
 
     Args:
         field: the coefficient mu, a number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
         limit: the largest stress that friction bears, a force per reference area, such as the yield stress in shear of the softer
             body; None for no limit.
+        force: the largest force of friction on each contactor, for contactors that are points; None for no limit.
 
     Raises:
-        InputError, InputTypeError: if ``limit`` is no positive number.
+        InputError, InputTypeError: if ``limit`` or ``force`` is no positive number, or both are given.
     """
 
-    field: float | Callable[[Array], npt.ArrayLike]
+    field: float | Callable[..., npt.ArrayLike]
     most: float | None
+    force: float | None
 
-    def __init__(self, field: float | Callable[[Array], npt.ArrayLike], limit: float | None = None):
+    def __init__(self, field: float | Callable[..., npt.ArrayLike], limit: float | None = None, *, force: float | None = None):
         object.__setattr__(self, "field", field)
         object.__setattr__(self, "most", None if limit is None else given.number("limit", limit, given.POSITIVE))
+        object.__setattr__(self, "force", None if force is None else given.number("force", force, given.POSITIVE))
+        if self.most is not None and self.force is not None:
+            raise InputError(
+                f"limit = {limit}, force = {force}: a limit is a stress on facets or a force on points: give one of them"
+            )
 
     @property
     def per_area(self) -> bool:
-        """Whether there is a limit."""
+        """Whether there is a limit of stress."""
         return self.most is not None
 
+    @property
+    def per_point(self) -> bool:
+        """Whether there is a limit of force."""
+        return self.force is not None
+
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
-        """The less of ``mu lam`` and the limit's ``limit A``, and mu or 0; see ``FrictionLaw``."""
-        if self.most is None:
+        """The less of ``mu lam`` and the limit, and mu or 0; see ``FrictionLaw``."""
+        if self.most is None and self.force is None:
             return value * lam, value
-        below = value * lam < self.most * area
-        return np.where(below, value * lam, self.most * area), np.where(below, value, 0.0)
+        most = np.full_like(lam, self.force) if self.most is None else self.most * area
+        below = value * lam < most
+        return np.where(below, value * lam, most), np.where(below, value, 0.0)

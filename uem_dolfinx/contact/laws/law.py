@@ -1,14 +1,16 @@
 """What a law of friction says, and how a law in one file is handed to a contact.
 
-A contactor that sticks bears any force along the target up to a limit; one that slips bears the limit against its way. The law is this
-limit and its derivative with the force along the normal, from which test rows are rotated. ``coulomb`` and ``tresca`` are examples of a
-file each: a law of the user's own is a class with the same attributes, and is given to ``Contact`` as ``friction``.
+A contactor that sticks bears any force along the target up to a limit; one that slips bears the limit against its way, or, by a law of
+rate, what it bears at the speed at which it slips. The law is this limit and its derivatives with the force along the normal, from which
+test rows are rotated, and with the speed. ``coulomb``, ``tresca`` and ``stribeck`` are examples of a file each: a law of the user's own is
+a class with the same attributes, and is given to ``Contact`` as ``friction``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias, cast
+from inspect import signature
+from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +22,9 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
-#: A number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
-Field: TypeAlias = float | Callable[[Array], npt.ArrayLike]
+#: A number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``; or one of place and of the load factor,
+#: in dynamics of the time, that returns ``(n,)`` or a number.
+Field: TypeAlias = float | Callable[..., npt.ArrayLike]
 
 
 class FrictionLaw(Protocol):
@@ -48,6 +51,33 @@ class FrictionLaw(Protocol):
         """
 
 
+@runtime_checkable
+class RateLaw(FrictionLaw, Protocol):
+    """A law of friction by which contactors that slip bear another force than those that are about to."""
+
+    @property
+    def timed(self) -> bool:
+        """Whether the speed of slip counts; statics has none."""
+
+    def sliding(self, value: Array, lam: Array, area: Array, speed: Array) -> tuple[Array, Array, Array]:
+        """Force along the target of contactors that slip, and its derivatives with the force along the normal and with the speed.
+
+        Args:
+            value: as of ``limit``.
+            lam: likewise.
+            area: likewise.
+            speed: of slip, 0 or positive ``(n,)``; zeros unless ``timed``.
+
+        Returns:
+            A force, a number and a force per speed for each contactor ``(n,)``.
+        """
+
+
+def of_rate(law: FrictionLaw) -> bool:
+    """Whether the speed of slip counts."""
+    return isinstance(law, RateLaw) and law.timed
+
+
 def as_law(friction: Any) -> FrictionLaw:
     """The law that a contact was given: Coulomb's where it is a number or a function; refuse all else."""
     if hasattr(friction, "limit"):
@@ -63,9 +93,9 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
     return law if hasattr(friction, "limit") else law.field
 
 
-def given_field(what: str, value: Any) -> Field:
-    """A number or a function of place that was given; refuse all else."""
-    return cast(Field, value) if callable(value) else given.number(what, value)
+def given_field(what: str, value: Any, within: given.Range = given.FINITE) -> Field:
+    """A number of a range or a function of place that was given; refuse all else."""
+    return cast(Field, value) if callable(value) else given.number(what, value, within)
 
 
 def parameters(law: FrictionLaw) -> list[Any]:
@@ -74,34 +104,75 @@ def parameters(law: FrictionLaw) -> list[Any]:
     return [law.field, *others]
 
 
-def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool) -> Array | None:
-    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)``; None if all are zero (collective).
+def follows_load(law: FrictionLaw) -> bool:
+    """Whether the law's parameter is a function of place and of the load factor or time, of two arguments."""
+    if not callable(law.field):
+        return False
+    try:
+        arguments = signature(law.field).parameters.values()
+    except (TypeError, ValueError):
+        # a function of C's
+        return False
+    asked = [a for a in arguments if a.default is a.empty and a.kind in (a.POSITIONAL_ONLY, a.POSITIONAL_OR_KEYWORD)]
+    return len(asked) == 2
+
+
+def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool, at: float) -> Array | None:
+    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)`` (collective).
+
+    Args:
+        law: of friction.
+        config: configuration of the displacement.
+        nodes: contactors ``(n,)``.
+        name: of the contact.
+        areas: whether the contactors have any.
+        at: load factor or time.
+
+    Returns:
+        The values; None if all are zero and stay so.
 
     Raises:
-        InputError, UserFunctionError: if the law needs areas and the contactors have none, or if a function of place is no good.
+        InputError, UserFunctionError: if the law needs areas and the contactors have none, or if a function is no good.
     """
     if law.per_area and not areas:
         raise InputError(f"contact '{name}': {type(law).__name__} needs areas, and points have none: give facets")
+    if getattr(law, "per_point", False) and areas:
+        raise InputError(
+            f"contact '{name}': a limit of the force on each contactor depends on the mesh where contactors are nodes of facets: give a "
+            "limit of the stress, or points"
+        )
+    n = len(nodes)
     if not callable(law.field):
-        return np.full(len(nodes), law.field) if law.field > 0 else None
-    value = asked_at(config, nodes, f"contact '{name}': friction", law.field, given.NOT_NEGATIVE)
-    return value if reduced(config.comm, int((value > 0).any())) else None
+        return np.full(n, law.field) if law.field > 0 else None
+    words, more = f"contact '{name}': friction", (at,) if follows_load(law) else ()
+    value = asked_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
+    return value if more or reduced(config.comm, int((value > 0).any())) else None
 
 
 def asked_at(
-    config: Configuration, nodes: Indices, words: str, f: Callable[[Array], npt.ArrayLike], within: given.Range
+    config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: float
 ) -> Array:
     """What a function of place, which ``words`` name, returns at the reference places of ``nodes (n,)``: ``(n,)`` (collective).
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned nodes ``(n,)``.
+        words: for messages.
+        f: the function.
+        within: values that it may have.
+        more: what else it is given, a load factor or time; a number then stands for all places.
 
     Raises:
         InputError, UserFunctionError: if it returns anything else than so many numbers of the range, or raises.
     """
-    places = np.zeros((3, len(nodes)))
+    n = len(nodes)
+    places = np.zeros((3, n))
     places[: config.gdim] = config.X[nodes].T
-    value = np.array(ask_together(config.comm, words, f, places), dtype=float)
+    value = np.array(ask_together(config.comm, words, f, places, *more), dtype=float)
+    if more and value.ndim == 0:
+        value = np.full(n, value)
     with agreed(config.comm):
-        if value.shape != (len(nodes),) or not within.holds(value).all():
-            raise InputError(
-                f"{words}(x) has shape {value.shape}: expected {len(nodes)} numbers, {within.words.replace('a ', '')}"
-            )
+        if value.shape != (n,) or not within.holds(value).all():
+            called = f"{words}({', '.join(['x', *(f'{one:.6g}' for one in more)])})"
+            raise InputError(f"{called} has shape {value.shape}: expected {n} numbers, {within.words.replace('a ', '')}")
     return value

@@ -1,0 +1,65 @@
+"""Friction that falls, or grows, with the speed of slip: static and kinetic coefficients, and what leads from one to the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+
+
+@dataclass(frozen=True, init=False)
+class Stribeck:
+    """A contactor begins to slip at ``static lam``, and slips at ``mu(v) lam`` with the speed v of its slip.
+
+        mu(v) = kinetic + (static - kinetic) exp(-v / velocity) + viscous v
+
+    With ``velocity=0`` mu falls to ``kinetic`` at once (stiction). The speed is that of the present time step, the slip over its
+    length, and the tangent is consistent: a law that grows with the speed, or falls, is as stable as the step is, and of its first
+    order. Where friction falls faster than the surface's stiffness k over the step can hold, ``-mu' lam / dt > k``, the law has no
+    single answer, and the step fails and is cut.
+
+    Args:
+        field: the static coefficient, a number, or a function as of ``Contact``; where it is 0 there is no friction.
+        kinetic: coefficient at high speed.
+        velocity: speed at which all but ``1/e`` of the difference has gone, or 0.
+        viscous: growth with the speed, one over a speed.
+
+    Raises:
+        InputError, InputTypeError: if a number is negative.
+    """
+
+    field: float | Callable[..., npt.ArrayLike]
+    kinetic: float
+    velocity: float
+    viscous: float
+    per_area = False
+
+    def __init__(
+        self, static: float | Callable[..., npt.ArrayLike], kinetic: float, velocity: float = 0.0, *, viscous: float = 0.0
+    ):
+        object.__setattr__(self, "field", static)
+        for name, value in (("kinetic", kinetic), ("velocity", velocity), ("viscous", viscous)):
+            object.__setattr__(self, name, given.number(name, value, given.NOT_NEGATIVE))
+
+    @property
+    def timed(self) -> bool:
+        """Whether mu depends on how fast contactors slip, rather than on whether they do."""
+        return self.velocity > 0.0 or self.viscous > 0.0
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """``static lam`` and static; see ``FrictionLaw``."""
+        return value * lam, value
+
+    def sliding(self, value: Array, lam: Array, area: Array, speed: Array) -> tuple[Array, Array, Array]:
+        """``mu lam``, mu and ``mu' lam``; see ``RateLaw``."""
+        above, slope = np.zeros_like(value), np.full_like(value, self.viscous)
+        if self.velocity > 0.0:
+            above = (value - self.kinetic) * np.exp(-speed / self.velocity)
+            slope = slope - above / self.velocity
+        mu = self.kinetic + above + self.viscous * speed
+        return mu * lam, mu, slope * lam
