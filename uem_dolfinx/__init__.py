@@ -37,16 +37,16 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "FloatingBodyError", "FrictionError", "GeneralContact", "HistoryWriter",
-    "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
-    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError",
-    "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane",
-    "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError",
-    "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "VonMises", "animate",
-    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
-    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "multigrid_options", "newmark",
-    "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test",
-    "time_steps", "timing", "timings", "write_checkpoint",
+    "Energies", "EnergyBook", "EnergyGivenError", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact",
+    "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass",
+    "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError",
+    "OutputError", "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid",
+    "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError",
+    "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Voce",
+    "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh",
+    "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh",
+    "read_mesh", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -118,6 +118,8 @@ from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.geometry.mesh_files import read_mesh
+    from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
+    from uem_dolfinx.materials.hardening import Voce
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
@@ -126,7 +128,8 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
-    "Stribeck", "contact.laws.stribeck", "geometry.mesh_files", "read_mesh",
+    "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
+    "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",

@@ -85,6 +85,22 @@ def plastic(comm: MPI.Comm) -> Ramps:
     return Ramps(b.scene, problem, [(nothing, 5)])
 
 
+def forming(comm: MPI.Comm) -> Ramps:
+    """A soft body flattened by a rigid plane with friction."""
+    b = blocks(comm, "quadrilateral", 2, 1, gap=1.0)
+    metal, press = (
+        uem.FinitePlasticity(b.u, 100.0, 0.3, [(0.0, 1.0), (0.1, 2.0)], 1.0, kind="plane_strain"),
+        uem.RigidPlane([0, 0], [0, -1.0]),
+    )
+    contact = uem.Contact(b.low, press, friction=0.1)
+    bcs = [*clamp(b.V, b.bottom, 1), *clamp(b.V, b.scene.tag("side", 0, at(0, 0.0)), 0), *clamp(b.V, b.top), *clamp(b.V, b.high)]
+    problem = uem.UnitedProblem(
+        metal.residual(ufl.TestFunction(b.V)), b.u, bcs=bcs, contacts=[contact], materials=[metal], rtol=1e-10,
+        load=lambda factor: press.move([0.0, -0.2 * factor]),
+    )  # fmt: skip
+    return Ramps(b.scene, problem, [(nothing, 5)])
+
+
 def rolling(comm: MPI.Comm) -> Ramps:
     """A rigid disc that the load moves and turns, and a Constant would not do; solved by CG."""
     body = box("triangle", [-1.0, -1.0], [1.0, 0.0], [8, 4])
@@ -116,4 +132,4 @@ def loaded(comm: MPI.Comm) -> Ramps:
     return Ramps(b.scene, problem, [(nothing, 5)])
 
 
-RAMPS = {"sliding": sliding, "ramped": ramped, "plastic": plastic, "rolling": rolling, "loaded": loaded}
+RAMPS = {"sliding": sliding, "ramped": ramped, "plastic": plastic, "forming": forming, "rolling": rolling, "loaded": loaded}

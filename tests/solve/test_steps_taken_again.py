@@ -30,6 +30,7 @@ FAMILY = {
     "friction, 3d": {"friction": 0.2, "cell": "hexahedron"},
     "plastic": {"plastic": True},
     "plastic, friction": {"plastic": True, "friction": 0.2},
+    "finite plasticity": {"plastic": uem.FinitePlasticity},
 }
 
 
@@ -46,7 +47,8 @@ class Warm:
         g, self.swelling = b.gdim, fem.Constant(b.scene.mesh, 0.0)
         self.value = fem.Constant(b.scene.mesh, np.array([0.06, *[0.0] * (g - 2), -0.04]))
         kind, v = ("3d" if g == 3 else "plane_strain"), ufl.TestFunction(b.V)
-        self.laws = [uem.VonMises(b.u, 1.0, 0.3, 0.02, 0.1, kind=kind)] if plastic else []
+        law = uem.VonMises if plastic is True else plastic
+        self.laws = [law(b.u, 1.0, 0.3, 0.02, 0.1, kind=kind)] if plastic else []
         F = self.laws[0].residual(v) if plastic else st_venant(b.u, modulus(b.scene, 1.0, 2.0))
         up = ufl.conditional(ufl.gt(ufl.SpatialCoordinate(b.scene.mesh)[g - 1], 0.0), 1.0, 0.0)
         F -= self.swelling * up * ufl.div(v) * ufl.dx

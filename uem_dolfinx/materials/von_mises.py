@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import weakref
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import ufl
@@ -24,6 +24,9 @@ from uem_dolfinx.materials.elastic import KINDS, POISSON, check_kind, green_lagr
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
 from uem_dolfinx.parallel import agree
+
+if TYPE_CHECKING:
+    from uem_dolfinx.materials.logarithmic import Flowed
 
 STRAINS = ("small", "green_lagrange")
 #: Degrees of the quadrature of stress and of pressure, by the displacement's degree, on simplices and on tensor-product cells;
@@ -105,12 +108,16 @@ class VonMises:
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
         self._read_parameters(E, nu, yield_stress, hardening)
         self._create_functions()
-        self._strain = self._points.compile(self._vector(self._lagrangian(u)))
-        self._volume_change = self._pressure_points.compile(self._dilatation(self._lagrangian(u)))
+        self._compile()
         self._spread = self._spreading()
         #: Outcome of the last update.
-        self._trial: Returned
+        self._trial: Returned | Flowed
         self.update()
+
+    def _compile(self) -> None:
+        """Prepare the strain at the points of stress, and its trace at those of pressure."""
+        self._strain = self._points.compile(self._vector(self._lagrangian(self.u)))
+        self._volume_change = self._pressure_points.compile(self._dilatation(self._lagrangian(self.u)))
 
     def _degrees(self, quadrature_degree: int | None) -> tuple[int, int]:
         """Degrees of the quadrature of stress and of pressure."""
@@ -179,20 +186,28 @@ class VonMises:
         agree(self.comm, found)
         return values
 
-    def _create_functions(self) -> None:
-        """Functions at the quadrature points, zero outside of this material's cells."""
+    def _create_history(self) -> int:
+        """Stress and history at the quadrature points, zero outside of this material's cells: the number of their components."""
         size, at = {"3d": 6, "plane_strain": 4, "plane_stress": 3, "axisymmetric": 4}[self.kind], self._points
         self.stress = at.create_function("stress", size)
         self.plastic_strain = at.create_function("plastic_strain", size)
         self.peeq = at.create_function("peeq")
         self.history: dict[str, fem.Function] = {f.name: f for f in (self.plastic_strain, self.peeq)}
+        self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
+        self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
+        return size
+
+    def _create_functions(self) -> None:
+        """Functions at the quadrature points, zero outside of this material's cells."""
+        size, at = self._create_history(), self._points
         # what the forms hold: the deviator where the pressure goes its own way, and the tangent
         self._s = self.stress if self.kind == "plane_stress" else at.create_function("deviator", size)
         self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
-        self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
-        self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
-        # by which a problem that gets them in F knows that it needs this law
-        for f in (self.stress, self._s, self._a, self._c, self._m, *self.history.values()):
+        self._own(self.stress, self._s, self._a, self._c, self._m, *self.history.values())
+
+    def _own(self, *functions: fem.Function) -> None:
+        """Mark Functions as fields of this law, by which a problem that gets them in F knows that it needs it."""
+        for f in functions:
             f.material = weakref.ref(self)
 
     def _lagrangian(self, u: Any) -> Expr:
@@ -264,17 +279,21 @@ class VonMises:
                 stress = trial.stress.copy()
                 if self.kind != "plane_stress":
                     stress[:, :3] += (self._bulk[:, None] * (self._volume_changes() @ self._spread.T)).reshape(-1, 1)
-            bad, error = np.flatnonzero(~np.isfinite(stress).all(axis=1)), None
-            if len(bad):
-                error = NotFiniteError(
-                    f"strain or stress of the cell at {self._points.where(bad[0])} is NaN or infinite: "
-                    "check the displacement's initial values, the loads and the Dirichlet conditions, or take smaller load steps"
-                )
-            agree(self.comm, error)
+            self._refuse_infinite(stress)
             self._trial = trial
             for f, values in ((self._s, trial.stress), (self._a, trial.a), (self._c, trial.c), (self._m, trial.m)):
                 self._points.write(f, values)
             self._points.write(self.stress, stress)
+
+    def _refuse_infinite(self, stress: Array) -> None:
+        """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""
+        bad, error = np.flatnonzero(~np.isfinite(stress).all(axis=1)), None
+        if len(bad):
+            error = NotFiniteError(
+                f"strain or stress of the cell at {self._points.where(bad[0])} is NaN or infinite: "
+                "check the displacement's initial values, the loads and the Dirichlet conditions, or take smaller load steps"
+            )
+        agree(self.comm, error)
 
     def _volume_changes(self) -> Array:
         """Trace of the strain at the pressure points ``(n_cells, n_pressure_points)``."""
@@ -314,8 +333,7 @@ class VonMises:
             DG0 Functions by name, filled anew by every call (collective).
         """
         root = np.sqrt(0.5)
-        stress, plastic_strain = self._points.read(self.stress), self._points.read(self.plastic_strain)
-        full = {"stress": stress, "plastic_strain": plastic_strain}
+        full = {"stress": self._points.read(self.stress), "plastic_strain": self._plastic_strains()}
         for name, values in full.items():
             if values.shape[1] == 3:
                 across = 0 * values[:, 0] if name == "stress" else -values[:, 0] - values[:, 1]
@@ -330,6 +348,10 @@ class VonMises:
         for name, values in fields.items():
             self._points.average(values, self._averages[name])
         return dict(self._averages)
+
+    def _plastic_strains(self) -> Array:
+        """Committed plastic strains for output ``(n_points, size)``."""
+        return self._points.read(self.plastic_strain)
 
     @cached_property
     def _averages(self) -> dict[str, fem.Function]:

@@ -1,0 +1,177 @@
+"""Von Mises plasticity in finite strain: multiplicative split, logarithmic elastic strain, exponential return map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from ufl.core.expr import Expr
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.geometry.tags import Part
+from uem_dolfinx.log import timed
+from uem_dolfinx.materials.elastic import POISSON
+from uem_dolfinx.materials.hardening import Linear, Saturating, Voce, YieldCurve, read_table
+from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return, to_components, to_tensors
+from uem_dolfinx.materials.von_mises import VonMises
+
+#: Components of F that vary in each kind, by row and column.
+VARYING = {"3d": np.divmod(np.arange(9), 3), "plane_strain": np.divmod(np.array([0, 1, 3, 4]), 3)}
+
+
+class FinitePlasticity(VonMises):
+    """Elasto-plasticity of von Mises at strains and rotations of any size, as in metal forming, with isotropic hardening.
+
+        F = F_e F_p,    tau = kappa ln(J) 1 + 2 mu dev(ln V_e),    q(tau) <= yield stress at peeq
+
+    with the Kirchhoff stress ``tau``, ``J = det F`` and the elastic stretch ``V_e``. The flow is integrated by the exponential map,
+    ``det F_p = 1`` to rounding, so that the radial return of small strains acts on the logarithmic strain; the result is hyperelastic
+    in ``F_e``, and no rigid rotation changes it. In small strains it is ``VonMises``, to second order in the strain.
+
+    Volumes are treated as there, so that the same cells do not lock: what resists their change is integrated by a rule of its own,
+    with one point in quadrilaterals and hexahedra of degree 1. That part is an energy in ``J``, and the tangent is symmetric.
+
+    Args:
+        u: displacement, a Function of a vector Lagrange space.
+        E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
+        nu: Poisson's ratio.
+        yield_stress: in uniaxial tension, force per present area times J; infinite where the body is elastic. Or a table: pairs
+            (equivalent plastic strain, yield stress), the strains from 0 upwards, with straight lines between.
+        hardening: increase of the yield stress per equivalent plastic strain, with a table beyond its last point; or ``Voce``.
+        kind: ``"3d"`` or ``"plane_strain"``.
+        cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
+        quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
+
+    Attributes:
+        stress: Cauchy stress at quadrature points, as of the last ``update``, with the components of ``Returned``.
+        plastic_strain: ``(1 - C_p^-1) / 2`` there, as committed; ``cell_averages`` give ``ln(C_p) / 2``.
+        peeq: equivalent plastic strain there, as committed.
+        history: the committed Functions by name, all that the material remembers.
+
+    Raises:
+        InputError, InputTypeError: for an unknown word, or a parameter out of its range.
+        SpaceError, TagError: as ``VonMises``.
+    """
+
+    def __init__(
+        self,
+        u: fem.Function,
+        E: Any,
+        nu: Any,
+        yield_stress: Any,
+        hardening: Any = 0.0,
+        *,
+        kind: str = "3d",
+        cells: Part | None = None,
+        quadrature_degree: int | None = None,
+    ):
+        given.word("kind", kind, tuple(VARYING))
+        super().__init__(u, E, nu, yield_stress, hardening, kind=kind, cells=cells, quadrature_degree=quadrature_degree)
+
+    def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
+        """Take the parameters of every cell, and repeat them for its points."""
+        E, nu, count = self._cellwise("E", E, given.POSITIVE), self._cellwise("nu", nu, POISSON), len(self._points.points)
+        self._E, self._nu, self._bulk = np.repeat(E, count), np.repeat(nu, count), E / (3 * (1 - 2 * nu))
+        self._mu = self._E / (2 * (1 + self._nu))
+        #: Outcome of the last update.
+        self._trial: Flowed
+        #: Yield stress over peeq.
+        self._curve: YieldCurve
+        if isinstance(yield_stress, (Sequence, np.ndarray)) and not isinstance(yield_stress, str):
+            self._curve = read_table(yield_stress, hardening)
+            return
+        first = np.repeat(self._cellwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE), count)
+        if isinstance(hardening, Voce):
+            self._curve = Saturating(first, hardening)
+        else:
+            self._curve = Linear(first, np.repeat(self._cellwise("hardening", hardening, given.NOT_NEGATIVE), count))
+
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """Parameters at this rank's quadrature points ``(n_points,)``, and those of its yield curve, by name."""
+        return {"E": self._E, "nu": self._nu, **self._curve.parameters}
+
+    def _create_functions(self) -> None:
+        """Functions at the quadrature points, zero outside of this material's cells."""
+        self._create_history()
+        count = len(VARYING[self.kind][0])
+        # what the forms hold: the deviator's first Piola-Kirchhoff stress, and the upper triangle of its derivative by F
+        self._piola = self._points.create_function("first_piola", count)
+        self._upper = self._points.create_function("tangent", count * (count + 1) // 2)
+        self._own(self.stress, self._piola, self._upper, *self.history.values())
+
+    def _compile(self) -> None:
+        """Prepare the displacement's gradient at the points of stress, and ln J at those of pressure."""
+        self._strain = self._points.compile(self._components(self.u))
+        self._volume_change = self._pressure_points.compile(ufl.ln(ufl.det(self._deformation())))
+
+    def _gradient(self, w: Any) -> Expr:
+        """Gradient of a displacement ``(3, 3)``."""
+        G = ufl.grad(w)
+        return G if self.kind == "3d" else ufl.as_matrix([[G[0, 0], G[0, 1], 0], [G[1, 0], G[1, 1], 0], [0, 0, 0]])
+
+    def _components(self, w: Any) -> Expr:
+        """Those of a gradient that vary."""
+        G = self._gradient(w)
+        return ufl.as_vector([G[i, j] for i, j in np.transpose(VARYING[self.kind]).tolist()])
+
+    def _deformation(self) -> Expr:
+        """F ``(3, 3)``."""
+        return ufl.Identity(3) + self._gradient(self.u)
+
+    def residual(self, v: Any) -> ufl.Form:
+        """Internal virtual work of the material's cells; see ``VonMises.residual``."""
+        F = self._deformation()
+        pressed = self._kappa * ufl.ln(ufl.det(F)) * ufl.inner(ufl.inv(F).T, self._gradient(v)) * self._pressure_points.dx
+        return ufl.dot(self._piola, self._components(v)) * self._points.dx + pressed
+
+    def stiffness(self, du: Any, v: Any) -> ufl.Form:
+        """The deviator's part of the tangent, which ``ufl.derivative(residual(v), u)`` cannot see; see ``VonMises.stiffness``."""
+        count = len(VARYING[self.kind][0])
+        number = np.zeros((count, count), int)
+        number[np.triu_indices(count)] = np.arange(self._upper.function_space.dofmap.index_map_bs)
+        number = np.maximum(number, number.T)
+        A = ufl.as_matrix([[self._upper[int(k)] for k in row] for row in number])
+        return ufl.inner(ufl.dot(A, self._components(du)), self._components(v)) * self._points.dx
+
+    def update(self) -> None:
+        """Stress and tangent at the present displacement, from the committed history; NotFiniteError if they are not (collective)."""
+        with timed("return mapping"):
+            varying = VARYING[self.kind]
+            with np.errstate(over="ignore", invalid="ignore"):
+                values = self._points.evaluate(self._strain)
+                gradient = np.zeros((len(values), 3, 3))
+                gradient[:, varying[0], varying[1]] = values
+                before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
+                flowed = logarithmic_return(gradient, *before, self._mu, self._curve, varying)
+                logarithm = self._volume_changes() @ self._spread.T
+                stress = flowed.stress.copy()
+                stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
+                stress *= np.exp(-logarithm).reshape(-1, 1)
+            self._refuse_infinite(stress)
+            self._trial = flowed
+            rows, columns = np.triu_indices(len(varying[0]))
+            self._points.write(self._piola, flowed.first_piola)
+            self._points.write(self._upper, flowed.tangent[:, rows, columns])
+            self._points.write(self.stress, stress)
+
+    def energy(self) -> float:
+        """Elastic energy stored at the present displacement (collective)."""
+        self.update()
+        pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
+        return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
+
+    def dissipation(self) -> float:
+        """Plastic work done since the start, as committed, what hardening stores of it included (collective)."""
+        return self._points.integrate(self._curve.work(self._points.read(self.peeq)[:, 0]))
+
+    def _plastic_strains(self) -> Array:
+        """``ln(C_p) / 2`` as committed ``(n_points, size)``."""
+        values = self._points.read(self.plastic_strain)
+        change, axes = np.linalg.eigh(to_tensors(values))
+        strains = -np.log1p(-2 * change) / 2
+        return to_components((axes * strains[:, None, :]) @ axes.transpose(0, 2, 1), values.shape[1])
