@@ -67,7 +67,9 @@ material = uem.LinearElastic(E, nu, kind="plane_strain")
 turned = fem.Function(V)
 bcs = [uem.dirichlet(V, tags["outside"]), fem.dirichletbc(turned, fem.locate_dofs_topological(V, 1, tags["hole"].entities))]
 contact = uem.Contact(tags["seat"], tags["bore"], coupling=args.coupling, sliding="small", friction=mu, adjust=True, name="fit")
-problem = uem.UnitedProblem(material.residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hub_", verbose=args.verbose)
+problem = uem.UnitedProblem(
+    material.residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[contact], petsc_options_prefix="hub_", verbose=args.verbose
+)
 
 
 def mean_pressure() -> float:
@@ -79,6 +81,7 @@ def mean_pressure() -> float:
 # %% [markdown]
 # ## The steps
 # By 1.5 times the angle at which the fit slips.
+
 
 # %%
 def fit(factor: float) -> None:
@@ -116,7 +119,9 @@ if args.plot:
         uem.plot_scene(problem, left, field=shear, label="shear stress / p", levels=np.linspace(-0.5, 0.1, 13), arrows=False)
         if right is not None:
             right.plot(*([1e3 * r[k] / scale for r in rows] for k, scale in (("angle", 1.0), ("torque", 1e3 * most))), "o-", ms=4)
-            right.plot([1e3 * r["angle"] for r in rows], [r["elastic"] / most for r in rows], "k--", lw=0.8, label="in closed form")
+            right.plot(
+                [1e3 * r["angle"] for r in rows], [r["elastic"] / most for r in rows], "k--", lw=0.8, label="in closed form"
+            )
             right.set(xlabel="angle in mrad", ylabel="torque / (2 pi mu p b^2)")
             right.legend(frameon=False)
 if args.output:

@@ -48,7 +48,9 @@ def patch(dim: int, degree: int, cells: tuple[int, int], side: str, quads: int =
     nodes = np.unique(np.concatenate([fem.locate_dofs_topological(V, dim - 1, tag.entities) for tag in outside]))
     sides = {"lower": tags["top_1"], "upper": tags["bottom_2"]}
     tie = uem.Contact(sides.pop(side), *sides.values(), coupling=args.coupling, tied=True)
-    problem = uem.UnitedProblem(material.residual(u, v) * ufl.dx, u, bcs=[fem.dirichletbc(exact, nodes.astype(np.int32))], contacts=[tie])
+    problem = uem.UnitedProblem(
+        material.residual(u, v) * ufl.dx, u, bcs=[fem.dirichletbc(exact, nodes.astype(np.int32))], contacts=[tie]
+    )
     problem.solve()
     stress = [fem.Function(uem.function_space(mesh, ("DG", 0), (dim, dim))) for _ in range(2)]
     for s, field in zip(stress, (u, exact)):

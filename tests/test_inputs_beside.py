@@ -191,8 +191,9 @@ def mixed_space(mesh):
 def test_a_part_of_a_mixed_space():
     b = blocks(COMM, "triangle", 2, 2)
     W = mixed_space(b.scene.mesh)
-    for call in (lambda: uem.dirichlet(W.sub(0), b.bottom), lambda: uem.dirichlet(W, b.bottom)):
-        refused(uem.SpaceError, ("whole Lagrange space", "mixed"), call)
+    for V in (W, W.sub(0).sub(1)):
+        refused(uem.SpaceError, ("whole Lagrange space", "mixed"), lambda V=V: uem.dirichlet(V, b.bottom))
+    refused(uem.InputError, ("component is None", "a condition for each"), lambda: uem.dirichlet(W.sub(0), b.bottom))
     refused(uem.SpaceError, ("V is a part",), lambda: uem.lumped_mass(W.sub(0), 1.0))
 
 

@@ -121,7 +121,8 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
 
     Args:
         domain: the mesh.
-        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)``.
+        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)``; several
+            of these in a list make a mixed space, as ``[("Lagrange", 2, (2,)), 1]`` of a displacement and a pressure.
         shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
 
     Returns:
@@ -130,6 +131,8 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
     Raises:
         InputError: for another element.
     """
+    if isinstance(element, list) and len(element) > 1 and not isinstance(element[0], str):
+        return _mixed_space(domain, [function_space(domain, part).ufl_element() for part in element])
     given = ("Lagrange", element) if isinstance(element, (int, np.integer)) else element
     if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str):
         raise InputError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
@@ -143,6 +146,14 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
         return _space(domain, given[0], int(given[1]), tuple(shape))
     except Exception as error:  # of which class depends on the version of UFL
         raise InputError(f"element = {element!r} ({error}): expected a family and a degree that DOLFINx knows") from error
+
+
+def _mixed_space(domain: Any, elements: list[Any]) -> Any:
+    if DOLFINX_VERSION < (0, 7):
+        return fem.FunctionSpace(domain, ufl.MixedElement(elements))
+    from basix.ufl import mixed_element
+
+    return fem.functionspace(domain, mixed_element(elements))
 
 
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
@@ -183,6 +194,24 @@ def cell_dofs(V: Any) -> npt.NDArray[np.int32]:
 def cell_table(rows: Any, width: int) -> npt.NDArray[np.int32]:
     """Rows of so many numbers, one for each cell, from an array or an adjacency list; also where a rank has no cell."""
     return np.asarray(getattr(rows, "array", rows), dtype=np.int32).reshape(-1, width)
+
+
+def is_mixed(V: Any) -> bool:
+    """Whether a space is of a mixed element, whose parts are spaces of their own."""
+    return bool(V.num_sub_spaces > 1 and V.dofmap.index_map_bs == 1)
+
+
+def is_part(V: Any) -> bool:
+    """Whether a space is a part of a mixed one, and not a component of a vector space or of such a part."""
+    return len(V.component()) == 1 and V.dofmap.index_map_bs == 1
+
+
+def part_dofs(V: Any, i: int) -> npt.NDArray[np.int32]:
+    """Local d.o.f. of a mixed space that its part i has in every cell ``(n_cells incl. ghosts, n)``, components next to each other."""
+    cells, part = V.mesh.topology.index_map(V.mesh.topology.dim), V.sub(i).dofmap
+    n_cells = cells.size_local + cells.num_ghosts
+    rows = np.asarray(getattr(part.list, "array", part.list), dtype=np.int32)
+    return rows.reshape(n_cells, -1) if n_cells else rows.reshape(0, 1)
 
 
 def lagrange_degree(V: Any) -> int | None:

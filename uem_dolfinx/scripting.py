@@ -30,11 +30,12 @@ def dirichlet(
     """Prescribe the displacement, or one component of it, at all nodes of a part of the mesh (collective).
 
     Args:
-        V: a Lagrange space with ``size`` components.
+        V: a Lagrange space with ``size`` components, or a part of a mixed one, as ``W.sub(0)``.
         tag: facets, or entities of any dimension: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
         component: 0 is x; None prescribes all components.
         value: a number, for all components a vector ``(size,)`` as well, or a Constant of one of these shapes, or a Function of ``V``
-            (of a scalar space of the same degree for one component), both of which may be changed between steps.
+            (of a scalar space of the same degree for one component), both of which may be changed between steps. A vector that is a
+            part of a mixed space takes one component after the other.
 
     Returns:
         DOLFINx's Dirichlet condition.
@@ -50,20 +51,27 @@ def dirichlet(
     tdim = mesh.topology.dim
     tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
     mesh.topology.create_connectivity(tag.dim, tdim)
-    sub = V if component is None or V.dofmap.index_map_bs == 1 else V.sub(int(component))
+    part = compat.is_part(V)
+    sub = V if component is None or V.num_sub_spaces < 2 else V.sub(int(component))
     if not isinstance(value, fem.Function):
         return compat.dirichletbc(value, fem.locate_dofs_topological(sub, tag.dim, tag.entities), sub)
-    if sub is V:
+    if sub is V and not part:
         return fem.dirichletbc(value, fem.locate_dofs_topological(V, tag.dim, tag.entities))
     return compat.dirichletbc(value, fem.locate_dofs_topological((sub, value.function_space), tag.dim, tag.entities), sub)
 
 
 def _checked(V: Any, component: int | None, value: Any) -> Any:
     """The value as ``fem.dirichletbc`` takes it, which fits the space and is finite."""
-    degree, size = compat.lagrange_degree(V), V.dofmap.index_map_bs
-    if degree is None or V.dofmap.bs != size or len(V.component()):
+    part, degree = compat.is_part(V), compat.lagrange_degree(V)
+    size = max(V.num_sub_spaces, 1) if part else V.dofmap.index_map_bs
+    if degree is None or not (part or (V.dofmap.bs == size and not len(V.component()))):
         raise SpaceError(
-            "V is no whole Lagrange space: expected that of the displacement, no part of it or of a mixed one; name a component"
+            "V is no whole Lagrange space: expected that of the displacement, or a part of a mixed one as W.sub(0); name a component "
+            "of it by the argument component"
+        )
+    if part and size > 1 and component is None:
+        raise InputError(
+            f"component is None: expected one of 0 to {size - 1} for a part of a mixed space; make a condition for each"
         )
     if component is not None and component not in range(size):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
@@ -71,7 +79,7 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
     if isinstance(value, fem.Function):
         own, array = value.function_space, value.x.array
         scalar = own.dofmap.index_map_bs == 1 and compat.lagrange_degree(own) == degree and own.mesh is V.mesh
-        if not (own == V if n == size else scalar):
+        if not (own == V if n == size and not part else scalar):
             wanted = "the condition's space" if n == size else f"a scalar Lagrange space of degree {degree} on its mesh"
             raise SpaceError(f"the value '{value.name}' of a Dirichlet condition is no Function of {wanted}")
     else:

@@ -297,7 +297,7 @@ def test_the_sign_of_the_determinant():
         P, Q, K = (gathered_matrix(A) for A in (state.trial.P, state.test.P, scene.problem.bodies.tangent.K))
         used = np.abs(P).max(axis=0) > 0
         assert (np.linalg.slogdet((Q.T @ K @ P)[np.ix_(used, used)])[0] < 0) == negative == system.solver.negative
-        system._not_unique = state if negative else None
+        system._not_unique = (state, True) if negative else None
         if negative:
             refused(uem.FrictionError, "more than one answer", system.end_step)
         else:

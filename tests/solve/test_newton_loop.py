@@ -22,6 +22,7 @@ class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none: bodies and ``ContactMethod`` in one."""
 
     exact, iterative, passing, fits, convex, in_contact = True, False, False, False, False, False
+    unknowns = SimpleNamespace(norms=PETSc.Vec.norm, work=PETSc.Vec.dot)
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0

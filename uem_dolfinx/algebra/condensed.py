@@ -37,6 +37,8 @@ MOST_COMPONENTS = 3_000
 class Condensed:
     """The factorisation of one K without the components of the contact, and the united problem that was made of it last.
 
+    Not of mixed problems: without those components a body that keeps its volume may be enclosed, and its matrix be singular.
+
     Args:
         space: the space that K acts on.
     """

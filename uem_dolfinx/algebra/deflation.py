@@ -103,7 +103,7 @@ def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bo
 def without(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
     """A copy of A with nodes ``pressed (n_owned,)`` by much stiffer contactors crossed out (collective)."""
     rest = A.copy()
-    first = space.block * int(space.index_map.local_range[0])
+    first = space.block * space.first
     rest.zeroRowsColumns((np.flatnonzero(P.used & pressed[:, None]) + first).astype(PETSc.IntType))
     rest.setBlockSize(space.block)
     rest.setNearNullSpace(A.getNearNullSpace())
@@ -113,7 +113,7 @@ def without(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc
 def deflated(space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.Mat:
     """W for nodes ``pressed (n_owned,)`` by much stiffer contactors; the last rank has the columns of the modes (collective)."""
     g, n, comm = space.block, space.n_owned, space.comm
-    first = g * int(space.index_map.local_range[0])
+    first = g * space.first
     touched = PETSc.IS().createGeneral(np.flatnonzero(np.repeat(pressed, g)).astype(PETSc.IntType) + first, comm=PETSc.COMM_SELF)
     A.increaseOverlap(touched, 1)
     near = np.zeros((n, 1), dtype=bool)

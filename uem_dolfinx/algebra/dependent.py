@@ -137,7 +137,7 @@ class IndependentEquations:
         space = self._space
         independent = UnitingEquations.join([group.independent for group in self._groups], space.block)
         solved, self._scattered = send(space.comm, independent, space.owner_of(independent.node))
-        solved = replace(solved, node=(solved.node - space.index_map.local_range[0]).astype(np.int32))
+        solved = replace(solved, node=(solved.node - space.first).astype(np.int32))
         self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], space.block)
 
     def of_given(self, of_independent: Bools) -> Bools:

@@ -10,6 +10,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
 
 #: A matrix is symmetric if no entry differs from the one across by more than this part of the root of their diagonals' product.
@@ -109,14 +110,21 @@ def stiffen(A: PETSc.Mat, K: PETSc.Mat, idle: Bools) -> None:
     A.setDiagonal(diagonal)
 
 
-def is_symmetric(A: PETSc.Mat, like: PETSc.Vec) -> bool:
+def is_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
     """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective).
 
-    ``like`` is a vector of its layout.
+    ``space`` is what it acts on. Unknowns of other fields may have no diagonal: their largest entry then takes its place, over the root
+    of the largest diagonal.
     """
-    size, one, other = (like.duplicate() for _ in range(3))
+    size, one, other = (space.vector() for _ in range(3))
     A.getDiagonal(size)
     root = np.sqrt(np.abs(size.array_r))
+    if space.mixed:
+        largest = float(np.sqrt(size.norm(PETSc.NormType.INFINITY))) or 1.0
+        starts, _, values = A.getValuesCSR()
+        # every line has its diagonal
+        lines = np.maximum.reduceat(np.abs(values), starts[:-1]) if len(values) else values
+        root = np.where(root > 0.0, root, lines / largest)
     with np.errstate(divide="ignore", invalid="ignore"):
         size.array[:] = np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], len(root)) / root
         A.mult(size, one)

@@ -47,7 +47,9 @@ class KeptFactor:
         self._made_with: Any = None
 
     def keep(self, pc: PETSc.PC, P: Restriction, K: PETSc.Mat) -> None:
-        """Take a factorisation that has just been made."""
+        """Take a factorisation that has just been made; with other fields none, since what is left of a force may be all of a heat."""
+        if self.space.mixed:
+            return
         self._pc, self._made_with = pc, (P.used, K.getDiagonal())
 
     def drop(self) -> None:

@@ -45,13 +45,13 @@ class UnitedSolver:
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
         self.space = space
-        size = space.block * space.index_map.size_global
+        size = space.block * space.n_global
         with agreed(space.comm):
             check_options({} if options is None else options, prefix)
         given.alike(space.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
         self._prefix = prefix
         #: Options that are asked for first, and those that take over for the rest of a step where they fail or do not suit.
-        self._first, self._instead = default_options(size, space.gdim) if options is None else (dict(options), {})
+        self._first, self._instead = default_options(size, space.gdim, space.mixed) if options is None else (dict(options), {})
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self._first or PETSc.Options(prefix).hasName("ksp_rtol")
@@ -144,7 +144,7 @@ class UnitedSolver:
     @property
     def needs_near_null_space(self) -> bool:
         """Whether the preconditioner can use the rigid-body modes."""
-        return self.pc.getType() in ("gamg", "ml", "bddc")
+        return self.pc.getType() in ("gamg", "ml", "bddc") and not self.space.mixed
 
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
@@ -199,7 +199,7 @@ class UnitedSolver:
                 stiffen(self._A, K, ~restriction.used.ravel())
         else:
             self._A = self._united.update(restriction, restriction, K, G)
-        if not (symmetric := is_symmetric(self._A, self.space.vector())) and self._instead and self.iterative:
+        if not (symmetric := is_symmetric(self._A, self.space)) and self._instead and self.iterative:
             self._use(self._instead)
         self._adapt(symmetric)
         self._keep_preconditioner(restriction.equations)
@@ -228,7 +228,7 @@ class UnitedSolver:
         no factorisation is kept then, or from the second matrix of a K on. Where a factorisation that is kept serves it is noted.
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
-        pays = not self.iterative and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
+        pays = not (self.iterative or self.space.mixed) and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
         pays = pays and (self.lasting or self._petrov_galerkin or again)
         serves = pays and self._condensed.serves(P, Q, K, G)
         if not (serves or self.lasting or self._petrov_galerkin) and self._kept.serves(P, K):
@@ -242,7 +242,7 @@ class UnitedSolver:
 
     def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
         """Factorise K without the components of the contact; whether that can be done, and pays (collective)."""
-        pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K, self.space.vector())
+        pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K, self.space)
         pc.setOptionsPrefix(self._prefix)
         pc.setType((self.pc.getType() if self._symmetric else self._types[1]) if symmetric else "lu")
         with timed("factorisation or preconditioner set-up"), self._in_database(**options):
@@ -255,7 +255,7 @@ class UnitedSolver:
 
     def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
         """Put multigrid into a deflation where contactors are much stiffer than what they press on (collective)."""
-        if self.pc.getType() not in MULTIGRID:
+        if self.pc.getType() not in MULTIGRID or self.space.mixed:
             return
         with timed("deflation"):
             pressed = pressed_hard(self.space, self._A, K, restriction)
@@ -312,7 +312,7 @@ class UnitedSolver:
         self.pc.setReusePreconditioner(bool(keep))
 
     @property
-    def _tells_sign(self) -> bool:
+    def tells_sign(self) -> bool:
         """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
         return self._petrov_galerkin and mumps.solves(self.pc)
 
@@ -321,12 +321,12 @@ class UnitedSolver:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
         if self._on_condensed:
             return self._petrov_galerkin and self._condensed.negative
-        return self._tells_sign and mumps.is_negative(self.pc)
+        return self.tells_sign and mumps.is_negative(self.pc)
 
     @property
     def indefinite(self) -> bool:
-        """Whether the symmetric united matrix that was factorised last has negative eigenvalues, as far as MUMPS tells."""
-        return self._condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc))
+        """Whether the symmetric matrix factorised last has negative eigenvalues, beside multipliers', if MUMPS tells (collective)."""
+        return self._condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc, self.space))
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
@@ -389,12 +389,12 @@ class UnitedSolver:
         dq = rhs.duplicate() if guess is None else guess.copy()
         self.ksp.setInitialGuessNonzero(guess is not None)
         if self.inexact:
-            self.ksp.setTolerances(rtol=max(accuracy, MOST_ACCURATE))
+            self.ksp.setTolerances(rtol=max(0.0 if self.space.mixed else accuracy, MOST_ACCURATE))
         kinds = f"{self.ksp.getType()} and {self.pc.getType()}"
         try:
             if self._new:
                 with timed("factorisation or preconditioner set-up"):
-                    self._set_up(**(mumps.TELLS_SIGN if self._tells_sign else {}))
+                    self._set_up(**(mumps.TELLS_SIGN if self.tells_sign else {}))
             with timed("linear solve"), self._in_database():
                 self.ksp.solve(rhs, dq)
         except PETSc.Error as error:

@@ -18,6 +18,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.nodes import Nodes
 
 #: Types of PC that solve exactly.
 FACTORISATIONS = ("cholesky", "lu")
@@ -54,9 +55,14 @@ def is_negative(pc: PETSc.PC) -> bool:
     return bool(pc.getFactorMatrix().getMumpsRinfog(12) < 0.0)
 
 
-def is_indefinite(pc: PETSc.PC) -> bool:
-    """Whether a symmetric factorisation has negative pivots; not told if it is not MUMPS that made it."""
-    return bool(solves(pc) and pc.getType() == "cholesky" and pc.getFactorMatrix().getMumpsInfog(12) > 0)
+def is_indefinite(pc: PETSc.PC, space: Nodes | None = None) -> bool:
+    """Whether a symmetric factorisation has negative pivots; not told if it is not MUMPS that made it (collective among other fields).
+
+    Multipliers of other fields of ``space``, such as pressures, are expected to make one each.
+    """
+    if not (solves(pc) and pc.getType() == "cholesky"):
+        return False
+    return bool(pc.getFactorMatrix().getMumpsInfog(12) > (0 if space is None else space.multipliers(pc.getOperators()[0])))
 
 
 @cache

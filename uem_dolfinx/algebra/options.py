@@ -41,13 +41,16 @@ def has_mumps() -> bool:
     return bool(PETSc.Sys.hasExternalPackage("mumps"))
 
 
-def default_options(size: int, gdim: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str, Any], dict[str, Any]]:
     """PETSc options for a united system with ``size`` unknowns, and those that take over where CG fails; none if empty.
 
-    MUMPS while it is cheap, else CG with AMG. MUMPS pivots in LDL' as well, PETSc's own Cholesky does not.
+    MUMPS while it is cheap, else CG with AMG. MUMPS pivots in LDL' as well, PETSc's own Cholesky does not. A ``mixed`` problem may be a
+    saddle, which neither CG nor AMG is for: MUMPS at any size.
     """
     direct = {"ksp_type": "preonly"}
     direct |= {"pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"} if has_mumps() else {"pc_type": "lu"}
+    if mixed:
+        return direct, {}
     if size > DIRECT_UP_TO[gdim]:
         return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options(), {}
     if size > HYPRE_FROM[gdim] and has_hypre():

@@ -59,8 +59,8 @@ class UnitedMatrix:
 
     def __init__(self, space: Nodes, reserving: bool):
         self.space, self.reserving = space, reserving
-        self._first, self._n = space.block * int(space.index_map.local_range[0]), space.block * space.n_owned
-        self._size = int(space.index_map.size_global)
+        self._first, self._n = space.block * space.first, space.block * space.n_owned
+        self._size = space.n_global
         #: K and the free components that the matrix was made for, and the state of K's values that it holds.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
@@ -124,7 +124,7 @@ class UnitedMatrix:
             test: rows of Q there.
             G: curvature in owned rows, if any.
         """
-        space, (first, last) = self.space, self.space.index_map.local_range
+        space, first, last = self.space, self.space.first, self.space.first + self.space.n_owned
         own = np.unique(trial.row)
         eliminated = np.zeros(last - first, dtype=bool)
         eliminated[own - first] = True

@@ -65,7 +65,7 @@ class Restriction:
         self.space, self.equations, self.free, self.stacked = space, equations, free, stacked
         self.comm = space.comm
         g, n = space.block, space.n_owned
-        self._sizes = ((g * n, g * space.index_map.size_global),) * 2
+        self._sizes = ((g * n, g * space.n_global),) * 2
         self._first = g * space.first
         #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])

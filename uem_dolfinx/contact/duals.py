@@ -102,9 +102,7 @@ class Covered:
     full: Array
 
     @classmethod
-    def of(
-        cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array, offset: Array | None = None
-    ) -> Covered:
+    def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array, offset: Array | None = None) -> Covered:
         """Integrate.
 
         Args:

@@ -313,8 +313,8 @@ class GeneralContact:
             second = np.full(len(i), skin.n_bodies + k)
             if isinstance(target, MeshTarget):
                 second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
-            first, force = skin.body_of_node[pair.nodes[i]], config.whole(pair.trial.force[i])
-            rows = np.column_stack([np.ones(len(i)), force, moments(config.whole(pair.points[i]) - centre, force)])
+            first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
+            rows = np.column_stack([np.ones(len(i)), force, moments(config.of_circles(pair.points[i]) - centre, force)])
             keys, inverse = np.unique(first * (skin.n_bodies + len(self.parts)) + second, return_inverse=True)
             sums = np.zeros((len(keys), rows.shape[1]))
             np.add.at(sums, inverse.ravel(), rows)

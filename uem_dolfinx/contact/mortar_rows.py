@@ -105,7 +105,7 @@ class Elimination:
         """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
         node, term, value = (np.concatenate(part) for part in zip(*parts))
         node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
-        row = self._place[node - int(self.config.index_map.local_range[0])]
+        row = self._place[node - self.config.first]
         return add_up_terms((row, term, value / scale[row, None]))
 
     def variation(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:

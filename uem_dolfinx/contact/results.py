@@ -11,7 +11,6 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Indices, cross_products
@@ -208,13 +207,9 @@ class ContactResults:
         """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
         if "force" not in self._fields:
             self._fields["force"] = fem.Function(self.config.V, name=_identifier(f"contact_force_{self.name}"))
-        f, g, pair = self._fields["force"], self.config.gdim, self.pair
-        f.x.array[:] = 0.0
-        total = compat.petsc_vector(f)
-        nodes, forces = pair.nodal_forces(pair.trial)
-        rows = (nodes[:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
-        total.setValues(rows, forces.ravel(), addv=PETSc.InsertMode.ADD)
-        total.assemble()
+        f, pair = self._fields["force"], self.pair
+        total = self.config.add_at_owners(*pair.nodal_forces(pair.trial))
+        f.x.array[: total.size] = total.ravel()
         f.x.scatter_forward()
         return f
 
@@ -240,7 +235,7 @@ class ContactResults:
             # a gap that a tie keeps is part of the target
             x, f = np.where(self.pair.tied[:, None], x, p.foot), -f
             centre = target.reference(g) if about is None else centre
-        return sum_up(self.config.comm, self.config.whole(x) - centre, self.config.whole(f))
+        return sum_up(self.config.comm, self.config.of_circles(x) - centre, self.config.of_circles(f))
 
     def balance(self) -> Balance | None:
         """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
@@ -255,7 +250,7 @@ class ContactResults:
             return None
         n, g = self.config.n_owned, self.config.gdim
         force = self.force.x.array.reshape(-1, g)[:n]
-        return imbalance(self.config.comm, self.config.whole(self.config.x[:n]), self.config.whole(force))
+        return imbalance(self.config.comm, self.config.of_circles(self.config.x[:n]), self.config.of_circles(force))
 
     def _field(self, what: str, values: npt.ArrayLike, vector: bool = False) -> fem.Function:
         config = self.config

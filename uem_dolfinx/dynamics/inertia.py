@@ -351,7 +351,7 @@ class Dynamics:
     def momentum(self) -> Array:
         """Momentum ``(gdim,)``, of axisymmetric bodies that along the axis (collective)."""
         p = self.mass.M * self._like(self.velocity.x.array[: self._n])
-        return self.config.whole(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
+        return self.config.of_circles(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2`` (collective)."""

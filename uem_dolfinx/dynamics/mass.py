@@ -89,7 +89,7 @@ class Mass:
         """Centre of all mass as the bodies are drawn, components taken together ``(gdim,)``; NaN without mass (collective)."""
         m = self._row_sums.sum(axis=1)
         sums = reduced(self.config.comm, np.append(m @ self._X, m.sum()))
-        return self.config.whole(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
+        return self.config.of_circles(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
 
     def rigid(self) -> Array:
         """What each body's rigid motions feel of M ``(n_bodies, n_rigid, n_rigid)`` (collective).

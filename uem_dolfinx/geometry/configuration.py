@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import AnyArray, Array
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.bodies import rigid_velocities
@@ -29,8 +29,14 @@ class Configuration(Nodes):
     """
 
     def __init__(self, u: fem.Function):
-        V = u.function_space
-        self.u, gdim = u, V.mesh.geometry.dim
+        #: The Function with all unknowns, and the displacement in UFL; one and the same unless there are other fields.
+        self.whole: fem.Function = u
+        self.u: Any = u
+        self._take(u.function_space)
+
+    def _take(self, V: Any) -> None:
+        """Take the nodes of the displacement's space (collective)."""
+        gdim = V.mesh.geometry.dim
         self.tdim: int = V.mesh.topology.dim
         degree = compat.lagrange_degree(V)
         if self.tdim != gdim:
@@ -40,6 +46,7 @@ class Configuration(Nodes):
         if V.dofmap.index_map_bs != gdim or degree is None:
             raise SpaceError(
                 f"the displacement has {V.dofmap.index_map_bs} component(s) in {gdim}D: use a vector Lagrange space of size {gdim}"
+                + ("; of a mixed space name the part that it is, as displacement=0" if compat.is_mixed(V) else "")
             )
         self.degree: int = degree
         if degree > 2:
@@ -49,9 +56,47 @@ class Configuration(Nodes):
         self.axisymmetric: bool = is_axisymmetric(V.mesh)
 
     @property
+    def unknowns(self) -> Any:
+        """The nodes that vectors and matrices have rows for: these."""
+        return self
+
+    def of(self, values: AnyArray) -> Any:
+        """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)`` (a view)."""
+        return values.reshape(-1, self.gdim)
+
+    def rows(self, values: AnyArray) -> Any:
+        """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)`` (a view)."""
+        return values.reshape(-1, self.gdim)
+
+    def from_rows(self, rows: Array) -> Array:
+        """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
+        return rows
+
+    def place_of(self, unknown: int) -> str:
+        """Which component of which node a local unknown is, for error messages."""
+        node, component = divmod(unknown, self.gdim)
+        return f"{'xyz'[component]} at {self.describe(node)}"
+
+    def functions(self) -> dict[str, fem.Function]:
+        """The displacement, and other fields, as Functions of spaces of their own by name, up to date (first call: collective)."""
+        return {"displacement": self.whole}
+
+    def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
+        """Write values of all unknowns, ghosts included ``(n,)``, to Functions that are like those of ``functions``."""
+        functions["displacement"].x.array[:] = values
+
+    def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
+        """Values of all unknowns, ghosts included ``(n,)``, from Functions that are like those of ``functions``."""
+        return np.array(functions["displacement"].x.array)
+
+    @property
     def displacement(self) -> Array:
-        """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (a view)."""
-        return self.u.x.array.reshape(-1, self.gdim)
+        """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (to be read)."""
+        return np.asarray(self.of(self.whole.x.array))
+
+    def shift(self, nodes: Any, way: Array) -> None:
+        """Move local nodes ``(n,)``, each named once, or all of a slice, by a way ``(n, gdim)``; ghosts are not told."""
+        self.of(self.whole.x.array)[nodes] += way
 
     @property
     def x(self) -> Array:
@@ -60,8 +105,8 @@ class Configuration(Nodes):
 
     @contextmanager
     def at(self, displacement: Array) -> Iterator[None]:
-        """For a while, the nodes where another displacement takes them ``(n_local incl. ghosts,)``, which is flat."""
-        u = self.u.x.array
+        """For a while, the nodes where other values of all unknowns take them, ghosts included ``(n,)``."""
+        u = self.whole.x.array
         kept = np.array(u)
         u[:] = displacement
         try:
@@ -80,7 +125,7 @@ class Configuration(Nodes):
             x = (x - reduced(self.comm, x.sum(axis=0)) / self.index_map.size_global) / self.size
         return rigid_velocities(x)
 
-    def whole(self, vectors: Array) -> Array:
+    def of_circles(self, vectors: Array) -> Array:
         """Forces, momenta or places of nodes ``(..., gdim)`` as those of all that they stand for: around an axis radial parts cancel."""
         return vectors * np.array([0.0, 1.0]) if self.axisymmetric else vectors
 

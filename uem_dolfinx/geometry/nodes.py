@@ -12,7 +12,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Ints, sums_of_rows
+from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.parallel import Exchange, gathered
 
 
@@ -28,6 +28,7 @@ class Nodes:
         n_owned: number of nodes that this rank owns.
         n_local: that and its ghosts.
         first: global number of the first owned node.
+        n_global: global numbers of all ranks' nodes are below it.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
     """
 
@@ -41,7 +42,7 @@ class Nodes:
         self.n_local: int = self.n_owned + self.index_map.num_ghosts
         # every rank takes a node's position from its owner, to the last bit
         every = np.arange(self.n_local)
-        self.first = int(self.index_map.local_range[0])
+        self.first, self.n_global = int(self.index_map.local_range[0]), int(self.index_map.size_global)
         self.X: Array = self.from_owners(every, V.tabulate_dof_coordinates()[: self.n_local, : self.gdim], every)
 
     def modes(self, centred: bool = False) -> Array:
@@ -60,7 +61,7 @@ class Nodes:
     @cached_property
     def _like(self) -> PETSc.Vec:
         """What vectors are made after."""
-        sizes = self.block * self.n_owned, self.block * self.index_map.size_global
+        sizes = self.block * self.n_owned, self.block * self.n_global
         return PETSc.Vec().createMPI(sizes, bsize=self.block, comm=self.comm)
 
     def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
@@ -68,6 +69,28 @@ class Nodes:
         v = self._like.duplicate()
         v.array[:] = 0.0 if values is None else np.ravel(values)
         return v
+
+    #: Whether what is solved for has unknowns beside those of the nodes.
+    mixed = False
+
+    def create_matrix(self, a: Any) -> PETSc.Mat:
+        """Matrix for a compiled bilinear form (collective)."""
+        return forms.create_matrix(a)
+
+    def complete(self, K: PETSc.Mat, free: Bools) -> None:
+        """Bring an assembled matrix into what solvers take."""
+
+    def multipliers(self, A: PETSc.Mat) -> int:
+        """Number of unknowns that are expected to make a negative eigenvalue each (collective): none of a displacement."""
+        return 0
+
+    def norms(self, v: PETSc.Vec) -> Any:
+        """Norm of a vector; among other fields one for each field, the displacement's first ``(n_fields,)`` (collective)."""
+        return v.norm()
+
+    def work(self, q: PETSc.Vec, F: PETSc.Vec) -> float:
+        """Work of forces along an increment, that of the displacement alone (collective)."""
+        return float(q.dot(F))
 
     @cached_property
     def _work(self) -> fem.Function:
@@ -96,7 +119,7 @@ class Nodes:
     @cached_property
     def _first_nodes(self) -> Ints:
         """First global node of every rank, and one past the last."""
-        return np.append(gathered(self.comm, self.first), self.index_map.size_global)
+        return np.append(gathered(self.comm, self.first), self.n_global)
 
     def owner_of(self, nodes: npt.NDArray[np.integer]) -> Ints:
         """Ranks that own global nodes."""

@@ -134,7 +134,7 @@ def vertex_positions(problem: UnitedProblem, scale: float) -> Array:
     """Displaced positions of the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, gdim)``."""
     config = problem.config
     u = fem.Function(compat.function_space(config.mesh, 1, (config.gdim,)))
-    u.interpolate(problem.u)
+    u.interpolate(config.functions()["displacement"])
     u.x.scatter_forward()
     moved = u.x.array.reshape(-1, config.gdim)
     return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)

@@ -108,8 +108,9 @@ class ResultsWriter(Closing):
     """Time series of everything there is to see: fields for ParaView and the history.
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv``, and where DOLFINx has ADIOS2 ``PATH_vectors.bp`` and
-    ``PATH_scalars.bp``. Fields: displacement; for every contact its pressure, gap, status and force; and whatever ``fields``
-    names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree 2 is interpolated.
+    ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``; for every contact its pressure, gap,
+    status and force; and whatever ``fields`` names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree
+    2 is interpolated.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
     ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
@@ -221,7 +222,7 @@ class ResultsWriter(Closing):
 
     def _sources(self) -> dict[str, fem.Function]:
         """Functions of the problem by name, up to date (collective)."""
-        found = {"displacement": self.problem.u}
+        found = self.problem.config.functions()
         for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
             found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
             found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}

@@ -83,7 +83,7 @@ class Linearised:
     def _linearise(self) -> None:
         bodies, system = self.problem.bodies, self.problem.system
         assert isinstance(system, BodySystem)
-        bodies.wanted[:] = self.config.displacement
+        bodies.wanted[:] = self.problem.u.x.array
         system.place()
         bodies.assemble()
         state = system.assemble_constraints(lambda norm, scale, rounding: True)

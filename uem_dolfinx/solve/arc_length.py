@@ -19,6 +19,7 @@ from uem_dolfinx.contact.laws.law import as_law, follows_load
 from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState
@@ -161,6 +162,7 @@ class AlongArc:
                     f"arc_length leads loads, and friction of contact '{contact.name}' follows the load factor: expected friction that "
                     "does not"
                 )
+        refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out, and lead the load by a displacement")
         self._problem, self._arc, self._owned = problem, ArcLength(problem), problem.config.n_owned * problem.config.gdim
         self.tried, self.most = 0.0, MOST_STEPS
 

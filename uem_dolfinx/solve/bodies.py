@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from mpi4py import MPI
 
@@ -45,8 +46,10 @@ class Bodies:
         check_inversion: whether to look for cells turned inside out; None does so unless K is constant.
 
     Attributes:
-        free: components without Dirichlet condition ``(n_local, gdim)``.
-        wanted: displacement that the Dirichlet conditions ask for, at their components ``(n_local, gdim)``.
+        unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
+        free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
+        free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
+        wanted: values that the Dirichlet conditions ask for, at their unknowns, ghosts included ``(n,)``.
         tangent: K.
         stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, by which forces are told from rounding; None until known.
     """
@@ -61,25 +64,40 @@ class Bodies:
         dynamics: Dynamics | None = None,
         check_inversion: bool | None = None,
     ):
-        self.config, self.comm, self.u, self.bcs = config, config.comm, config.u, list(bcs)
+        self.config, self.comm, self.u, self.bcs = config, config.comm, config.whole, list(bcs)
+        self.unknowns = config.unknowns
         self.materials, self.dynamics = list(materials), dynamics
         #: The residual in UFL.
         self.F = F
-        self.tangent = Tangent(F, self.u, self.materials, dynamics)
+        self.tangent = Tangent(F, config, self.materials, dynamics)
         with compiling("the residual"):
             self._F = forms.form(F)
-        self._b = compat.create_vector(config.V)
+        self._b = compat.create_vector(self.u.function_space)
         self._u = compat.petsc_vector(self.u)
-        free = np.ones(config.n_local * config.gdim, dtype=bool)
+        self._held: Bools = np.zeros(len(self.u.x.array), dtype=bool)
         for bc in self.bcs:
-            free[compat.bc_dofs(bc)[0]] = False
-        self.free: Bools = free.reshape(-1, config.gdim)
+            self._held[compat.bc_dofs(bc)[0]] = True
+        self._n_owned = len(self._b.array_r)
+        self.free: Bools = ~config.of(self._held)
+        self.free_rows: Bools = config.rows(~self._held[: self._n_owned])
+        self.tangent.free = self.free_rows
         if dynamics is not None:
             dynamics.hold(~self.free[: config.n_owned])
-        self.wanted: Array = np.array(config.displacement)
+        self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._inversions = Inversions(config) if check else None
+        self._fields: Any = None
+        if self.unknowns.mixed:
+            from uem_dolfinx.solve.field_scales import FieldScales
+
+            #: Sizes of the terms in the equations of other fields; None without any.
+            self._fields = FieldScales(self.unknowns, self.tangent)
+
+    def begin_step(self) -> None:
+        """Measure other fields by K of the state that the step begins with, as a run that goes on from a checkpoint does (collective)."""
+        if self._fields is not None:
+            self.tangent.update()
 
     # -- forces --------------------------------------------------------------------------------------------------------
 
@@ -101,7 +119,18 @@ class Bodies:
     @property
     def residual(self) -> PETSc.Vec:
         """Owned part of the assembled residual, internal minus external forces."""
-        return self.config.vector(self._b.array_r)
+        return self.unknowns.vector(self.config.rows(self._b.array_r))
+
+    @property
+    def forces(self) -> Array:
+        """The assembled residual at the owned nodes of the displacement ``(n_owned, gdim)``."""
+        return np.asarray(self.config.rows(self._b.array_r)[: self.config.n_owned])
+
+    def forces_at_work(self, F: PETSc.Vec) -> Any:
+        """What residuals are small beside: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
+        if self._fields is None:
+            return F.norm()
+        return np.maximum(self.unknowns.norms(F), self._fields.terms())
 
     @property
     def linear(self) -> bool:
@@ -121,12 +150,14 @@ class Bodies:
         return self._diagonal()
 
     def _diagonal(self) -> Array:
-        diagonal = self.config.vector()
+        diagonal = self.unknowns.vector()
         self.tangent.K.getDiagonal(diagonal)
-        return np.array(diagonal.array_r).reshape(-1, self.config.gdim)
+        return np.array(diagonal.array_r).reshape(-1, self.config.gdim)[: self.config.n_owned]
 
-    def rounding(self, positioned: npt.NDArray[np.integer]) -> float:
+    def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
         """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).
+
+        With other fields one for each ``(n_fields,)``, of what is in their equations.
 
         Args:
             positioned: owned nodes whose position counts, not their displacement alone; repeated ones count repeatedly.
@@ -135,7 +166,8 @@ class Bodies:
             return 0.0
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
-        return float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
+        of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
+        return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
         """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""
@@ -145,47 +177,54 @@ class Bodies:
             FORCE_ROUNDING * (np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])).max(axis=1, initial=0.0)
         )
 
-    def above_rounding(self, positioned: bool) -> float:
-        """Norm of the forces at those components where they are told from rounding (collective).
+    def above_rounding(self, positioned: bool) -> Any:
+        """Norm of the forces, or one for each field, at those components where they are told from rounding (collective).
 
         Rounding of a body's displacement is seen at all of its nodes, also where they are held.
 
         Args:
             positioned: whether positions count, not displacements alone.
         """
-        F, n = self._b.array_r, self.config.n_owned
+        F, n = self.forces, self.config.n_owned
         if self.stiffness is None:
-            return float(self.config.vector(F).norm())
+            return self.unknowns.norms(self.residual)
         body, count = find_bodies(self.config)
         rounded = np.zeros(count)
         np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
         limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
-        return float(self.config.vector(np.where(np.abs(F) > limit.ravel(), F, 0.0)).norm())
+        told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
+        if self._fields is None:
+            return told
+        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
 
-    def strain_rounding(self) -> float:
-        """Norm of the forces that rounding of ``1 + grad(u)`` can make (collective)."""
-        return (
-            0.0
-            if self.stiffness is None
-            else float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
-        )
+    def strain_rounding(self) -> Any:
+        """Norm of the forces that rounding of ``1 + grad(u)`` can make, nothing in other fields (collective)."""
+        if self.stiffness is None:
+            return 0.0
+        size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
+        return size if self._fields is None else self._first(size)
+
+    def _first(self, of_displacement: float) -> Array:
+        """A norm of the displacement's forces, none of the other fields ``(n_fields,)``."""
+        return np.append(of_displacement, np.zeros(self.unknowns.n_fields - 1))
 
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
 
     @property
     def prescribed(self) -> Array:
-        """Increments that the Dirichlet conditions ask for at the owned nodes, zero where free ``(n_owned, gdim)``."""
-        return np.where(self.free, 0.0, self.wanted - self.config.displacement)[: self.config.n_owned]
+        """Increments that the Dirichlet conditions ask for in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        n = self._n_owned
+        return np.asarray(self.config.rows(np.where(self._held[:n], self.wanted[:n] - self.u.x.array[:n], 0.0)))
 
     def dirichlet_met(self) -> bool:
         """Whether the Dirichlet values are there (collective)."""
-        held = ~self.free
-        short = np.abs(self.wanted - self.config.displacement)[held].max(initial=0.0)
-        both = np.array([short, np.abs(self.wanted[held]).max(initial=0.0)])
+        there, field = self.u.x.array, self.unknowns.field_of if self.unknowns.mixed else None
+        parts = [self._held] if field is None else [self._held & (field == i) for i in range(self.unknowns.n_fields)]
+        both = np.array([[np.abs(a).max(initial=0.0) for a in (self.wanted[h] - there[h], self.wanted[h])] for h in parts])
         self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
-        return bool(both[0] <= VALUE_ROUNDING * both[1])
+        return bool((both[:, 0] <= VALUE_ROUNDING * both[:, 1]).all())
 
     # -- displacement --------------------------------------------------------------------------------------------------
 
@@ -199,15 +238,15 @@ class Bodies:
             raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
 
     def displacement(self) -> PETSc.Vec:
-        """Copy of the present displacement."""
-        return self.config.vector(self._u.array_r)
+        """Copy of the present displacement, and of all other fields."""
+        return self.unknowns.vector(self.config.rows(self._u.array_r))
 
     def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
-        """Set the displacement to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""
-        self._u.array[:] = start.array_r + length * du.array_r
+        """Set all unknowns to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""
+        self._u.array[:] = self.config.from_rows(start.array_r + length * du.array_r)
         if length == 1.0:
-            held = ~self.free[: self.config.n_owned]
-            self.config.displacement[: self.config.n_owned][held] = self.wanted[: self.config.n_owned][held]
+            held = np.flatnonzero(self._held[: self._n_owned])
+            self._u.array[held] = self.wanted[held]
         self.u.x.scatter_forward()
 
     def inverted(self) -> str | None:

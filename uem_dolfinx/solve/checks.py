@@ -73,6 +73,24 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function) -> list[Histor
     return found
 
 
+def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
+    """Raise an InputError of what a displacement among other fields cannot have, with a remedy."""
+    if config.unknowns.mixed:
+        raise InputError(
+            f"{what} are not there for a displacement among other fields: expected a problem of a displacement; {remedy}"
+        )
+
+
+def check_fields(config: Configuration, materials: Sequence[HistoryMaterial], dynamics: Any) -> None:
+    """Refuse what a displacement among other fields cannot have: laws with history, and inertia."""
+    if materials:
+        refuse_other_fields(config, "materials with history", "write the stress in UFL of the mixed Function")
+    if dynamics is not None:
+        refuse_other_fields(
+            config, "time steps with inertia", "leave dynamics out, or leave the other fields to a problem of their own"
+        )
+
+
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:
     """The load as a function of the factor or the time, or as Constants and their values, each numbers or a function; or None.
 
@@ -130,7 +148,7 @@ def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
     """
     bcs = given.items("bcs", bcs, compat.is_dirichlet, "a Dirichlet condition")
     for i, bc in enumerate(bcs):
-        if not compat.is_condition_of(bc, config.V):
+        if not compat.is_condition_of(bc, config.whole.function_space):
             where = "another function space" if compat.is_on(bc.function_space, config.mesh) else "another mesh"
             raise SpaceError(
                 f"the Dirichlet condition bcs[{i}] belongs to {where}: expected the displacement's space V or a component V.sub(i), not "
@@ -145,7 +163,7 @@ def check_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> No
     Args:
         config: configuration of the displacement.
         bcs: Dirichlet conditions.
-        wanted: displacement with their values ``(n_local * gdim,)``.
+        wanted: all unknowns with their values, ghosts included ``(n,)``.
 
     Raises:
         NotFiniteError: naming condition, value and place.
@@ -154,8 +172,7 @@ def check_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> No
         dofs = compat.bc_dofs(bc)[0]
         bad = dofs[~np.isfinite(wanted[dofs])]
         if len(bad):
-            node, component = divmod(int(bad[0]), config.gdim)
             raise NotFiniteError(
-                f"the Dirichlet condition bcs[{i}] prescribes {wanted[bad[0]]} in {'xyz'[component]} at {config.describe(node)}: "
+                f"the Dirichlet condition bcs[{i}] prescribes {wanted[bad[0]]} in {config.place_of(int(bad[0]))}: "
                 "expected finite values; check its value and what the load sets"
             )

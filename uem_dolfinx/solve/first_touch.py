@@ -34,7 +34,7 @@ def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions 
     if known or rigid is None:
         return
     place()
-    free, prescribed = bodies.free[: config.n_owned], bodies.prescribed
+    free, prescribed = bodies.free[: config.n_owned], bodies.prescribed[: config.n_owned]
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     near = OPEN * float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
     gaps = [pair.predicted(du) for pair in pairs]

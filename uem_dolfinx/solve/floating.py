@@ -96,10 +96,10 @@ class FloatingBodies:
             )  # fmt: skip
 
     def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
-        """Free components ``(n_owned, gdim)`` without those that hold neutral motions (collective).
+        """Free components ``(n_rows, gdim)`` without those that hold neutral motions (collective).
 
         Args:
-            free: components without Dirichlet condition ``(n_owned, gdim)``.
+            free: components without Dirichlet condition ``(n_rows, gdim)``.
             equations: rows of the relative motions that contacts do not let go on without end.
             resisting: rows of all relative motions that contacts resist, the same object without friction.
         """
@@ -108,7 +108,9 @@ class FloatingBodies:
         self._open = self._sliding = self.motions.open_motions(self._rates(resisting))
         if resisting is not equations:
             self._sliding = self.motions.open_motions(self._rates(equations))
-        return free & ~self.motions.supports(self._sliding, equations)
+        left, supports = free.copy(), self.motions.supports(self._sliding, equations)
+        left[: len(supports)] &= ~supports
+        return left
 
     def slide(self, driving: Array, forces: Array) -> Array | None:
         """Increment, far beyond all others, of bodies that slide under what the supports carry; None if none does (collective).
@@ -127,7 +129,7 @@ class FloatingBodies:
         """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
         if self.motions is None:
             return False
-        force = self.motions.load(self._open, self._bodies.residual.array_r.reshape(-1, self._bodies.config.gdim))
+        force = self.motions.load(self._open, self._bodies.forces)
         return bool(force.any())
 
     def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
@@ -210,8 +212,8 @@ class FloatingBodies:
         for pair, e in zip(self._pairs, equations):
             kinds.append(np.where(e.tied | pair.frictional, HELD, UNITED)[e.resisting.active])
         kind = np.concatenate(kinds)
-        R, force, scale = motions.rates(rows), *motions.forces(self._residual)
-        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._residual).any()
+        R, force, scale = motions.rates(rows), *motions.forces(self._bodies.forces)
+        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._bodies.forces).any()
         if not (loose or freely):
             return None, False
         # friction holds what sticks in all directions; contactors without it may part again
@@ -253,11 +255,6 @@ class FloatingBodies:
                 return np.zeros_like(v), took
             raise motions.error(v)
         return v, took
-
-    @property
-    def _residual(self) -> Array:
-        """Forces of the bodies at the owned nodes ``(n_owned, gdim)``."""
-        return np.asarray(self._bodies.residual.array_r.reshape(-1, self._bodies.config.gdim))
 
     def _ways(self, R: Any, gap: Array, v: Array) -> Array:
         """How far bodies go in motions ``v (n_motions,)`` until the first of their gaps closes ``(count,)`` (collective)."""

@@ -19,6 +19,7 @@ from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodySystem
 
@@ -115,6 +116,7 @@ def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
     """Refuse problems whose derivatives are not those of one state, and what are not controls or pairs with their changes (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
+        refuse_other_fields(problem.config, "gradients", "take differences of two solutions")
         for present, history in (
             (problem.dynamics is not None, "a problem in time"),
             (any(pair.frictional for pair in problem.pairs), "a contact with friction"),

@@ -8,14 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.norms import Norm, first, ratio, worst
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
@@ -42,7 +46,7 @@ LARGEST_ROUNDING = 1e-4
 
 
 #: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
-InEquilibrium = Callable[[float, float, float], bool]
+InEquilibrium = Callable[[Norm, Norm, Norm], bool]
 
 
 @dataclass(frozen=True)
@@ -90,9 +94,9 @@ class IterationState:
     trial: Restriction
     test: Restriction
     residual: PETSc.Vec
-    norm: float
-    scale: float
-    rounding: float
+    norm: Norm
+    scale: Norm
+    rounding: Norm
     gap: float
     active: int
     changed: bool
@@ -213,7 +217,7 @@ def solve_united(
     max_iterations: int,
     line_search: bool,
     verbose: bool,
-    forces_before: float = 0.0,
+    forces_before: Norm = 0.0,
     check_signals: Callable[[], None] | None = None,
 ) -> list[Iteration]:
     """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
@@ -238,14 +242,19 @@ def solve_united(
         InvertedElementError: if even the shortest step turns a cell inside out.
     """
     history: list[Iteration] = []
-    start, length, norm, stalled, left = 0.0, 1.0, 0.0, 0, 0.0
+    start: Norm = 0.0
+    norm: Norm = 0.0
+    left: Norm = 0.0
+    stalled: int | Ints = 0
+    norms, length = bodies.unknowns.norms, 1.0
 
-    def rounding_of_all(rounding: float, times: int) -> float:
+    def rounding_of_all(rounding: Norm, times: int) -> Norm:
         # a residual that has not fallen so often has met the rounding of laws that start from the deformation gradient
-        return max(rounding, left, bodies.strain_rounding() if stalled >= times else 0.0)
+        more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
+        return np.maximum(np.maximum(rounding, left), more)
 
-    def in_equilibrium(norm: float, scale: float, rounding: float) -> bool:
-        return norm <= max(rtol * max(scale, start), rounding_of_all(rounding, 1))
+    def in_equilibrium(norm: Norm, scale: Norm, rounding: Norm) -> bool:
+        return bool(np.all(norm <= np.maximum(rtol * np.maximum(scale, start), rounding_of_all(rounding, 1))))
 
     method.place()
     if not bodies.assemble():
@@ -258,35 +267,36 @@ def solve_united(
             state = method.assemble_constraints(in_equilibrium)
         if k == 0:
             # a displacement that comes back to nothing keeps the rounding of what it was
-            start, left = state.norm, min(state.rounding, rtol * forces_before)
-        forces = max(state.scale, start)
-        if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * forces):
+            start, left = state.norm, np.minimum(state.rounding, rtol * forces_before)
+        forces = np.maximum(state.scale, start)
+        if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * first(forces)):
             bodies.assemble()
             with _told(history):
                 state = method.assemble_constraints(in_equilibrium)
         steady = state.right and not state.changed
-        stalled = stalled + 1 if k > 0 and state.norm > STALLED * norm and not state.changed else 0
+        stalled = np.where(state.norm > STALLED * norm, stalled + 1, 0) if k > 0 and not state.changed else 0
         norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
-        if small < norm <= rounding and (k > 0 or forces_before > 0.0):
+        if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
             # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
-            real = max(bodies.above_rounding(state.in_contact), forces_before)
-            small = min(rounding, LARGEST_ROUNDING * real) if real > 0 else rounding
-        converged = steady and state.closed and norm <= small
-        hidden = steady and stalled >= 2 and small < norm <= rounding
+            real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
+            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), rounding)
+            small = np.where((small < norm) & (norm <= rounding), excused, small)
+        converged = steady and state.closed and bool(np.all(norm <= small))
+        hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
         if converged or hidden or k == max_iterations:
-            history.append(Iteration(_ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
+            history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
                 return history
             if hidden:
-                raise _no_precision(norm, rounding, real)
+                raise _no_precision(*worst(norm, rounding, real))
             break
         # the residual that a step begins with knows nothing of conditions and gaps
-        relative = _ratio(norm, forces) if k > 0 else 1.0
+        relative = ratio(norm, forces) if k > 0 else 1.0
         with _told(history):
-            problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * forces, relative, check_signals)
-        driving = max(problem.rhs.norm(), step.rhs.norm())
-        residual = _ratio(driving, max(forces, driving if k == 0 else 0.0))
+            problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * first(forces), relative, check_signals)
+        driving = np.maximum(norms(problem.rhs), norms(step.rhs))
+        residual = ratio(driving, np.maximum(forces, driving if k == 0 else 0.0))
         changed = state.changed or exchanges > 0
         history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
         _report(history, verbose)
@@ -301,7 +311,7 @@ def solve_united(
 
 def _no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
     return PrecisionError(
-        f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {_ratio(norm, real):.1g} of the forces at work, "
+        f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {ratio(norm, real):.1g} of the forces at work, "
         f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "
         "forces; model them as rigid, give them less stiffness or less far to go, or raise rtol if that is accurate enough"
     )
@@ -368,20 +378,22 @@ def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relativ
 
 
 def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, step: Increment, line_search: bool) -> float:
-    """Take the step, shortened where it must be, to where the next iteration begins: the length taken."""
+    """Take the step, shortened where the displacement's forces ask for it, to where the next iteration begins: the length taken."""
     start, state, dq = bodies.displacement(), problem.state, step.dq
-    work, norm, length = abs(dq.dot(step.rhs)), step.rhs.norm(), step.longest
+    work_of, norms = bodies.unknowns.work, bodies.unknowns.norms
+    work, norm, length = abs(work_of(dq, step.rhs)), first(norms(step.rhs)), step.longest
     while True:
         last = not line_search or length <= SHORTEST_SEARCH
         if _moved(bodies, method, start, step, length):
             if last or problem.fits:
                 return length
             residual = method.reduced_residual(state)
-            less_work = abs(dq.dot(residual)) <= max(ENOUGH_DECREASE * work, state.rounding * dq.norm())
-            downhill = problem.convex and dq.dot(residual) < 0.0
+            least = first(state.rounding) * first(norms(dq))
+            less_work = abs(work_of(dq, residual)) <= max(ENOUGH_DECREASE * work, least)
+            downhill = problem.convex and work_of(dq, residual) < 0.0
             if downhill and not less_work and length == 1.0:
                 return _downhill(bodies, method, state, start, step)
-            if less_work or downhill or residual.norm() <= ENOUGH_DECREASE * norm:
+            if less_work or downhill or first(norms(residual)) <= ENOUGH_DECREASE * norm:
                 return length
         elif last:
             where = bodies.inverted()
@@ -402,17 +414,13 @@ def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increm
 
 def _downhill(bodies: Bodies, method: ContactMethod, state: IterationState, start: PETSc.Vec, step: Increment) -> float:
     """Go on from a full step as long as forces still drive the bodies that way: the length taken, of 1, 2, 4 ... up to a bound."""
-    length = 1.0
+    length, along = 1.0, partial(bodies.unknowns.work, step.dq)
     while length < LONGEST_SEARCH:
-        if not _moved(bodies, method, start, step, 2.0 * length) or step.dq.dot(method.reduced_residual(state)) >= 0.0:
+        if not _moved(bodies, method, start, step, 2.0 * length) or along(method.reduced_residual(state)) >= 0.0:
             break
         length *= 2.0
     _moved(bodies, method, start, step, length)
     return length
-
-
-def _ratio(norm: float, scale: float) -> float:
-    return norm / scale if scale > 0 else 0.0
 
 
 def _report(history: list[Iteration], verbose: bool) -> None:

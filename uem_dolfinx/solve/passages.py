@@ -44,14 +44,14 @@ def refuse_passages(
     Args:
         config: configuration of the displacement at the end of the step.
         pairs: of all contacts; those that keep their facets for a step cannot pass, nor can what is tied.
-        start: displacement at the beginning ``(n_local incl. ghosts,)``.
+        start: all unknowns at the beginning, ghosts included ``(n,)``.
         motions: of the pairs' rigid targets at the beginning.
         moving: whether bodies have inertia, so that none may cut a crest short.
 
     Raises:
         TunnellingError: naming the deepest such contactor of the first rank that has one.
     """
-    du = config.displacement - start.reshape(-1, config.gdim)
+    du = config.displacement - config.of(start)
     looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.sliding == "finite"]
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # of one contact: the longest ways of both sides, the sum of the target's and their number

@@ -28,8 +28,17 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.bodies import Bodies
-from uem_dolfinx.solve.checks import check_conditions, check_load, check_materials, check_residual, check_values, set_constant
+from uem_dolfinx.solve.checks import (
+    check_conditions,
+    check_fields,
+    check_load,
+    check_materials,
+    check_residual,
+    check_values,
+    set_constant,
+)
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
+from uem_dolfinx.solve.norms import Norm
 from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
@@ -48,7 +57,9 @@ class UnitedProblem:
     Args:
         F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
             forces are added by ``dynamics``. On a mesh declared ``axisymmetric`` it is integrated over whole circles.
-        u: displacement, a Function of a vector Lagrange space; holds the solution.
+        u: displacement, a Function of a vector Lagrange space; holds the solution. With ``displacement`` a Function of a mixed space.
+        displacement: number of the part of the mixed space that is the displacement, as of a pressure or a temperature beside it; the
+            other parts are solved for as well, and contact leaves them alone.
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
         petsc_options_prefix: prefix of the linear solver's options.
@@ -86,6 +97,7 @@ class UnitedProblem:
         F: ufl.Form,
         u: fem.Function,
         *,
+        displacement: int | None = None,
         bcs: Sequence[fem.DirichletBC] = (),
         contacts: Sequence[Contact | GeneralContact] = (),
         petsc_options_prefix: str = "uem_",
@@ -103,7 +115,7 @@ class UnitedProblem:
         verbose: bool = False,
     ):
         self.u = given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
-        self.config = Configuration(u)
+        self.config = _configured(u, displacement)
         self.comm = self.config.comm
         with agreed(self.comm):
             check_residual(F, u)
@@ -116,6 +128,7 @@ class UnitedProblem:
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
+            check_fields(self.config, self.materials, dynamics)
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
@@ -143,7 +156,7 @@ class UnitedProblem:
             dynamics=dynamics,
             check_inversion=check_inversion,
         )
-        self.solver = UnitedSolver(self.config, petsc_options_prefix, petsc_options)
+        self.solver = UnitedSolver(self.config.unknowns, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         pairs = [contact.attach(self.config, free, **clock) for contact in self.contacts]
@@ -163,7 +176,7 @@ class UnitedProblem:
         #: Where the rigid targets were then; None for those that had not moved, and for meshes.
         self.motions = self._rigid_motions()
         #: Norm of the largest forces of all steps, as far as they are told from rounding.
-        self.largest_forces = 0.0
+        self.largest_forces: Norm = 0.0
         #: What the last step began with, where its ramp began, how far it went, and whether something led its load.
         from uem_dolfinx.solve.memory import Memory
 
@@ -178,7 +191,8 @@ class UnitedProblem:
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""
         config = self.config
-        size = f"{config.block * config.index_map.size_global} unknowns in {config.gdim}D"
+        dofmap = self.u.function_space.dofmap
+        size = f"{dofmap.index_map_bs * dofmap.index_map.size_global} unknowns in {config.gdim}D"
         kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
         names = ", ".join(repr(contact.name) for contact in self.contacts) or "none"
         return f"UnitedProblem({size}, {kind}, contacts: {names}, steps committed: {self.progress.steps})"
@@ -269,8 +283,9 @@ class UnitedProblem:
         compat.set_bc_values(wanted, self.bodies.bcs)
         with agreed(self.comm):
             check_values(self.config, self.bodies.bcs, wanted)
-        self.bodies.wanted[:] = (start + fraction * (wanted - start) if fraction < 1.0 else wanted).reshape(-1, self.config.gdim)
+        self.bodies.wanted[:] = start + fraction * (wanted - start) if fraction < 1.0 else wanted
         try:
+            self.bodies.begin_step()
             self.system.begin_step()
             history = solve_united(
                 self.bodies,
@@ -309,7 +324,7 @@ class UnitedProblem:
 
     def _keep(self) -> None:
         self.committed = np.array(self.u.x.array)
-        self.largest_forces = max(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
+        self.largest_forces = np.maximum(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:
@@ -341,13 +356,14 @@ class UnitedProblem:
         Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
         added must differ from those here.
         """
-        stiffness, start = fem.Function(self.config.V), fem.Function(self.config.V)
-        functions = {"displacement": self.u, "stiffness": stiffness}
+        stiffness, own, config = fem.Function(self.config.V), self.config.functions(), self.config
+        starts = {name: fem.Function(f.function_space) for name, f in own.items()}
+        functions = own | {"stiffness": stiffness}
         for i, pair in enumerate(self.pairs, 1):
             functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
         ramped = self.dynamics is None
         if self.dynamics is None:
-            functions |= {"load start": start}
+            functions |= {"load start" + name.removeprefix("displacement"): f for name, f in starts.items()}
         else:
             d = self.dynamics
             functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
@@ -357,21 +373,28 @@ class UnitedProblem:
         state = State(self.config.mesh, functions, self.contacts, settings=self._settings.describe(self.comm))
 
         def collect() -> None:
+            config.functions()
             known = self.bodies.to_checkpoint(stiffness)
             # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
             self.system.forget()
-            state.numbers |= {"largest forces": self.largest_forces, "stiffness known": known}
+            state.numbers |= {"largest forces": np.asarray(self.largest_forces).tolist(), "stiffness known": known}
             state.numbers |= self.progress.to_checkpoint(ramped)
             if ramped and self.progress.ramp:
-                start.x.array[:] = self.progress.start
+                config.fill(starts, self.progress.start)
             if self.dynamics is not None:
                 state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
 
         def restore() -> None:
+            if config.unknowns.mixed:
+                self.u.x.array[:] = config.values_of(own)
+                for pair in self.pairs:
+                    # they have been projected where the bodies were before
+                    pair.remember(pair.memory())
+                    pair.project()
             self.committed, self.motions = np.array(self.u.x.array), self._rigid_motions()
-            self.largest_forces = state.numbers["largest forces"]
+            self.largest_forces = np.asarray(state.numbers["largest forces"])[()]
             self.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
-            self.progress.from_checkpoint(state.numbers, start.x.array if ramped else None)
+            self.progress.from_checkpoint(state.numbers, config.values_of(starts) if ramped else None)
             if self.dynamics is not None:
                 self.dynamics.from_checkpoint(state.numbers)
                 self.step_control.from_checkpoint(state.numbers)
@@ -390,13 +413,13 @@ class UnitedProblem:
                 axisymmetric bodies radial forces cancel around the axis.
         """
         self.bodies.assemble()
-        tdim, shape = self.config.tdim, (-1, self.config.gdim)
+        tdim = self.config.tdim
         nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
-        force = self.bodies.residual.array_r.reshape(shape)[nodes]
+        force = self.bodies.forces[nodes]
         for contact in self.contacts:
-            force = force - contact.force.x.array.reshape(shape)[nodes]
+            force = force - contact.force.x.array.reshape(-1, self.config.gdim)[nodes]
         sums = self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0))
-        return self.config.whole(np.sum(sums, axis=0))
+        return self.config.of_circles(np.sum(sums, axis=0))
 
     @property
     def pairs(self) -> list[Interface]:
@@ -406,6 +429,15 @@ class UnitedProblem:
     def _rigid_motions(self) -> list[Motion | None]:
         """Where the rigid targets are now; None for those that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.pairs]
+
+
+def _configured(u: fem.Function, displacement: int | None) -> Configuration:
+    """Nodes of a displacement, which is u or one part of it (collective)."""
+    if displacement is None:
+        return Configuration(u)
+    from uem_dolfinx.geometry.fields import ConfigurationAmongFields
+
+    return ConfigurationAmongFields(u, displacement)
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:

@@ -228,15 +228,14 @@ class RigidMotions:
     def move(self, motion: Array) -> None:
         """Move the bodies, ghosts included."""
         config, g = self.config, self.config.gdim
-        u = config.displacement
         parts = motion.reshape(self.count, self.n_modes)
         body = self._body
         if not self.finite:
-            u += np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body])
+            config.shift(slice(None), np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body]))
             return
         x = config.x
         turns = np.array([rotation_matrix(_turn(angles)) for angles in parts[:, g:] / self.radius[:, None]]) - np.eye(g)
-        u += np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g]
+        config.shift(slice(None), np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g])
 
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 

@@ -39,7 +39,7 @@ class OverConstraints:
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface]):
-        self._config = config
+        self._unknowns = config.unknowns
         follows = [followed_nodes(config, pair.discretisation.followed) for pair in pairs]
         meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
@@ -69,18 +69,18 @@ class OverConstraints:
 
         Args:
             equations: of all pairs together.
-            free: components that are not held ``(n_owned, gdim)``.
-            prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
+            free: components that are not held ``(n_rows, gdim)``.
+            prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
         """
-        independent = IndependentEquations(self._config, equations, free) if self.contestable else None
+        independent = IndependentEquations(self._unknowns, equations, free) if self.contestable else None
         own = equations if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         try:
-            return Restriction(self._config, own, free, prescribed, stacked), independent
+            return Restriction(self._unknowns, own, free, prescribed, stacked), independent
         except DependentRingError as error:
             ring = error.rows if independent is None else independent.of_given(error.rows)
-        independent = IndependentEquations(self._config, equations, free, ring)
-        return Restriction(self._config, independent.equations, free, prescribed), independent
+        independent = IndependentEquations(self._unknowns, equations, free, ring)
+        return Restriction(self._unknowns, independent.equations, free, prescribed), independent
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def make_rows(
     Args:
         over_constraints: of the pairs.
         pairs: of all contacts.
-        hold: free components ``(n_owned, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
-        prescribed: increments that Dirichlet conditions ask for ``(n_owned, gdim)``.
+        hold: free components ``(n_rows, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
+        prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
 
     Raises:
         FrictionError: if contactors wedge where several equations meet.
@@ -181,7 +181,8 @@ def unbalanced(pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Tracti
 
     ``forces`` are those of every pair.
     """
-    every = F.array_r.reshape(-1, F.getBlockSize()).copy()
+    config = pairs[0].config
+    every = F.array_r.reshape(-1, config.gdim)[: config.n_owned].copy()
     left = every.copy()
     for pair, found in zip(pairs, forces):
         left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(found)))

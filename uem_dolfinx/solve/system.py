@@ -29,6 +29,7 @@ from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
@@ -61,15 +62,16 @@ class BodySystem:
         consistent_tangent: bool = True,
     ):
         self.bodies, self.pairs, self.solver = bodies, list(pairs), solver
-        self.config, self.comm = bodies.config, bodies.comm
+        self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
+        self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
         self._curvature: PETSc.Mat | None = None
         self.exchanges = Exchanges(self.pairs)
         #: Whether P differs from Q.
         self._petrov_galerkin = False
-        #: The state that was settled last, if its united matrix has a negative determinant.
-        self._not_unique: BodyState | None = None
+        #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
+        self._not_unique: tuple[BodyState, bool] | None = None
         #: Whether the bodies have moved in this step.
         self._led = False
         #: Whether the last exchange has let go of a body that loads drive.
@@ -115,7 +117,7 @@ class BodySystem:
                 # what another pair has returned is returned
                 pair.project()
                 way = pair.return_vectors()
-            self.config.displacement[pair.nodes] += way
+            self.config.shift(pair.nodes, way)
         self.bodies.u.x.scatter_forward()
         self.place()
         return True
@@ -138,15 +140,15 @@ class BodySystem:
             check_prescribed(pair)
         self.floating.end_step()
         if self._not_unique is not None:
-            self._refuse_one_of_several(self._not_unique)
+            self._refuse_one_of_several(*self._not_unique)
 
-    def _refuse_one_of_several(self, state: BodyState) -> None:
+    def _refuse_one_of_several(self, state: BodyState, negative: bool) -> None:
         """Refuse an equilibrium between which and that without friction the united matrix was singular (collective)."""
         added = together(self._curvature, state.added)
-        if not self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
+        if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
             raise FrictionError(
-                "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP is negative; take less "
-                "friction, or stiffer bodies"
+                "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP has another sign than "
+                "without friction; take less friction, or stiffer bodies"
             )
 
     # -- equations and forces --------------------------------------------------------------------------------------------
@@ -155,7 +157,7 @@ class BodySystem:
         """Forces of the bodies less those of friction that are known, which do not grow with the force along the normal (collective)."""
         F = self.bodies.residual
         for nodes, forces in filter(None, (pair.known_forces() for pair in self.pairs)):
-            F.array[:] -= self.config.add_at_owners(nodes, forces).ravel()
+            F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
@@ -176,7 +178,7 @@ class BodySystem:
             rows, self._here = self._rows_here(), None
             y = rows.test.pass_on(F)
             residual = rows.test.reduce(y)
-            at_rest = in_equilibrium(residual.norm(), F.norm(), rounding)
+            at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest:
                 self._take(self._read_forces(rows, y))
             self._swept = not at_rest
@@ -193,7 +195,7 @@ class BodySystem:
             unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
             wanting = not (at_rest and violated == 0 and not moved)
             # the residual that a step begins with does not know how far conditions lead the bodies
-            if wanting and pairs and self._led and self.exchanges.visit(residual.norm()):
+            if wanting and pairs and self._led and self.exchanges.visit(first(self.unknowns.norms(residual))):
                 for pair in pairs:
                     pair.place_again()
                 moved = True
@@ -206,8 +208,8 @@ class BodySystem:
             trial=trial,
             test=rows.test,
             residual=residual,
-            norm=residual.norm(),
-            scale=self.bodies.residual.norm(),
+            norm=self.unknowns.norms(residual),
+            scale=self.bodies.forces_at_work(self.bodies.residual),
             rounding=rounding,
             gap=gap,
             active=active,
@@ -231,7 +233,7 @@ class BodySystem:
 
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
-        hold = partial(self.floating.hold, self.bodies.free[: self.config.n_owned])
+        hold = partial(self.floating.hold, self.bodies.free_rows)
         return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed)
 
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
@@ -246,7 +248,7 @@ class BodySystem:
         largest = max((pair.largest_gap_here() for pair in self.pairs), default=0.0)
         united = sum(int(pair.united.sum()) for pair in self.pairs)
         told = gathered(self.comm, np.array([united, largest])) if self.pairs else np.zeros((1, 2))
-        return trial, *slip_terms(self.pairs, self.config.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
+        return trial, *slip_terms(self.pairs, self.unknowns.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
@@ -254,10 +256,10 @@ class BodySystem:
             return None
         state, du, left = problem.state, step.du, step.left
         assert isinstance(state, BodyState)
-        driving = max(problem.rhs.norm(), step.rhs.norm()) if left > 0.0 else 0.0
+        driving = max(first(self.unknowns.norms(rhs)) for rhs in (problem.rhs, step.rhs)) if left > 0.0 else 0.0
         with timed("uniting equations"):
             F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
-            increment = du.array_r.reshape(-1, self.config.gdim)
+            increment = du.array_r[: self._n].reshape(-1, self.config.gdim)
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
             near = max(PREDICTED, left) * way
@@ -279,7 +281,8 @@ class BodySystem:
                     "Dirichlet condition, give it inertia, or take less load"
                 )
             if chosen is None or self._adrift:
-                self._not_unique = state if self.solver.negative else None
+                negative, either = self.solver.negative, self.unknowns.mixed and self.solver.tells_sign
+                self._not_unique = (state, negative) if negative or either else None
                 self._take(forces)
                 return None
             if self.exchanges.straight:
@@ -375,7 +378,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.bodies.update_tangent()
         with timed("contact curvature"):
-            how = self.config.vector(), self._petrov_galerkin, self.exchanges.convex
+            how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex
             self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
@@ -429,7 +432,7 @@ class BodySystem:
         """``du = P dq + c``; bodies stay where they are along neutral motions."""
         du = state.trial.expand(dq)
         du.axpy(1.0, state.trial.c)
-        du.array[:] = self.floating.without_open_motions(du.array_r)
+        du.array[: self._n] = self.floating.without_open_motions(du.array_r[: self._n])
         return du
 
     @property

@@ -13,7 +13,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
@@ -29,7 +29,7 @@ class Tangent:
 
     Args:
         F: UFL residual.
-        u: displacement.
+        config: configuration of the displacement.
         materials: whose stresses in F are no expressions of u; they add their stiffness.
         dynamics: whose inertia forces depend on u, or None.
 
@@ -37,7 +37,10 @@ class Tangent:
         SpaceError: if F does not depend on u.
     """
 
-    def __init__(self, F: ufl.Form, u: fem.Function, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None):
+    def __init__(
+        self, F: ufl.Form, config: Configuration, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None
+    ):
+        u = config.whole
         J = ufl.derivative(F, u)
         for material in materials:
             J += revolved(material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0]))
@@ -51,7 +54,10 @@ class Tangent:
         self._values: list[Array] | None = None
         with compiling("the tangent"):
             self._form = forms.form(J)
-        self.K: PETSc.Mat = forms.create_matrix(self._form)
+        self._unknowns = config.unknowns
+        self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
+        #: Components without Dirichlet condition ``(n_rows, gdim)``, which the bodies tell.
+        self.free: Bools = np.ones((0, 0), dtype=bool)
         #: Grows with every assembly.
         self.number = 0
 
@@ -68,6 +74,7 @@ class Tangent:
             forms.assemble_matrix(self.K, self._form)
             if self._dynamics is not None and factor:
                 self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+            self._unknowns.complete(self.K, self.free)
         self._values, self._factor = values, factor
         self.number += 1
 

@@ -122,7 +122,7 @@ def time_steps(
             f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
         )
-    begin_checkpoint(checkpoint, problem.state, problem.u)
+    begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
     steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
     shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
     return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)

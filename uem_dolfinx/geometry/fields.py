@@ -1,0 +1,264 @@
+"""A displacement that is one part of a mixed space: which unknowns of the space are its nodes', and in which rows all others stand.
+
+Vectors and matrices of the united system have rows of gdim components each. On every rank the displacement's nodes come first, then the
+unknowns of all other fields, as many to a row as a node has components; the last row is filled up with components that are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints
+from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
+
+
+class ConfigurationAmongFields(Configuration):
+    """Nodes of a displacement that is one part of a mixed space, and where they are now (collective).
+
+    Args:
+        w: Function of the mixed space.
+        displacement: number of the part, of vector Lagrange elements of degree 1 or 2.
+
+    Attributes:
+        dofs: local unknowns of w that the components of the local nodes are ``(n_local, gdim)``.
+
+    Raises:
+        InputTypeError, InputError, SpaceError: if w is of no mixed space, or has no such part, or that is no displacement.
+    """
+
+    def __init__(self, w: fem.Function, displacement: int):
+        W = w.function_space
+        with agreed(W.mesh.comm):
+            V = _space_of_displacement(W, displacement)
+        self.whole, self.part, self.u = w, int(displacement), ufl.split(w)[displacement]
+        self._take(V)
+        nodes, own = compat.cell_dofs(V), compat.part_dofs(W, self.part)
+        self.dofs: Ints = np.zeros((self.n_local, self.gdim), dtype=np.int64)
+        if len(nodes):
+            self.dofs[nodes.ravel()] = own.reshape(-1, self.gdim)
+        self._unknowns = Unknowns(self)
+        first = np.append(self._first_nodes[:-1], np.iinfo(np.int64).max)
+        numbers = super().to_global(np.arange(self.n_local))
+        rank = np.searchsorted(first, numbers, side="right") - 1
+        #: Rows of the local nodes, over all ranks.
+        self._rows: Ints = numbers - first[rank] + self._unknowns._first_nodes[rank]
+        self.first, self.n_global = self._unknowns.first, self._unknowns.n_global
+        self._first_nodes = self._unknowns._first_nodes
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """The rows that vectors and matrices have."""
+        return self._unknowns
+
+    def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Rows of local nodes, over all ranks."""
+        return self._rows[nodes]
+
+    def of(self, values: AnyArray) -> Any:
+        """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)``."""
+        return values[self.dofs]
+
+    def rows(self, values: AnyArray) -> Any:
+        """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)``, zero where these are filled up."""
+        out = np.zeros(self.gdim * self._unknowns.n_owned, values.dtype)
+        out[self._unknowns.place] = values
+        return out.reshape(-1, self.gdim)
+
+    def from_rows(self, rows: Array) -> Array:
+        """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
+        return rows[self._unknowns.place]
+
+    def place_of(self, unknown: int) -> str:
+        """Which component of which node a local unknown is, or of which other part of the space, for error messages."""
+        node, component = np.nonzero(self.dofs == unknown)
+        if len(node):
+            return f"{'xyz'[component[0]]} at {self.describe(node[0])}"
+        W = self.whole.function_space
+        parts = [i for i in range(W.num_sub_spaces) if (compat.part_dofs(W, i) == unknown).any()]
+        return f"part {parts[0]} of the mixed space"
+
+    @cached_property
+    def _parts(self) -> dict[str, tuple[fem.Function, Ints]]:
+        """Functions of the parts by name, and the unknowns of w that they have (first time: collective)."""
+        W, found = self.whole.function_space, {"displacement": (fem.Function(self.V, name="displacement"), self.dofs.ravel())}
+        for i in range(W.num_sub_spaces):
+            if i != self.part:
+                V, dofs = W.sub(i).collapse()
+                found[f"field_{i}"] = fem.Function(V, name=f"field_{i}"), np.asarray(dofs, dtype=np.int64).ravel()
+        return found
+
+    def functions(self) -> dict[str, fem.Function]:
+        """The displacement and all other fields, ``field_1`` of part 1, as Functions of their own, up to date (first call: collective)."""
+        found = {name: f for name, (f, _) in self._parts.items()}
+        self.fill(found, self.whole.x.array)
+        return found
+
+    def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
+        """Write values of all unknowns, ghosts included ``(n,)``, to Functions that are like those of ``functions``."""
+        for name, (_, dofs) in self._parts.items():
+            functions[name].x.array[:] = values[dofs]
+
+    def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
+        """Values of all unknowns, ghosts included ``(n,)``, from Functions that are like those of ``functions``."""
+        values = np.zeros(len(self.whole.x.array))
+        for name, (_, dofs) in self._parts.items():
+            values[dofs] = functions[name].x.array
+        return values
+
+    def shift(self, nodes: Any, way: Array) -> None:
+        """Move local nodes ``(n,)``, each named once, or all of a slice, by a way ``(n, gdim)``; ghosts are not told."""
+        self.whole.x.array[self.dofs[nodes]] += way
+
+
+class Unknowns(Nodes):
+    """Rows of the united system of a mixed space: nodes of the displacement, then the unknowns of all other fields (collective).
+
+    Args:
+        config: nodes of the displacement, whose numbers are not yet those of the rows.
+
+    Attributes:
+        place: component of a vector that each owned unknown of the mixed space is ``(n,)``.
+        numbers: likewise over all ranks, of each local unknown, ghosts included.
+        n_fields: number of parts of the mixed space.
+        field: which part each component is of, the displacement 0 and the others in their order ``(n_owned * block,)``; -1 is none.
+        kind: number of the part's component, alike for all that can be averaged ``(n_owned * block,)``.
+    """
+
+    mixed = True
+
+    def __init__(self, config: ConfigurationAmongFields):
+        W = config.whole.function_space
+        self.config, self.comm, self.mesh, self.V = config, config.comm, config.mesh, W
+        self.gdim = self.block = g = config.gdim
+        self._map, n = W.dofmap.index_map, W.dofmap.index_map.size_local
+        own = config.dofs[: config.n_owned].ravel()
+        others = np.setdiff1d(np.arange(n), own)
+        self.n_owned = self.n_local = config.n_owned + -(-len(others) // g)
+        counts = gathered(self.comm, self.n_owned)
+        self.first, self.n_global = int(counts[: self.comm.rank].sum()), int(counts.sum())
+        self.place: Ints = np.empty(n, dtype=np.int64)
+        self.place[own], self.place[others] = np.arange(len(own)), g * config.n_owned + np.arange(len(others))
+        sent = fem.Function(W)
+        sent.x.array[:n] = g * self.first + self.place
+        sent.x.scatter_forward()
+        self.numbers: Ints = np.rint(sent.x.array).astype(np.int64)
+        self._label(W, n)
+
+    def _label(self, W: Any, n: int) -> None:
+        """Tell fields and their components apart."""
+        self.n_fields = W.num_sub_spaces
+        field, kind = np.full((2, len(self.numbers)), -1)
+        order = [self.config.part, *(i for i in range(self.n_fields) if i != self.config.part)]
+        count = 0
+        for number, i in enumerate(order):
+            dofs = compat.part_dofs(W, i)
+            width = max(W.sub(i).num_sub_spaces, 1)
+            field[dofs] = number
+            kind[dofs] = count + np.arange(dofs.shape[1]) % width
+            count += width
+        self.field, self.kind = np.full((2, self.block * self.n_owned), -1)
+        self.field[self.place], self.kind[self.place] = field[:n], kind[:n]
+        #: Field of every local unknown of the mixed space, ghosts included.
+        self.field_of: Ints = field
+
+    def norms(self, v: PETSc.Vec) -> Array:
+        """Norm of each field's part of a vector, the displacement's first ``(n_fields,)`` (collective)."""
+        return self.norms_of(v.array_r)
+
+    def norms_of(self, values: Array) -> Array:
+        """Likewise of the owned components ``(n_owned * block,)`` (collective)."""
+        squares = np.bincount(self.field + 1, values**2, self.n_fields + 1)[1:]
+        return np.sqrt(np.asarray(reduced(self.comm, squares)))
+
+    def work(self, q: PETSc.Vec, F: PETSc.Vec) -> float:
+        """Work of forces along an increment, that of the displacement alone (collective)."""
+        n = self.block * self.config.n_owned
+        return float(reduced(self.comm, float(q.array_r[:n] @ F.array_r[:n])))
+
+    def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
+        """Numbers of owned rows over all ranks."""
+        return np.asarray(nodes, dtype=np.int64) + self.first
+
+    def describe(self, node: int) -> str:
+        """Where an owned row's node is, for error messages."""
+        return self.config.describe(node) if node < self.config.n_owned else "an unknown of another field"
+
+    def create_matrix(self, a: Any) -> PETSc.Mat:
+        """Matrix for a compiled bilinear form of the mixed space, into which DOLFINx assembles by its own numbers (collective).
+
+        All components of a row have entries in the same rows' columns, as those of a node have.
+        """
+        there = forms.create_matrix(a)
+        forms.assemble_matrix(there, a)
+        indptr, columns, _ = there.getValuesCSR()
+        there.destroy()
+        g, (asked, at) = self.block, np.unique(columns, return_inverse=True)
+        column = self._numbers_of(asked)[at] // g
+        row = np.repeat(self.place // g, np.diff(indptr))
+        every = np.arange(self.n_owned)
+        keys = np.unique(np.append(row * self.n_global + column, every * self.n_global + every + self.first))
+        row, column = np.divmod(keys, self.n_global)
+        width = g * np.bincount(row, minlength=self.n_owned)
+        of_row, wide = np.cumsum(width) - width, np.repeat(width, g)
+        starts = np.append(0, np.cumsum(wide))
+        places = np.arange(starts[-1]) + np.repeat(np.repeat(of_row, g) - starts[:-1], wide)
+        all_columns = (g * column[:, None] + np.arange(g)).ravel()[places]
+        sizes = ((g * self.n_owned, g * self.n_global),) * 2
+        csr = starts.astype(PETSc.IntType), all_columns.astype(PETSc.IntType), np.zeros(len(all_columns))
+        K = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self.comm)
+        numbers = PETSc.LGMap().create(self.numbers.astype(PETSc.IntType), comm=self.comm)
+        K.setLGMap(numbers, numbers)
+        return K
+
+    def _numbers_of(self, unknowns: Ints) -> Ints:
+        """Components of vectors, over all ranks, that DOLFINx's global ``unknowns (k,)`` of any rank are (collective)."""
+        first = gathered(self.comm, int(self._map.local_range[0]))
+        asking = Exchange.to(self.comm, np.searchsorted(first, unknowns, side="right") - 1)
+        (asked,) = asking.send(unknowns)
+        found = np.empty(len(unknowns), dtype=np.int64)
+        (found[asking.rows],) = asking.back(self.numbers[asked - first[self.comm.rank]])
+        return found
+
+    def multipliers(self, A: PETSc.Mat) -> int:
+        """Number of unknowns of other fields without stiffness of their own, or with a negative one (collective)."""
+        return int(reduced(self.comm, int(((A.getDiagonal().array_r <= 0.0) & (self.field > 0)).sum())))
+
+    def complete(self, K: PETSc.Mat, free: Bools) -> None:
+        """Put 1 on the diagonal of K where it is zero and components are held, which P crosses out ``(n_owned, block)`` (collective)."""
+        diagonal = K.getDiagonal()
+        idle = ~free.ravel() & (diagonal.array_r == 0.0)
+        diagonal.array[idle] = 1.0
+        K.setDiagonal(diagonal)
+
+
+def _space_of_displacement(W: Any, i: Any) -> Any:
+    """The vector Lagrange space of a mixed space's part i, numbered as a space of its own."""
+    if not compat.is_mixed(W):
+        raise SpaceError("displacement names a part of a mixed space, and the space of u is none: leave displacement out")
+    size = W.num_sub_spaces
+    whole = isinstance(i, (int, np.integer)) and not isinstance(i, bool)
+    given.kind("displacement", i, whole, f"the number of a part of the mixed space, one of 0 to {size - 1}")
+    if not 0 <= i < size:
+        raise InputError(given.sentence("displacement", i, f"the number of a part of the mixed space, one of 0 to {size - 1}"))
+    part, g = W.sub(int(i)), W.mesh.geometry.dim
+    degree, components = compat.lagrange_degree(part), part.num_sub_spaces
+    if degree is None or components != g:
+        fit = [k for k in range(size) if W.sub(k).num_sub_spaces == g and compat.lagrange_degree(W.sub(k)) is not None]
+        remedy = f"; take displacement={fit[0]}" if fit else "; make the displacement a part of its own"
+        raise SpaceError(
+            f"displacement = {i}: that part of the mixed space has {max(components, 1)} component(s)"
+            f"{'' if degree else ' and is no Lagrange space'}, expected a vector Lagrange space of size {g}{remedy}"
+        )
+    return compat.function_space(W.mesh, degree, (g,))
