@@ -29,9 +29,9 @@ from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: A dense matrix of more components takes as long as factorisations of the whole, and too much memory on one rank.
-#: [convention; components; test_condensed.py::test_most_components]
-MOST_COMPONENTS = 3_000
+#: A sparse factorisation takes as long, beside its arithmetic, as so many floating-point operations for each unknown.
+#: [heuristic; operations; test_condensed.py::test_which_way_is_cheaper]
+FOR_EACH_UNKNOWN = 30_000
 
 
 class Condensed:
@@ -45,6 +45,8 @@ class Condensed:
 
     def __init__(self, space: Nodes):
         self.space = space
+        #: K, and what MUMPS expects its factorisation to take, by its pattern alone.
+        self._expected: tuple[PETSc.Mat, mumps.Expected] | None = None
         self.drop()
 
     #: What solves with K_II.
@@ -110,7 +112,7 @@ class Condensed:
         return touched
 
     def factorise(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, pc: PETSc.PC, symmetric: bool) -> bool:
-        """Factorise K without all that P, Q and G touch or may touch; whether there are few enough of it, and MUMPS does (collective).
+        """Factorise K without all that P, Q and G touch or may touch; whether that is cheaper than as a whole, and done (collective).
 
         Args:
             P: of a united matrix.
@@ -124,7 +126,7 @@ class Condensed:
         if self._is_of(K) and not self._begins:
             nodes |= self._nodes
         self.drop()
-        if reduced(space.comm, space.block * int(nodes.sum())) > MOST_COMPONENTS:
+        if not self._is_cheaper(reduced(space.comm, space.block * int(nodes.sum())), K, pc):
             return False
         self._nodes = nodes
         self._at = (space.block * np.flatnonzero(nodes)[:, None] + np.arange(space.block)).ravel()
@@ -152,6 +154,20 @@ class Condensed:
                 return False
         self._pc, self._S, self._made_for = pc, S, (K, K.stateGet(), P.free)
         return True
+
+    def _is_cheaper(self, size: int, K: PETSc.Mat, pc: PETSc.PC) -> bool:
+        """Whether dense algebra of ``size`` components costs no more than factorising the whole, in counts alike on all ranks (collective).
+
+        ``size^3 / 3`` operations stand against those that MUMPS counts in its analysis of K, which is made once and where it decides.
+        Then S has no more entries than these factors, either.
+        """
+        dense, beside = size**3 / 3 * (1 if pc.getType() == "cholesky" else 2), FOR_EACH_UNKNOWN * K.getSize()[0]
+        if dense <= beside:
+            return True
+        if self._expected is None or self._expected[0] != K:
+            self._expected = K, mumps.expected(pc, K)
+        flops, entries = self._expected[1]
+        return dense <= flops + beside and size**2 <= entries
 
     def unite(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None) -> None:
         """Make the dense united matrix; ``serves`` must hold (collective)."""

@@ -1,16 +1,17 @@
-"""What is asked of MUMPS beside solving: whether it needs more workspace, and the sign of the determinant.
+"""What is asked of MUMPS beside solving: whether it needs more workspace, the sign of the determinant, and what a factorisation takes.
 
 Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the workspace beyond what the analysis estimates,
-INFOG(12) the number of negative pivots of a symmetric one, ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa. With a
-Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are solves. petsc4py has no Schur complements: PETSc's
-own library is called.
+INFOG(12) the number of negative pivots of a symmetric one, ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa; RINFOG(1)
+and INFOG(20) the operations and entries that the analysis expects of it, the latter in millions where it is negative. With a
+Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are solves. petsc4py has neither Schur complements
+nor analyses alone: PETSc's own library is called.
 """
 
 from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -67,13 +68,16 @@ def is_indefinite(pc: PETSc.PC, space: Nodes | None = None) -> bool:
 
 @cache
 def _petsc() -> Any:
-    """PETSc's library if it has what Schur complements take, or None."""
+    """PETSc's library if it has what Schur complements and analyses take, or None."""
     library = ctypes.CDLL(PETSc.__file__)
-    names = "MatFactorSetSchurIS", "MatFactorCreateSchurComplement", "MatDenseGetArrayRead", "MatDestroy"
-    if PETSc.ScalarType is not np.float64 or not all(hasattr(library, name) for name in names):
+    arguments = {
+        "MatFactorSetSchurIS": 2, "MatFactorCreateSchurComplement": 3, "MatDenseGetArrayRead": 2, "MatDestroy": 1,
+        "MatFactorInfoInitialize": 1, "MatCholeskyFactorSymbolic": 4, "MatLUFactorSymbolic": 5,
+    }  # fmt: skip
+    if PETSc.ScalarType is not np.float64 or not all(hasattr(library, name) for name in arguments):
         return None
-    for name, arguments in zip(names, (2, 3, 2, 1)):
-        getattr(library, name).argtypes = [ctypes.c_void_p] * arguments
+    for name, n in arguments.items():
+        getattr(library, name).argtypes = [ctypes.c_void_p] * n
     return library
 
 
@@ -85,6 +89,46 @@ def condenses(pc: PETSc.PC) -> bool:
 def solves_with_schur_complement(comm: MPI.Comm) -> bool:
     """Whether PETSc solves with a factorisation that has a Schur complement: on several ranks those after 3.18 do not."""
     return comm.size == 1 or PETSc.Sys.getVersion() < (3, 19)
+
+
+class Expected(NamedTuple):
+    """What a factorisation is expected to take.
+
+    Attributes:
+        flops: floating-point operations.
+        entries: of the factors.
+    """
+
+    flops: float
+    entries: float
+
+
+def expected(pc: PETSc.PC, A: PETSc.Mat) -> Expected:
+    """What factorising a matrix as a PC is made to is expected to take, by the matrix's pattern (collective)."""
+    library, alone = _petsc(), PETSc.PC().create(pc.comm)
+    alone.setOptionsPrefix(pc.getOptionsPrefix())
+    alone.setType(pc.getType())
+    alone.setOperators(A)
+    factors = _factors(alone)
+    # MatFactorInfo is less than this many numbers
+    info = (ctypes.c_double * 32)()
+    _check(library.MatFactorInfoInitialize(info))
+    if pc.getType() == "cholesky":
+        _check(library.MatCholeskyFactorSymbolic(factors.handle, A.handle, None, info))
+    else:
+        _check(library.MatLUFactorSymbolic(factors.handle, A.handle, None, None, info))
+    flops, entries = factors.getMumpsRinfog(1), factors.getMumpsInfog(20)
+    alone.destroy()
+    return Expected(flops, float(entries if entries >= 0 else -1e6 * entries))
+
+
+def _factors(pc: PETSc.PC) -> PETSc.Mat:
+    """The factors that a PC is going to make by MUMPS, with its options (collective)."""
+    pc.setFactorSolverType("mumps")
+    pc.setFactorSetUpSolverType()
+    factors = pc.getFactorMatrix()
+    factors.setOptionsPrefix(pc.getOptionsPrefix())
+    return factors
 
 
 def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
@@ -102,10 +146,7 @@ def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
     library, comm = _petsc(), pc.comm.tompi4py()
     every = np.concatenate(comm.allgather(left)).astype(PETSc.IntType)
     numbers = PETSc.IS().createGeneral(every if comm.rank == 0 else every[:0], comm=comm)
-    pc.setFactorSolverType("mumps")
-    pc.setFactorSetUpSolverType()
-    factors = pc.getFactorMatrix()
-    factors.setOptionsPrefix(pc.getOptionsPrefix())
+    factors = _factors(pc)
     factors.setMumpsIcntl(33, 1)
     _check(library.MatFactorSetSchurIS(factors.handle, numbers.handle))
     pc.setUp()

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.state import FrictionState
 
@@ -98,6 +98,23 @@ def tangents(normals: Array, free: Bools) -> Array:
     Returns:
         ``(n, gdim - 1, gdim)``.
     """
+    first, g = normals[:, 0], normals.shape[2]
+    if g == 2:
+        found = np.stack([-first[:, 1], first[:, 0]], axis=1)[:, None]
+    else:
+        # the first is across the axis that the normal is farthest from
+        across = cross_products(first, np.eye(3)[np.abs(first).argmin(axis=1)])
+        found = np.stack([across, cross_products(first, across)], axis=1)
+    size = np.linalg.norm(found, axis=2, keepdims=True)
+    found /= np.where(size > 0, size, 1.0)
+    more = np.flatnonzero(normals[:, 1:].any(axis=(1, 2)) | ~free.all(axis=1))
+    if len(more):
+        found[more] = _left_by(normals[more], free[more])
+    return found
+
+
+def _left_by(normals: Array, free: Bools) -> Array:
+    """``tangents`` where several normals meet, or something is prescribed."""
     fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normals.shape[2])
     _, size, axes = np.linalg.svd(np.concatenate([normals, fixed], axis=1))
     # the last axes are those that neither the normal nor a prescribed component has a part in
