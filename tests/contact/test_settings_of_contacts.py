@@ -81,5 +81,5 @@ def test_what_a_contact_has_not():
     contact = driven("quadrilateral", 0.1).contact
     new = uem.Contact(contact.contactor, uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
     for one in (contact, new):
-        for name in ("mu", "offset", "frictions"):
+        for name in ("mu", "offsets", "frictions"):
             refused(uem.InputError, f"no '{name}'", lambda: setattr(one, name, 0.1))

@@ -180,10 +180,11 @@ class Contact(ContactResults):
         super().__setattr__(name, value)
 
     def __repr__(self) -> str:
-        """Its name, coupling and sliding, and friction if there is any."""
+        """Its name, coupling and sliding, and friction and a tie if there is any."""
         law, coupling = as_law(self._friction), self.coupling if isinstance(self.coupling, str) else self.coupling.__name__
         friction = "" if law.field == 0.0 else f", friction={type(law).__name__}({', '.join(map(given.shown, parameters(law)))})"
-        return f"Contact({self.name!r}, coupling={coupling!r}, sliding={self.sliding!r}{friction})"
+        tied = f", tied={self.tied!r}" if self.tied else ""
+        return f"Contact({self.name!r}, coupling={coupling!r}, sliding={self.sliding!r}{friction}{tied})"
 
     @property
     def friction(self) -> Field | FrictionLaw:
@@ -348,7 +349,7 @@ class Contact(ContactResults):
                 free=free[nodes],
                 keeps_feet=self.sliding != "finite",
             )
-        self._pair, self._offsets = self._interface(discretisation, means, friction, **of), None
+        self._pair, self._offsets = self._interface(nodes, discretisation, means, friction, **of), None
         if self.adjust and self.tied is not True:
             from uem_dolfinx.contact.offsets import Offsets
 
@@ -366,9 +367,11 @@ class Contact(ContactResults):
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 
-    def _interface(self, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any) -> Interface:
+    def _interface(
+        self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any
+    ) -> Interface:
         """The pair, tied if it is from the start; ``means`` as of ``Tied`` (collective)."""
-        between = self.config, surface_nodes(self.config, self.contactor), discretisation, friction
+        between = self.config, nodes, discretisation, friction
         if not self.tied:
             return Interface(*between, **of)
         from uem_dolfinx.contact.tied import Tied
@@ -416,7 +419,8 @@ class Contact(ContactResults):
         from uem_dolfinx.contact.target_corners import TargetCorners
 
         self._corners = TargetCorners(self.pair, self.contactor) if nodes_on_facets else None
-        warn_of_sagging_facets(self.pair)
+        if not self.adjust:
+            warn_of_sagging_facets(self.pair)
 
     def look_at_ends(self) -> None:
         """Warn, once, if contactors have slid off the target's end since the start (collective)."""

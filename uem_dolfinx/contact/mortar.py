@@ -194,7 +194,7 @@ class Mortar(Contactors):
         coefficients = at.duals.C @ self.basis.T
         weighted = np.einsum("mij,mj->mi", coefficients, offsets)
         own = np.einsum("mii,mg->mig", coefficients, at.planes.normal)
-        parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, -1)
+        parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, 1 + self.config.gdim)
         total = self.config.add_at_owners(at.nodes.ravel(), parts)[self.nodes]
         length = np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
         return np.where(rows.covered, total[:, 0] / length, self.offset)

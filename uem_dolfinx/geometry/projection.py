@@ -11,8 +11,8 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
 
-#: The way from its foot to a point at a height is along the facet's normal unless its cosine differs from one by more.
-#: [convention; cosine; test_offset.py::test_over_an_edge]
+#: A way from the foot that leans from the facet's normal by less, in the cosine of the angle, leans by rounding.
+#: [bound; cosine; -]
 ALONG_NORMAL = 1e-12
 
 

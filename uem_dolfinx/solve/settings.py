@@ -78,6 +78,8 @@ class Settings:
             name = f"contact {i} '{contact.name}'"
             for what in ("coupling", "sliding", "normals", "thickness", "chords"):
                 words[f"{name}, {what}"] = str(getattr(contact, what))
+            if contact.tied or contact.adjust:
+                words[f"{name}, tied and adjust"] = f"{contact.tied}, {contact.adjust}"
             for k, value in enumerate(parameters(as_law(contact.friction))[1:], 2):
                 words[f"{name}, parameter {k} of friction"] = described(value)
             if follows_load(as_law(contact.friction)):
