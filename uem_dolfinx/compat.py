@@ -220,9 +220,20 @@ def lagrange_degree(V: Any) -> int | None:
     return degree if family == "Lagrange" else None
 
 
+def highest_degree(V: Any) -> int:
+    """Degree of a continuous Lagrange space, or the highest among the parts of a mixed one; 0 for any other."""
+    parts = getattr(V.ufl_element(), "sub_elements", ())
+    elements = [V.ufl_element(), *(parts() if callable(parts) else parts)]
+    found = [family for family in map(_family_of, elements) if family is not None]
+    return max((degree for family, degree in found if family == "Lagrange"), default=0)
+
+
 def element_family(V: Any) -> tuple[str, int] | None:
     """``"Lagrange"``, ``"Discontinuous Lagrange"`` or ``"Quadrature"``, and the degree; None for any other space."""
-    element = V.ufl_element()
+    return _family_of(V.ufl_element())
+
+
+def _family_of(element: Any) -> tuple[str, int] | None:
     if callable(getattr(element, "family", None)):
         family = "Lagrange" if element.family() in ("CG", "Q", "P") else str(element.family())
         family = "Discontinuous Lagrange" if family == "DQ" else family

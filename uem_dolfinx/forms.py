@@ -186,7 +186,7 @@ def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
     if not tensor and not any(_has_hoop_strains(i.integrand()) for i in F.integrals_by_type("cell")):
         return F
     spaces = [f.ufl_function_space() for f in (*F.coefficients(), *F.arguments())]
-    degree = int(DEGREES_ENOUGH * max((compat.lagrange_degree(V) or 0 for V in spaces), default=0))
+    degree = int(DEGREES_ENOUGH * max(map(compat.highest_degree, spaces), default=0))
     integrals = []
     for integral in F.integrals():
         if integral.integral_type() == "cell" and not any(key.startswith("quadrature") for key in integral.metadata()):
@@ -209,7 +209,7 @@ def _is_polynomial(integrand: Any) -> bool:
 
     def varies(part: Any) -> bool:
         functions = (f for f in traverse_unique_terminals(part) if isinstance(f, ufl.Coefficient))
-        return any(compat.lagrange_degree(f.ufl_function_space()) for f in functions)
+        return any(compat.highest_degree(f.ufl_function_space()) for f in functions)
 
     for part in unique_pre_traversal(integrand):
         below = part.ufl_operands[1] if isinstance(part, Division) else part if isinstance(part, MathFunction) else None

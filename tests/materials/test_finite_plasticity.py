@@ -41,7 +41,7 @@ def tensors(material: uem.FinitePlasticity, name: str) -> np.ndarray:
 @pytest.mark.parametrize("law", LAWS)
 def test_uniaxial_tension(comm, law):
     """The logarithmic strain and the Kirchhoff stress obey the equations of small strains: to three times the length, and back."""
-    s, u = block(comm, "hexahedron", 1)
+    s, u = block(comm, "hexahedron")
     V, (parameters, flow) = u.function_space, LAWS[law]
     material = uem.FinitePlasticity(u, E, NU, *parameters)
     pulled = fem.Constant(s.mesh, 0.0)
@@ -78,7 +78,7 @@ def test_uniaxial_tension(comm, law):
 @pytest.mark.parametrize("cell, kind", [("quadrilateral", "plane_strain"), ("hexahedron", "3d")])
 def test_simple_shear(comm, cell, kind):
     """Perfectly plastic shear is borne by FY / sqrt(3), however far it goes."""
-    _, u = block(comm, cell, 1)
+    _, u = block(comm, cell)
     material = uem.FinitePlasticity(u, E, NU, FY, kind=kind)
     for gamma in np.linspace(0.0, 5.0, 251)[1:]:
         deform(u, gamma * np.outer(np.eye(len(u))[0], np.eye(len(u))[1]))
@@ -93,7 +93,7 @@ def test_simple_shear(comm, cell, kind):
 @pytest.mark.parametrize("cell, kind", [("quadrilateral", "plane_strain"), ("hexahedron", "3d")])
 def test_rotations_turn_the_stress_and_change_nothing_else(comm, cell, kind):
     """A stretched body is turned, and stretched on: as if it had not been turned."""
-    _, u = block(comm, cell, 1)
+    _, u = block(comm, cell)
     g = len(u)
     still, turned = (uem.FinitePlasticity(u, E, NU, FY, H, kind=kind) for _ in range(2))
     stretched, further = np.eye(g) + 0.3 * np.eye(g, k=1), np.diag([1.2, 0.9, 1.1][:g])
@@ -115,7 +115,7 @@ def test_rotations_turn_the_stress_and_change_nothing_else(comm, cell, kind):
 @pytest.mark.parametrize("law", LAWS)
 def test_flow_keeps_the_volume_and_dissipates(comm, law):
     """Over a path that turns back and forth: det F_p = 1 to rounding."""
-    _, u = block(comm, "hexahedron", 1)
+    _, u = block(comm, "hexahedron")
     material = uem.FinitePlasticity(u, E, NU, *LAWS[law][0])
     before = 0.0
     for k in range(40):

@@ -41,8 +41,11 @@ class ConfigurationAmongFields(Configuration):
     def __init__(self, w: fem.Function, displacement: int):
         W = w.function_space
         with agreed(W.mesh.comm):
-            V = _space_of_displacement(W, displacement)
+            degree = _degree_of_displacement(W, displacement)
+        given.alike(W.mesh.comm, "UnitedProblem", displacement=displacement)
         self.whole, self.part, self.u = w, int(displacement), ufl.split(w)[displacement]
+        # numbered as a space of its own, which surfaces and results are of
+        V = compat.function_space(W.mesh, degree, (W.mesh.geometry.dim,))
         self._take(V)
         nodes, own = compat.cell_dofs(V), compat.part_dofs(W, self.part)
         self.dofs: Ints = np.zeros((self.n_local, self.gdim), dtype=np.int64)
@@ -243,8 +246,8 @@ class Unknowns(Nodes):
         K.setDiagonal(diagonal)
 
 
-def _space_of_displacement(W: Any, i: Any) -> Any:
-    """The vector Lagrange space of a mixed space's part i, numbered as a space of its own."""
+def _degree_of_displacement(W: Any, i: Any) -> int:
+    """Degree of a mixed space's part i, a vector Lagrange space."""
     if not compat.is_mixed(W):
         raise SpaceError("displacement names a part of a mixed space, and the space of u is none: leave displacement out")
     size = W.num_sub_spaces
@@ -261,4 +264,4 @@ def _space_of_displacement(W: Any, i: Any) -> Any:
             f"displacement = {i}: that part of the mixed space has {max(components, 1)} component(s)"
             f"{'' if degree else ' and is no Lagrange space'}, expected a vector Lagrange space of size {g}{remedy}"
         )
-    return compat.function_space(W.mesh, degree, (g,))
+    return degree

@@ -110,7 +110,7 @@ class ResultsWriter(Closing):
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv``, and where DOLFINx has ADIOS2 ``PATH_vectors.bp`` and
     ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``; for every contact its pressure, gap,
     status and force; and whatever ``fields`` names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree
-    2 is interpolated.
+    2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
     ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
@@ -206,9 +206,11 @@ class ResultsWriter(Closing):
 
     def _open_vtx(self) -> list[Any]:
         """VTX files, beside those that are there (collective)."""
-        opened, comm = [], self.problem.comm
+        opened, comm, degree = [], self.problem.comm, self.problem.config.degree
+        # a file holds Functions of one element
+        alike = [u for u in self._sources().values() if compat.lagrange_degree(u.function_space) == degree]
         for rank, ending in enumerate(ENDINGS):
-            functions = [u for u in self._sources().values() if len(u.ufl_shape) == rank]
+            functions = [u for u in alike if len(u.ufl_shape) == rank]
             if self._wants_vtx and functions:
                 stem = self._name(f"_{ending}")
                 first = stem.with_name(f"{stem.name}.bp")
