@@ -76,7 +76,7 @@ class Contact(ContactResults):
             returns ``(n,)``, or a function of place and of the load factor, in time steps of the time, that counts for the step that
             ends there; or a law of friction, made with any of these: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the
             contact is the one without friction. It may be set anew between steps, of a contact that was made with friction, by the same
-            law; all else is settled once a problem has been made.
+            law; all else but ``offset`` is settled once a problem has been made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of place as of ``friction``: after every
             step the contactor has lost the volume ``wear N s`` under the force N that slips by s, with friction or without, and gaps
             are larger by its depth. :attr:`wear` and :attr:`worn_volume` tell it. The target does not wear.

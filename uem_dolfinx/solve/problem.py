@@ -18,7 +18,7 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.configuration import configured
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
@@ -115,7 +115,7 @@ class UnitedProblem:
         verbose: bool = False,
     ):
         self.u = given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
-        self.config = _configured(u, displacement)
+        self.config = configured(u, displacement)
         self.comm = self.config.comm
         with agreed(self.comm):
             check_residual(F, u)
@@ -429,15 +429,6 @@ class UnitedProblem:
     def _rigid_motions(self) -> list[Motion | None]:
         """Where the rigid targets are now; None for those that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.pairs]
-
-
-def _configured(u: fem.Function, displacement: int | None) -> Configuration:
-    """Nodes of a displacement, which is u or one part of it (collective)."""
-    if displacement is None:
-        return Configuration(u)
-    from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-
-    return ConfigurationAmongFields(u, displacement)
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:
