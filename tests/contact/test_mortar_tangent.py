@@ -79,7 +79,7 @@ def leaning(b, cell):
         disturbed(b, 2, 0.01)
 
 
-def weighted_gap(cell, target, hollow=None, offset=0.0):
+def weighted_gap(cell, target, offset=0.0, hollow=None):
     """Of leaning blocks above a mesh, one that ends over a facet, or a rigid ball; of rings with a radius ``hollow``; with an offset."""
     b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, hollow=hollow, contactor=(
         "lower" if target == "end" else "upper"
@@ -130,10 +130,10 @@ def test_curvature_against_differences(cell, target, offset):
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
 
 
-@pytest.mark.parametrize("target", ["mesh", "ball", "end"])
-def test_circles(target):
+@pytest.mark.parametrize("target,offset", product(("mesh", "ball", "end"), (0.0, varying)))
+def test_circles(target, offset):
     """Both of rings, whose parts grow with their radii; of second derivatives all but how dual functions change to second order."""
-    phi = weighted_gap("triangle", target, hollow=0.5)
+    phi = weighted_gap("triangle", target, offset, hollow=0.5)
     rows = phi.leave_out(target)
     first, parts = phi.forces(phi.start), curvature(rows.points, phi.pressure)
     for way, (ahead, behind), h in phi.ways("triangle"):

@@ -143,12 +143,3 @@ def configuration_of(V: Any) -> Configuration:
     if len(V.component()):
         raise SpaceError("V is a part of another space: expected a whole one; collapse it, or make it by uem.function_space")
     return Configuration(fem.Function(V))
-
-
-def configured(u: fem.Function, displacement: int | None) -> Configuration:
-    """Nodes of a displacement, which is u, or the part of u with this number (collective)."""
-    if displacement is None:
-        return Configuration(u)
-    from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-
-    return ConfigurationAmongFields(u, displacement)

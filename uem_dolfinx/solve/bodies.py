@@ -267,3 +267,12 @@ class Bodies:
         """Go on from a diagonal of K that was kept, None if none was known."""
         n = self.config.n_owned * self.config.gdim
         self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.gdim)
+
+
+def configured(u: fem.Function, displacement: int | None) -> Configuration:
+    """Nodes of a displacement, which is u, or the part of u with this number (collective)."""
+    if displacement is None:
+        return Configuration(u)
+    from uem_dolfinx.geometry.fields import ConfigurationAmongFields
+
+    return ConfigurationAmongFields(u, displacement)

@@ -18,7 +18,6 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.geometry.configuration import configured
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
@@ -27,7 +26,7 @@ from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.bodies import Bodies, configured
 from uem_dolfinx.solve.checks import (
     check_conditions,
     check_fields,
