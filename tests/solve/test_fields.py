@@ -294,7 +294,7 @@ def heated(mu=0.3):
 
 
 def test_going_on_from_a_checkpoint(folder):
-    """The rest of the steps is to the last bit what it would have been."""
+    """The rest of the steps is what it would have been: to the last bit on one rank, but for MUMPS' order of messages on several."""
     problem, contact = heated()
     for step in uem.load_steps(problem, 3):
         if step.number == 1:
@@ -302,9 +302,10 @@ def test_going_on_from_a_checkpoint(folder):
     other, again = heated()
     uem.read_checkpoint(folder / "run.uem", other.state())
     assert len(list(uem.load_steps(other, 3))) == 2
-    assert highest(COMM, np.abs(other.u.x.array - problem.u.x.array)) == 0.0
-    assert (contact.resultant().force == again.resultant().force).all()
-    assert again.dissipation == contact.dissipation > 0.0
+    bits = 0.0 if COMM.size == 1 else 1e-12
+    assert highest(COMM, np.abs(other.u.x.array - problem.u.x.array)) <= bits
+    assert np.abs(contact.resultant().force - again.resultant().force).max() <= bits
+    assert abs(again.dissipation - contact.dissipation) <= bits < contact.dissipation
 
 
 def test_a_step_taken_again():
