@@ -14,7 +14,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.kinematics import Discretisation
+from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
@@ -41,6 +41,7 @@ from uem_dolfinx.parallel import agreed, reduced
 if TYPE_CHECKING:
     from uem_dolfinx.contact.mortar import Mortar
     from uem_dolfinx.contact.offsets import Offsets
+    from uem_dolfinx.contact.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.sliding import Sliding
     from uem_dolfinx.contact.state import PairState
     from uem_dolfinx.contact.target_corners import CornerInside
@@ -103,6 +104,8 @@ class Contact(ContactResults):
 
     #: Whether it is one of those that a general contact consists of.
     of_all_surfaces = False
+    #: What friction by pairs of surfaces it has, as one of those.
+    _by_pairs: ValuesOfPairs | None = None
 
     def __init__(
         self,
@@ -208,6 +211,7 @@ class Contact(ContactResults):
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
                 "the friction that it is to have, and set friction = 0 until then"
             )
+        self._by_pairs = None
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
         self._friction = value
@@ -230,6 +234,17 @@ class Contact(ContactResults):
             friction.set(law, value)
         elif reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
             self.pair.set_friction(law, value)
+
+    def friction_values(self) -> Array:
+        """Values that friction has at this rank's contactors, now or elsewhere; none without friction."""
+        return np.zeros(0) if self.pair.friction is None else self.pair.friction.value
+
+    def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
+        """Values of the law's parameter to begin with at contactors ``(n,)``; None if there is no friction (collective)."""
+        return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at)
+
+    def _friction_now(self, kinematics: Kinematics) -> Array | None:
+        """Values at contactors that have been placed ``(n,)``; None where they do not depend on that (collective)."""
 
     @property
     def offset(self) -> Field:
@@ -324,7 +339,7 @@ class Contact(ContactResults):
         bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
         law, friction = as_law(self.friction), None
-        value = values_at(law, config, nodes, self.name, self.contactor.dim > 0, at)
+        value = self._friction_at(law, nodes, at)
         wears = callable(self._wear) or self._wear > 0.0
         if value is None and wears:
             # slip is followed where there is no friction, too
@@ -348,6 +363,7 @@ class Contact(ContactResults):
                 limits=limits,
                 free=free[nodes],
                 keeps_feet=self.sliding != "finite",
+                value_now=self._friction_now if self._by_pairs is not None else None,
             )
         self._pair, self._offsets = self._interface(nodes, discretisation, means, friction, **of), None
         if self.adjust and self.tied is not True:

@@ -19,9 +19,10 @@ from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
+from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import Resultant, moments, sum_up
-from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Target
@@ -31,20 +32,35 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.pair_friction import FrictionOfPairs
     from uem_dolfinx.geometry.neighbours import Neighbours
     from uem_dolfinx.geometry.skin import Skin
 
 
-class RigidContact(Contact):
+class _Part(Contact):
+    """One of the contacts that a general contact consists of."""
+
+    of_all_surfaces = True
+
+    def friction_values(self) -> Array:
+        """Values that friction has at this rank's contactors, by whatever pair."""
+        return super().friction_values() if self._by_pairs is None else self._by_pairs.values.ravel()
+
+    def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
+        """Values to begin with at contactors ``(n,)``; None if no pair has friction (collective)."""
+        if self._by_pairs is None:
+            return super()._friction_at(law, nodes, at)
+        if not reduced(self.config.comm, bool(self._by_pairs.at(nodes).any()), op=MPI.LOR):
+            return None
+        return self._by_pairs.now(np.full(len(nodes), -1))
+
+
+class RigidContact(_Part):
     """One of the contacts that a general contact consists of: every node against a rigid surface."""
 
-    of_all_surfaces = True
 
-
-class AmongContact(Contact):
+class AmongContact(_Part):
     """One of the contacts that a general contact consists of: every node against one body near it."""
-
-    of_all_surfaces = True
 
     def __init__(self, general: GeneralContact, neighbours: Neighbours, number: int, **options: Any):
         from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
@@ -60,6 +76,14 @@ class AmongContact(Contact):
         from uem_dolfinx.geometry.neighbours import Neighbour
 
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
+
+    def _friction_now(self, kinematics: Kinematics) -> Array | None:
+        """Values by what contactors are on, or would touch ``(n,)``; None where friction is one for all (collective)."""
+        from uem_dolfinx.contact.among_bodies import NothingNear
+
+        if self._by_pairs is None or isinstance(kinematics, NothingNear):
+            return None
+        return self._by_pairs.now(kinematics.projection.facet)
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete (collective)."""
@@ -102,7 +126,9 @@ class GeneralContact:
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
-        friction: as of ``Contact``, for all.
+        friction: as of ``Contact``, for all; or by pairs, ``{(one, other): value, ..., None: value of all others}``, with names of
+            bodies, or parts of facets or of cells, or one of the rigid surfaces, and values of one law. Of several pairs that hold the
+            first counts; what no pair names has none without ``None``.
         normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
         max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
         measure: as of ``Contact``.
@@ -121,7 +147,7 @@ class GeneralContact:
         order: Sequence[Part] = (),
         self_contact: bool | Sequence[Part] = False,
         bodies: dict[str, Part] | None = None,
-        friction: Field | FrictionLaw = 0.0,
+        friction: Field | FrictionLaw | dict[Any, Field | FrictionLaw] = 0.0,
         normals: str = "facet",
         max_penetration: float | None = None,
         measure: str = "reference",
@@ -136,7 +162,7 @@ class GeneralContact:
                 self_contact = given.items("self_contact", self_contact, lambda one: one is not None, "a part of a mesh")
             named = isinstance(bodies, dict) and all(isinstance(key, str) for key in bodies)
             given.kind("bodies", bodies, bodies is None or named, "names and parts, {name: part}, or None")
-            given_friction(friction)
+            self._pairs = self._friction_of_pairs(friction)
             self.normals = given.word("normals", normals, ("facet", "averaged"))
             self.measure = given.word("measure", measure, ("reference", "current"))
             if max_penetration is not None:
@@ -148,6 +174,19 @@ class GeneralContact:
         self.taken = False
         self._parts: list[Contact] = []
         self._fields: dict[str, fem.Function] = {}
+
+    def _friction_of_pairs(self, friction: Any) -> FrictionOfPairs | None:
+        """Friction that is given by pairs; None if it is one for all."""
+        if not isinstance(friction, dict):
+            given_friction(friction)
+            return None
+        from uem_dolfinx.contact.pair_friction import FrictionOfPairs
+
+        pairs = FrictionOfPairs(friction)
+        for _, other, _ in pairs.pairs:
+            if hasattr(other, "project") and not any(other is one for one in self.rigid):
+                raise InputError(given.sentence("a rigid surface in friction", other, "one of those in rigid"))
+        return pairs
 
     def __repr__(self) -> str:
         """Its name, and how many rigid surfaces it has."""
@@ -173,7 +212,8 @@ class GeneralContact:
         self._name_bodies()
         nodes = surface_nodes(config, surface)
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
-        options: dict[str, Any] = {"friction": self.friction, "max_penetration": bound, "measure": self.measure}
+        friction = self.friction if self._pairs is None else self._pairs.law
+        options: dict[str, Any] = {"friction": friction, "max_penetration": bound, "measure": self.measure}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
             itself |= skin.bodies_of(_part(config, part, "self_contact"))
@@ -186,7 +226,7 @@ class GeneralContact:
         if len(with_facets) > 1 or itself.any():
             body = skin.body_of_node[nodes]
             own = nodes[(place[body] < with_facets.max()) | itself[body] | skin.corners[nodes]]
-            apart = [(*_where(skin, one), *_where(skin, other)) for one, other in pairs]
+            apart = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
             # as many bodies as others meet one in a corner of a grid of blocks
             n_lists = 2**config.gdim - 1
             neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
@@ -195,8 +235,26 @@ class GeneralContact:
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
             parts.append(RigidContact(surface, target, name=f"{self.name} on {name}", **options))
+        if self._pairs is not None:
+            self._give_friction(parts)
         self._parts = parts
         return parts
+
+    def _give_friction(self, parts: Sequence[Contact]) -> None:
+        """Tell the contacts what friction pairs have (collective)."""
+        from uem_dolfinx.contact.pair_friction import ValuesOfPairs
+
+        assert self._pairs is not None
+        for part in parts:
+            target = part.target if isinstance(part, RigidContact) else None
+            part._by_pairs = ValuesOfPairs(self._skin, self._pairs, self._place_of, target, part.name)
+
+    def _place_of(self, one: Any) -> tuple[Bools, Bools]:
+        """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part, or of a body by its name (collective)."""
+        if not isinstance(one, str):
+            return _where(self._skin, one, "friction")
+        body = self._names.index(given.word("the name of a body in friction", one, self._names))
+        return self._skin.body_of_node == body, self._skin.body == body
 
     def _name_bodies(self) -> None:
         self._names = [f"body {k + 1}" for k in range(self._skin.n_bodies)]
@@ -377,10 +435,10 @@ def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag
     return Tag("all surfaces", 0, facets, mesh, left.astype(np.int32))
 
 
-def _where(skin: Skin, part: Part) -> tuple[Bools, Bools]:
+def _where(skin: Skin, part: Part, role: str) -> tuple[Bools, Bools]:
     """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part (collective)."""
     config = skin.config
-    tag = _part(config, part, "exclude")
+    tag = _part(config, part, role)
     nodes = np.zeros(config.n_local, bool)
     nodes[surface_nodes(config, tag)] = True
     if tag.dim == config.tdim:

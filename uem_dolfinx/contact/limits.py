@@ -39,11 +39,15 @@ class Limits:
 
     def set(self, law: FrictionLaw, value: Array) -> Array:
         """Take a law, and the values of its parameter ``(n,)``: the slopes of the cones of contactors that do not press (collective)."""
-        self.law, self.value = law, value
-        none = np.zeros(len(value))
-        self.area = self._areas = self._areas_of() if law.per_area else none
-        self.speed = none
-        return law.limit(value, none, self.area)[1]
+        self.law = law
+        self.area = self._areas = self._areas_of() if law.per_area else np.zeros(len(value))
+        self.speed = np.zeros(len(value))
+        return self.change(value)
+
+    def change(self, value: Array) -> Array:
+        """Take other values of the parameter ``(n,)``; returns as ``set`` does."""
+        self.value = value
+        return self.law.limit(value, np.zeros(len(value)), self.area)[1]
 
     def grow(self, kinematics: Kinematics) -> None:
         """Take the areas where contactors are now (collective)."""

@@ -45,6 +45,7 @@ class Sliding:
         limits: how much of it contactors bear.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
         keeps_feet: whether feet stay where they were at the start of the step.
+        value_now: tells the parameter's values ``(n,)`` where contactors have been placed, None for those of before (collective).
 
     Attributes:
         frame: directions along the target and relative motions, of the last placement.
@@ -66,11 +67,12 @@ class Sliding:
         limits: Limits,
         free: Bools,
         keeps_feet: bool,
+        value_now: Callable[[Kinematics], Array | None] | None = None,
     ):
         self.config, self.nodes, self.discretisation = config, nodes, discretisation
         self.free, self.keeps_feet = free, keeps_feet
         n, g = len(nodes), config.gdim
-        self.limits = limits
+        self.limits, self._value_now = limits, value_now
         self.wear: Wear | None = None
         self.set(law, value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
@@ -99,6 +101,8 @@ class Sliding:
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
         self.limits.grow(kinematics)
+        if self._value_now is not None and (value := self._value_now(kinematics)) is not None:
+            self.discretisation.with_friction(self.limits.change(value))
         self.replace(kinematics)
 
     def replace(self, kinematics: Kinematics) -> None:

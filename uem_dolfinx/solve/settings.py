@@ -85,7 +85,7 @@ class Settings:
             if follows_load(as_law(contact.friction)):
                 words[f"{name}, friction"] = "follows the load"
             else:
-                values[f"{name}, friction"] = _extent([] if contact.pair.friction is None else contact.pair.friction.value)
+                values[f"{name}, friction"] = _extent(contact.friction_values())
             if contact.pair.friction is not None and contact.pair.friction.wear is not None:
                 values[f"{name}, wear"] = _extent(contact.pair.friction.wear.k)
         if (d := self._dynamics) is not None:
