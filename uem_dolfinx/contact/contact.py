@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices
-from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slim_tips, warn_of_slipped, warn_of_straight_facets
+from uem_dolfinx.contact.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.law import (
@@ -26,7 +26,7 @@ from uem_dolfinx.contact.laws.law import (
     parameters,
     values_at,
 )
-from uem_dolfinx.contact.results import ContactResults
+from uem_dolfinx.contact.watched import WatchedContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -35,7 +35,6 @@ from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
-from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
@@ -43,8 +42,6 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.sliding import Sliding
-    from uem_dolfinx.contact.state import PairState
-    from uem_dolfinx.contact.target_corners import CornerInside
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
@@ -59,7 +56,7 @@ REACH = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
-class Contact(ContactResults):
+class Contact(WatchedContact):
     """A contactor surface that may touch a target.
 
     Args:
@@ -317,54 +314,10 @@ class Contact(ContactResults):
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
         thickness = np.inf if self.thickness is None else self.thickness
-        how: dict[str, Any] = {"free": free, "sliding": self.sliding, "thickness": thickness}
-        discretisation: Discretisation
-        # points have no facets to integrate over
-        means: Mortar | None = None
-        if self.coupling == "mortar" and self.contactor.dim > 0:
-            from uem_dolfinx.contact.mortar import Mortar
-
-            surface = TargetFacets(config, self.contactor, "contactor")
-            warn_of_slim_tips(config, self.name, surface)
-            discretisation = Mortar(config, nodes, target, surface=surface, **how)
-            if self.tied and target.n_nodes:
-                means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"}))
-        else:
-            from uem_dolfinx.contact.bernstein import Bernstein
-            from uem_dolfinx.contact.node_to_surface import NodeToSurface
-
-            kind = Bernstein if config.degree == 2 else NodeToSurface
-            own = self.coupling if callable(self.coupling) else kind
-            discretisation = own(config, nodes, target, chords=self.chords and config.degree == 2, **how)
-        bound = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
-        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "max_penetration": bound, "thickness": thickness}
-        law, friction = as_law(self.friction), None
-        value = self._friction_at(law, nodes, at)
-        wears = callable(self._wear) or self._wear > 0.0
-        if value is None and wears:
-            # slip is followed where there is no friction, too
-            value = np.zeros(len(nodes))
-        if value is not None:
-            from uem_dolfinx.contact.limits import Limits
-            from uem_dolfinx.contact.sliding import Sliding
-
-            if of_rate(law) and duration is None:
-                raise InputError(
-                    f"contact '{self.name}': {type(law).__name__} needs the speed of slip, and statics has none: give the problem dynamics "
-                    "and take time steps, or take a law without speed"
-                )
-            limits = Limits(lambda: self.surface.reference[nodes], duration)
-            friction = Sliding(
-                config,
-                nodes,
-                discretisation,
-                law=law,
-                value=value,
-                limits=limits,
-                free=free[nodes],
-                keeps_feet=self.sliding != "finite",
-                value_now=self._friction_now if self._by_pairs is not None else None,
-            )
+        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "thickness": thickness}
+        of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
+        discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
+        friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         self._pair, self._offsets = self._interface(nodes, discretisation, means, friction, **of), None
         if self.adjust and self.tied is not True:
             from uem_dolfinx.contact.offsets import Offsets
@@ -372,7 +325,7 @@ class Contact(ContactResults):
             self._offsets = Offsets(self._pair, self.name)
             self._offsets.adjust(self.adjust)
         self._set_offset()
-        if wears:
+        if self._wears:
             from uem_dolfinx.contact.offsets import Offsets
             from uem_dolfinx.contact.wear import Wear
 
@@ -382,6 +335,51 @@ class Contact(ContactResults):
             friction.wear = Wear(config, nodes, self._wear, **of)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
+
+    def _discretised(self, nodes: Indices, target: Target, **how: Any) -> tuple[Discretisation, Mortar | None]:
+        """What unites contactors with the target, and the means that a tie takes, as of ``Tied`` (collective)."""
+        config = self.config
+        # points have no facets to integrate over
+        if self.coupling == "mortar" and self.contactor.dim > 0:
+            from uem_dolfinx.contact.mortar import Mortar
+
+            surface = TargetFacets(config, self.contactor, "contactor")
+            warn_of_slim_tips(config, self.name, surface)
+            tied = self.tied and target.n_nodes
+            means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
+            return Mortar(config, nodes, target, surface=surface, **how), means
+        from uem_dolfinx.contact.bernstein import Bernstein
+        from uem_dolfinx.contact.node_to_surface import NodeToSurface
+
+        kind = Bernstein if config.degree == 2 else NodeToSurface
+        own = self.coupling if callable(self.coupling) else kind
+        return own(config, nodes, target, chords=self.chords and config.degree == 2, **how), None
+
+    @property
+    def _wears(self) -> bool:
+        return callable(self._wear) or self._wear > 0.0
+
+    def _sliding_of(
+        self, nodes: Indices, discretisation: Discretisation, free: Bools, duration: Callable[[], float] | None
+    ) -> Sliding | None:
+        """What friction adds, or None without; slip that wears is followed without friction, too (collective)."""
+        law = as_law(self.friction)
+        value = self._friction_at(law, nodes, self._at)
+        if value is None and not self._wears:
+            return None
+        from uem_dolfinx.contact.limits import Limits
+        from uem_dolfinx.contact.sliding import Sliding
+
+        if of_rate(law) and duration is None:
+            raise InputError(
+                f"contact '{self.name}': {type(law).__name__} needs the speed of slip, and statics has none: give the problem dynamics "
+                "and take time steps, or take a law without speed"
+            )
+        return Sliding(
+            self.config, nodes, discretisation, law=law, value=np.zeros(len(nodes)) if value is None else value,
+            limits=Limits(lambda: self.surface.reference[nodes], duration), free=free, keeps_feet=self.sliding != "finite",
+            value_now=None if self._by_pairs is None else self._friction_now,
+        )  # fmt: skip
 
     def _interface(
         self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any
@@ -425,43 +423,3 @@ class Contact(ContactResults):
         surface = TargetFacets(config, self.target)
         check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
         return nodes, MeshTarget(surface, averaged=self.normals == "averaged")
-
-    def begin(self) -> None:
-        """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
-        self.taken, self._slipped = True, False
-        self._entered: CornerInside | None = None
-        self._off_at_start = self.pair.off.copy()
-        nodes_on_facets = self.pair.discretisation.at_feet and self.contactor.dim > 0
-        from uem_dolfinx.contact.target_corners import TargetCorners
-
-        self._corners = TargetCorners(self.pair, self.contactor) if nodes_on_facets else None
-        if not self.adjust:
-            warn_of_sagging_facets(self.pair)
-
-    def look_at_ends(self) -> None:
-        """Warn, once, if contactors have slid off the target's end since the start (collective)."""
-        gone = self.pair.off & ~self._off_at_start & ~self.pair.tied
-        if not self._slipped and self.pair.target.n_nodes and reduced(self.config.comm, gone.any(), op=MPI.LOR):
-            self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
-
-    def look_at_wear(self, before: PairState, stiffness: Array | None) -> None:
-        """Warn, once, if the step from the state ``before`` has worn too much; ``stiffness`` as of ``corner_inside`` (collective)."""
-        wear = None if self.pair.friction is None else self.pair.friction.wear
-        if wear is not None and stiffness is not None:
-            wear.look_at_step(before, self.pair.committed, self.pair.kinematics.normal, stiffness)
-
-    def corner_inside(self, stiffness: Array | None) -> CornerInside | None:
-        """A convex corner of the target inside the contactor by which the contact lacks force, or lacked it before (collective).
-
-        Args:
-            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None where it is not known yet.
-        """
-        found = None if self._corners is None or stiffness is None else self._corners.find(stiffness)
-        return found or self._entered
-
-    def look_at_corners(self, stiffness: Array | None) -> None:
-        """Warn, once, if a convex corner of the target is inside the contactor; argument as of ``corner_inside`` (collective)."""
-        if self._entered is None:
-            self._entered = self.corner_inside(stiffness)
-            if self._entered is not None:
-                logger.warning("%s: %s", self.name, self._entered)
