@@ -34,7 +34,7 @@ def steel(b, **parameters):
         ({"E": "steel"}, uem.InputTypeError, ("E = 'steel'", "a positive number")),
         ({"u": None}, uem.InputTypeError, ("u = None", "a Function")),
         ({"strain": "large"}, uem.InputError, ("strain = 'large'", "'small' or 'green_lagrange'")),
-        ({"kind": "3d"}, uem.InputError, ("kind = '3d'", "2 components", "'plane_strain' or 'plane_stress'")),
+        ({"kind": "3d"}, uem.InputError, ("kind = '3d'", "2 components", "'plane_strain', 'plane_stress' or 'axisymmetric'")),
         ({"quadrature_degree": 2.5}, uem.InputError, ("quadrature_degree = 2.5", "a whole number")),
     ],
 )
