@@ -48,6 +48,18 @@ def test_patch(coupling, n, cell, degree):
         lawful(contact, force=p)
 
 
+@pytest.mark.parametrize(("coupling", "n"), [("node_to_surface", (4, 4)), ("mortar", (5, 3))])
+def test_tied_cylinders_are_pulled(coupling, n):
+    """A uniaxial tension goes through the tie."""
+    p = -3.0
+    s, contact, problem = pressed(uem.LinearElastic(E, NU, kind="axisymmetric"), p, n, coupling=coupling, tied=True)
+    problem.solve()
+    exact = np.stack([NU * p / E * s.X[:, 0], -p / E * (s.X[:, 1] + 1)], axis=1)
+    assert highest(COMM, np.abs(s.U - exact)) < 1e-11 * abs(p) / E
+    assert highest(COMM, np.abs(contact.pressures / p - 1)) < 1e-11
+    assert contact.resultant().force == pytest.approx([0.0, p * np.pi * R**2], rel=1e-11)
+
+
 @pytest.mark.parametrize("coupling", [slow("node_to_surface"), "mortar"])
 def test_true_pressures(coupling):
     """In large strains a dead load is a pressure per drawn area, and the true one that of the circle as it is now."""

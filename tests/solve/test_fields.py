@@ -68,19 +68,21 @@ def test_rows_of_the_displacement_and_of_other_fields(cell, displacement):
 
 
 @pytest.mark.parametrize(
-    ("coupling", "mu", "degree"),
+    ("coupling", "more", "degree"),
     [
-        ("node_to_surface", 0.0, 1), ("node_to_surface", 0.3, 2), ("mortar", 0.0, 2), ("mortar", 0.3, 1),
-        slow("node_to_surface", 0.0, 2), slow("node_to_surface", 0.3, 1), slow("mortar", 0.0, 1), slow("mortar", 0.3, 2),
+        ("node_to_surface", {}, 1), ("node_to_surface", {"friction": 0.3}, 2), ("mortar", {}, 2), ("mortar", {"friction": 0.3}, 1),
+        slow("node_to_surface", {}, 2), slow("node_to_surface", {"friction": 0.3}, 1), slow("mortar", {}, 1),
+        slow("mortar", {"friction": 0.3}, 2), ("node_to_surface", {"tied": True}, 1), ("mortar", {"tied": True}, 1),
+        ("node_to_surface", {"offset": 0.01, "wear": 1.0, "friction": 0.3}, 1),
     ],
 )  # fmt: skip
-def test_a_field_that_is_not_coupled_changes_nothing(coupling, mu, degree):
+def test_a_field_that_is_not_coupled_changes_nothing(coupling, more, degree):
     """Displacement, forces and iterations are those of the displacement alone, the other field of other units before or behind it."""
     b = blocks(COMM, "triangle", 3, 4, overhang=0.5, degree=degree)
     E = modulus(b.scene, 1.0, 3.0)
 
     def contact():
-        return uem.Contact(b.high, b.low, coupling=coupling, friction=mu, sliding="finite" if degree == 2 else "small")
+        return uem.Contact(b.high, b.low, coupling=coupling, sliding="finite" if degree == 2 else "small", **more)
 
     def pressed(V):
         return [

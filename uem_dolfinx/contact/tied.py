@@ -106,7 +106,7 @@ class Tied(Interface):
         state, f = self.committed, self.committed.friction
         drag = 0.0 if f is None else f.tau
         forces = state.lam[:, None] * self.projection.normal + drag if self._means else state.force
-        self.at.x.array[:] = self.config.u.x.array
+        self.at.x.array[:] = self.config.displacement.ravel()
         self._make(self._within_reach() if which is None else which)
         assert self.rows is not None
         error = None
@@ -134,7 +134,7 @@ class Tied(Interface):
         if not self.target.n_nodes:
             self._take_rows(to_surface(config, nodes, self.target, which))
             return
-        with config.at(self.at.x.array):
+        with config.at(config.values_of(config.functions() | {"displacement": self.at})):
             if self._means is not None:
                 self._means.let_go()
                 found = self._means.place(self.points, PairState.initial(len(nodes), config.gdim))
