@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
+import pytest
 import ufl
 from dolfinx import fem
-from helpers import Scene, box, highest, scene
+from helpers import Scene, at, box, clamp, highest, run, scene
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -27,6 +29,33 @@ def block(comm: MPI.Comm, cell: str, n: int = 2, degree: int = 1, **how: Any) ->
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     s = scene(comm, cell, [box(cell, [0.0] * g, [1.0] * g, [n] * g)], **how)
     return s, fem.Function(compat.function_space(s.mesh, degree, (g,)), name="u")
+
+
+def tube(
+    comm: MPI.Comm, cell: str, n: int, degree: int, opening: float, law: Callable[..., uem.VonMises], steps: int
+) -> tuple[float, list[uem.LoadStep]]:
+    """Inner pressure, per area as drawn, of a perfectly plastic tube in plane strain, b = 2 a, after a has grown by ``opening``."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+
+    def bent(X: np.ndarray) -> np.ndarray:
+        angle = np.pi / 2 * X[:, 1]
+        return np.column_stack([(1 + X[:, 0]) * np.cos(angle), (1 + X[:, 0]) * np.sin(angle), X[:, 2:]])
+
+    s = scene(comm, cell, [box(cell, [0.0] * g, [1.0, 1.0, 0.25][:g], [n, 2 * n, 1][:g])], pose=bent)
+    V = compat.function_space(s.mesh, degree, (g,))
+    u, opened = fem.Function(V), fem.Function(V)
+    X = V.tabulate_dof_coordinates()[:, :2]
+    opened.x.array.reshape(-1, g)[:, :2] = opening * X / np.linalg.norm(X, axis=1, keepdims=True)
+    bcs = clamp(V, s.tag("x", 0, at(1, 0.0)), 1) + clamp(V, s.tag("y", 0, at(1, 1.0)), 0)
+    for z in (0.0, 0.25) if g == 3 else ():
+        bcs += clamp(V, s.tag("end", 0, at(2, z)), 2)
+    bcs.append(fem.dirichletbc(opened, fem.locate_dofs_topological(V, g - 1, s.tag("inner", 0, at(0, 0.0)).entities)))
+    material = law(u, 1000.0, NU, 1.0, kind="3d" if g == 3 else "plane_strain")
+    problem = uem.UnitedProblem(
+        material.residual(ufl.TestFunction(V)), u, bcs=bcs, materials=[material], petsc_options_prefix="t_"
+    )
+    taken = run(problem, steps)
+    return reaction(problem) / (opening * np.pi / 2 * (0.25 if g == 3 else 1.0)), taken
 
 
 def reaction(problem: uem.UnitedProblem) -> float:
@@ -75,3 +104,26 @@ def spread(material: uem.VonMises, name: str) -> tuple[np.ndarray, float]:
     values = material._points.read(f)
     mean = np.mean(f.function_space.mesh.comm.allgather(values.mean(axis=0)), axis=0)
     return mean, highest(material.comm, np.abs(values - mean))
+
+
+def tangent_in_flow(material: uem.VonMises, u: fem.Function) -> None:
+    """Assert that the tangent is symmetric, and the derivative of the forces, in a state of flow."""
+    V, comm = u.function_space, material.comm
+    flowing = material._trial.peeq > material._points.read(material.peeq)[:, 0]
+    assert comm.allreduce(int(flowing.sum())) > 0
+    v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+    K = matrix(ufl.derivative(material.residual(v), u, du) + material.stiffness(du, v))
+    x, y = K.createVecRight(), K.createVecRight()
+    X = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local, : len(u)]
+    x.array[:], y.array[:] = np.cos(3 * X + 1).ravel(), np.sin(2 * X + 0.3 * X[:, ::-1]).ravel()
+    assert y.dot(K * x) == pytest.approx(x.dot(K * y), rel=1e-11)
+    direction, here, h = fem.Function(V), np.array(u.x.array), 1e-7
+    direction.x.array[: len(x.array)] = x.array
+    direction.x.scatter_forward()
+    sides = []
+    for sign in (1, -1):
+        u.x.array[:] = here + sign * h * direction.x.array
+        material.update()
+        sides.append(vector(material.residual(v), V))
+    slope, product = (sides[0] - sides[1]) / (2 * h), (K * x).array_r
+    assert highest(comm, np.abs(slope - product)) < 2e-6 * highest(comm, np.abs(product))
