@@ -266,12 +266,16 @@ class Contact(WatchedContact):
 
     def _set_offset(self) -> None:
         """Hand the present offset to the pair, if there has been any (collective)."""
-        if self._offsets is None and (callable(self._offset) or self._offset != 0.0):
+        if self._offsets is not None or callable(self._offset) or self._offset != 0.0:
+            self._offsets_of_pair().set(self._offset)
+
+    def _offsets_of_pair(self) -> Offsets:
+        """What lowers the pair's gaps, made when first asked for."""
+        if self._offsets is None:
             from uem_dolfinx.contact.offsets import Offsets
 
             self._offsets = Offsets(self.pair, self.name)
-        if self._offsets is not None:
-            self._offsets.set(self._offset)
+        return self._offsets
 
     @property
     def adjusted(self) -> float:
@@ -320,19 +324,21 @@ class Contact(WatchedContact):
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         self._pair, self._offsets = self._interface(nodes, discretisation, means, friction, **of), None
         if self.adjust and self.tied is not True:
-            from uem_dolfinx.contact.offsets import Offsets
-
-            self._offsets = Offsets(self._pair, self.name)
-            self._offsets.adjust(self.adjust)
+            self._offsets_of_pair().adjust(self.adjust)
         self._set_offset()
         if self._wears:
-            from uem_dolfinx.contact.offsets import Offsets
             from uem_dolfinx.contact.wear import Wear
 
-            self._offsets = self._offsets or Offsets(self._pair, self.name)
-            of = {"tag": self.contactor, "areas": self.surface, "lower": self._offsets.wear, "name": self.name}
             assert friction is not None
-            friction.wear = Wear(config, nodes, self._wear, **of)
+            friction.wear = Wear(
+                config,
+                nodes,
+                self._wear,
+                tag=self.contactor,
+                areas=self.surface,
+                lower=self._offsets_of_pair().wear,
+                name=self.name,
+            )
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 
