@@ -79,7 +79,6 @@ def read_gmsh(
         MissingFileError: there is no such file.
         MeshError: Gmsh refuses the file, a parameter is unknown, or the model has no cells this package can use.
     """
-    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
 
     def read() -> RawMesh:
         known = parameters is None or isinstance(parameters, Mapping)
@@ -93,6 +92,7 @@ def read_gmsh(
 
 def distributed(comm: MPI.Comm, read: Callable[[], RawMesh], label: Any) -> tuple[Any, Tags]:
     """The mesh that rank 0 reads, on all ranks, and its groups as tags; ``label`` is for the log (collective)."""
+    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
     with timed("read mesh"):
         raw = None
         with agreed(comm):

@@ -19,13 +19,13 @@ from uem_dolfinx.geometry.gmsh import Group, RawMesh, distributed, points_of, re
 from uem_dolfinx.geometry.tags import Tags
 
 #: Cells of meshio: name of the cell and degree of its geometry.
-CELLS = {
+MESHIO_CELLS = {
     "triangle": ("triangle", 1), "quad": ("quadrilateral", 1), "tetra": ("tetrahedron", 1), "hexahedron": ("hexahedron", 1),
     "triangle6": ("triangle", 2), "quad9": ("quadrilateral", 2), "tetra10": ("tetrahedron", 2), "hexahedron27": ("hexahedron", 2),
 }  # fmt: skip
 
 #: Vertices of what surfaces consist of.
-N_VERTICES = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
+MESHIO_VERTICES = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
 
 
 def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None) -> tuple[Any, Tags]:
@@ -50,7 +50,6 @@ def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None) -> tupl
         MissingFileError: there is no such file.
         MeshError: meshio cannot read the file, or it has no cells that this package can use.
     """
-    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
     given.kind("path", path, isinstance(path, (str, Path)), "the path of a mesh file")
     file = Path(path).expanduser().absolute()
     if file.suffix in (".geo", ".msh"):
@@ -79,14 +78,14 @@ def _read(path: Path, gdim: int | None) -> RawMesh:
         raise MeshError(f"meshio cannot read {path}: {told}") from error
     dim = max((block.dim for block in found.cells), default=0)
     kinds = sorted({block.type for block in found.cells if block.dim == dim})
-    if len(kinds) != 1 or kinds[0] not in CELLS:
+    if len(kinds) != 1 or kinds[0] not in MESHIO_CELLS:
         raise MeshError(
             f"the cells of {path} are {', '.join(kinds) or 'none'}: they must all be one kind of triangle, quadrilateral, tetrahedron or "
             "hexahedron, of order 1 or 2, with nodes in the middle of facets and cells, too (quad9, hexahedron27)"
         )
     if gdim not in (None, dim):
         raise MeshError(f"{path} has cells of dimension {dim}, not {gdim}: read it with gdim={dim}")
-    cell, degree = CELLS[kinds[0]]
+    cell, degree = MESHIO_CELLS[kinds[0]]
     data = np.concatenate([block.data for block in found.cells if block.dim == dim])
     nodes, cells = np.unique(data, return_inverse=True)
     points = np.zeros((len(nodes), 3))
@@ -122,7 +121,7 @@ def _sets_of_cells(found: Any, dim: int, place: Ints) -> Iterator[tuple[str, int
                 rows.setdefault(dim, []).append(start + which)
             else:
                 # vertices come first
-                vertices = np.sort(place[block.data[which, : N_VERTICES[block.type.rstrip("0123456789")]]], axis=1)
+                vertices = np.sort(place[block.data[which, : MESHIO_VERTICES[block.type.rstrip("0123456789")]]], axis=1)
                 rows.setdefault(block.dim, []).append(vertices[(vertices >= 0).all(axis=1)])
         for of_dim, parts in rows.items():
             yield name, of_dim, np.concatenate(parts)
