@@ -12,7 +12,6 @@ the matrix has them, in one piece between lines that have more.
 
 from __future__ import annotations
 
-import zlib
 from typing import Any
 
 import numpy as np
@@ -41,11 +40,9 @@ def made_of(P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, r
         G: the curvature.
         roughly: whether coefficients of P and Q, and values of G, do not count.
     """
-    values = not roughly
-    if values and (G is not None or Q is not P):
+    if not roughly and (G is not None or Q is not P):
         return None
-    exact = 0 if G is not None else P.fingerprint(values=values)
-    parts = (K.stateGet(), exact, Q is P, P.fingerprint(values=False), zlib.crc32(P.equations.active.tobytes()))
+    parts = (K.stateGet(), G is None, Q is P, P.fingerprint(values=not roughly))
     return K, *gathered(P.space.comm, np.array(parts, dtype=np.int64)).ravel().tolist()
 
 

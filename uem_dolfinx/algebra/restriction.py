@@ -344,13 +344,12 @@ class Restriction:
         return self.space.vector(total)
 
     def fingerprint(self, *, values: bool) -> int:
-        """Hash of this rank's part of P: of its sparsity, or of its values too, but for rounding."""
+        """Hash of this rank's part of P: of its sparsity and of which equations hold, or of its values too, but for rounding."""
         eq = self.equations
-        parts = [eq.node.tobytes(), eq.row.tobytes(), eq.followed.tobytes(), str(self.chain).encode()]
+        parts = [*(v.tobytes() for v in (eq.node, eq.row, eq.followed, eq.active)), str(self.chain).encode()]
         if values:
             # feet that have moved by rounding make no new P
-            rounded = (np.rint(v / NEGLIGIBLE).astype(np.int64) for v in (eq.direction, eq.coefficients))
-            parts += [*(v.tobytes() for v in rounded), eq.active.tobytes()]
+            parts += [np.rint(v / NEGLIGIBLE).astype(np.int64).tobytes() for v in (eq.direction, eq.coefficients)]
         return zlib.crc32(b"".join(parts))
 
 
