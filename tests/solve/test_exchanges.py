@@ -104,6 +104,7 @@ def test_who_goes_in_a_circle_is_named():
         assert "upper on lower at (1, 0.5), upper on lower at (2, 0.5), upper on lower at (4, 0.5), and 1 more" in str(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [0, exchanges_of_a_step.MOST_OF_EACH])
 def test_the_first_alone_finds_any_active_set(most, monkeypatch):
     """Exchanged one by one in their order, however many these are, contactors end where all at once do; a bound is told of."""
@@ -333,6 +334,23 @@ def test_a_stiff_block_is_dragged_over_a_soft_one_and_back(cell, n, ratio, mu, c
     force = d.contact.resultant().force
     assert abs(force[0]) <= mu * abs(force[-1]) * (1 + 1e-6)
     assert sum(d.states) > 0 and force[0] * force[-1] != 0
+
+
+def test_a_body_that_friction_does_not_hold_is_told_of_soon():
+    """Pushed a little harder than friction bears, a block leads to the same states again: the error takes 200 linear solves at most."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [2.0, 0.5], [8, 2])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, force = fem.Function(V), fem.Constant(s.mesh, np.zeros(2))
+    contact = uem.Contact(s.tag("low", 0, at(1, 0.0)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)), friction=0.3)
+    problem = uem.UnitedProblem(
+        linear(u, 200.0) - ufl.dot(force, ufl.TestFunction(V)) * ufl.dx, u, contacts=[contact], rtol=1e-12
+    )
+    for part in (0.0, 0.5, 0.9, 1 - 1e-6, 1e-6 - 1):
+        force.value[:] = 0.3 * part, -1.0
+        problem.solve()
+    force.value[0] = 0.3 * (1 + 1e-6)
+    error = raised(uem.FrictionError, "", problem.solve)
+    assert len(error.history) + sum(i.exchanges for i in error.history) <= 200
 
 
 def test_signals_are_heeded_between_exchanges():

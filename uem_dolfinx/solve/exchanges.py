@@ -283,9 +283,11 @@ class Exchanges:
             self.convex, self._from = True, max(norm, self._from)
             return False
         self._visits, self._rounds = [], self._rounds + 1
-        if self._rounds == MOST_ROUNDS:
+        calmed = reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        # no rule found the active set of the last linearised problem, and it has led back to the same state
+        if self._rounds == MOST_ROUNDS or (self.frozen and not calmed):
             raise self._circle(changed)
-        return reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        return calmed
 
     def _state(self) -> tuple[int, ...]:
         """What tells the present states of all contactors from others."""
