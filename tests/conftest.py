@@ -14,6 +14,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,25 @@ _MEETING = MPI.COMM_WORLD.Dup()
 def pytest_xdist_auto_num_workers() -> int:
     """Tests run side by side on all cores, under mpirun on its ranks alone."""
     return 0 if MPI.COMM_WORLD.size > 1 else len(os.sched_getaffinity(0))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The number of cases of a parametrised test that are quick."""
+    parser.addoption("--cases", type=int, default=3, help="so many cases of each parametrised test are not marked slow (3)")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark as slow all but a few cases of each parametrised test, evenly spread over its list, the first and the last among them."""
+    quick, cases = config.getoption("--cases"), defaultdict[str, list[pytest.Item]](list)
+    for item in items:
+        if item.get_closest_marker("slow") is None:
+            cases[item.nodeid.partition("[")[0]].append(item)
+    for several in cases.values():
+        kept = {round(k) for k in np.linspace(0, len(several) - 1, min(quick, len(several)))}
+        for k, item in enumerate(several):
+            if k not in kept:
+                item.add_marker("slow")
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -118,6 +118,7 @@ def test_a_concave_edge_that_ends_with_its_target(degree, friction):
     assert len(held) == steps and held[0] > held[-1] > 0
 
 
+@pytest.mark.slow
 def test_blocks_of_equal_width_pushed_aside():
     """Contactors past the end, between two facets whose ends bulge, are held where they stand: the moment is zero to rounding."""
     b = blocks(COMM, "hexahedron", 4, 5, degree=2)

@@ -75,6 +75,7 @@ def half_of_top(side):
     return lambda x: (np.abs(x[:, 1]) < 1e-9) & (side * x[:, 0] > -1e-9)
 
 
+@pytest.mark.slow
 def test_over_a_joint(folder):
     """Every node has the friction of what it is on, while both parts carry the block as well; a run gone on with is the same."""
     found, u = dragged()

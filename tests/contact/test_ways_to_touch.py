@@ -104,6 +104,7 @@ def meet(
 # -- poses, units, numbering -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height", "law"),
     [

@@ -135,6 +135,7 @@ def test_same_answer_as_by_load():
     np.testing.assert_allclose(one.u.x.array, other.u.x.array, rtol=0, atol=1e-8 * np.abs(other.u.x.array).max())
 
 
+@pytest.mark.slow
 def test_loads_that_are_not_proportional():
     """The derivative with respect to the factor is by differences, and the path that of the proportional load."""
 
@@ -160,6 +161,7 @@ def test_loads_that_are_not_proportional():
     assert path[-1, 1] == 2 * shallow(LIMIT)
 
 
+@pytest.mark.slow
 def test_resumed_on_the_way(tmp_path_factory):
     """A run that is ended past the limit point goes on from its checkpoint to the same last state, bit for bit."""
     folder = COMM.bcast(tmp_path_factory.mktemp("arc") if COMM.rank == 0 else None)

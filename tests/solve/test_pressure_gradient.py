@@ -34,6 +34,7 @@ def test_pressures_of_second_order(cell, degree, coupling, rigid, law, measure):
     assert min(orders(s, s.of_pressures).values()) >= 1.95
 
 
+@pytest.mark.slow
 @BOTH
 def test_pressures_past_the_ends_of_the_target(coupling):
     """Likewise on contactor facets that the target covers in part, or not at all."""
