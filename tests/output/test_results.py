@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
@@ -79,6 +80,56 @@ def test_columns_name_the_contacts_where_there_are_several(folder: Path) -> None
     with uem.HistoryWriter(folder / "history.csv", problem) as history:
         history.write(0.0)
     assert {"active_left_pad", "force_y_wall_1", "moment_z_wall_2"} <= set(rows(folder / "history.csv")[0])
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_columns_that_are_asked_for(folder: Path, cell: str) -> None:
+    """Reactions of supports and quantities of the user's own; the support bears what the contact carries."""
+    problem = pressed(cell)
+    axes, u = "xyz"[: problem.config.gdim], problem.u
+    lowest = helpers.highest(comm, -problem.config.X[:, -1]) * -1.0
+    foot = mesh.locate_entities_boundary(problem.config.mesh, len(axes) - 1, lambda x: np.isclose(x[len(axes) - 1], lowest))
+    asked = {
+        "energy": lambda: 0.5 * len(axes),
+        "mean": lambda: [uem.integrate(u[k] * ufl.dx) for k in range(len(axes))],
+        "pair": lambda: [1.0, 2.0, 3.0, 4.0],
+    }
+    with uem.ResultsWriter(folder / "blocks", problem, reaction={"foot": foot}, columns=asked) as writer:
+        for step in uem.load_steps(problem, 2):
+            writer.write(step)
+    first, last = rows(folder / "blocks.csv")
+    up = axes[-1]
+    assert float(last[f"reaction_foot_{up}"]) == pytest.approx(float(last[f"force_{up}"]), rel=1e-7)
+    assert float(first[f"mean_{up}"]) == pytest.approx(0.5 * float(last[f"mean_{up}"]), rel=1e-7) != 0
+    assert float(last["energy"]) == 0.5 * len(axes) and [float(last[f"pair_{k}"]) for k in range(4)] == [1.0, 2.0, 3.0, 4.0]
+    with uem.HistoryWriter(folder / "one.csv", problem, reaction=foot) as history:
+        history.write(1.0)
+    assert float(rows(folder / "one.csv")[0][f"reaction_{up}"]) == pytest.approx(float(last[f"force_{up}"]), rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "words"),
+    [
+        ({"columns": {"a": 1.0}}, uem.InputTypeError, "a function without arguments"),
+        ({"columns": {"a": lambda: "one"}}, uem.InputTypeError, r"columns\['a'\] = 'one'"),
+        ({"columns": {"a": lambda: np.nan}}, uem.InputError, "finite"),
+        ({"columns": {"a": lambda: 1 / 0}}, uem.UserFunctionError, "ZeroDivisionError"),
+        ({"columns": [1]}, uem.InputTypeError, "by the names of their columns"),
+        ({"columns": {"a b": lambda: 1.0}}, uem.InputError, "without blanks"),
+        ({"columns": {"reaction_y": lambda: 1.0}, "reaction": {"y": 1}}, uem.InputError, "choose another"),
+        ({"reaction": "foot"}, uem.UEMError, "support"),
+    ],
+)
+def test_columns_that_cannot_be_had(folder: Path, how: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        uem.HistoryWriter(folder / "history.csv", pressed("triangle"), **how)
+    assert not (folder / "history.csv").exists()
+
+
+@pytest.mark.skipif(comm.size == 1, reason="one rank is alike")
+def test_columns_are_the_same_on_all_ranks(folder: Path) -> None:
+    with pytest.raises(uem.InputError, match="on rank 0, but"):
+        uem.HistoryWriter(folder / "history.csv", pressed("triangle"), columns={"own": lambda: float(comm.rank)})
 
 
 @pytest.mark.parametrize("degree", [1, 2])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_expression
 from uem_dolfinx.log import logger, timed
+from uem_dolfinx.output.columns import Columns
 from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_step import LoadStep
@@ -32,30 +34,46 @@ class HistoryWriter(Closing):
 
     Columns: ``factor`` or ``time``, ``step`` (how many steps the problem has done), ``newton_iterations``, and for every contact
     ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each followed
-    by the contact's name where there are several.
+    by the contact's name where there are several; then what is asked for, in this order::
+
+        uem.HistoryWriter("out/run.csv", problem, reaction=tags["foot"], columns={"heat": lambda: uem.integrate(q * ufl.dx)})
 
     Args:
         path: name of the file; its folder is made.
         problem: what the rows are read from.
+        reaction: part of the mesh whose reaction is written, ``reaction_x`` ..., as ``UnitedProblem.reaction`` takes it; or several
+            by name, ``reaction_NAME_x`` ...
+        columns: functions without arguments by the name of their column, called on all ranks once here and after every step; they
+            return a number, or a vector, whose columns are ``NAME_x`` ... if it has as many components as the displacement, else
+            ``NAME_0`` ...
         resume: keep what a file that is there says about the steps up to now, and go on after them; False keeps it in a folder
             beside, ``NAME.1`` or the next number, and begins anew.
 
     Raises:
         OutputError, CheckpointError, ValueError: see ``CsvTable``.
+        InputError, InputTypeError, UserFunctionError: if what is asked for cannot be had.
     """
 
-    def __init__(self, path: str | Path, problem: UnitedProblem, *, resume: bool = False):
+    def __init__(
+        self,
+        path: str | Path,
+        problem: UnitedProblem,
+        *,
+        reaction: Any = None,
+        columns: Mapping[str, Callable[[], Any]] | None = None,
+        resume: bool = False,
+    ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
-        columns = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
+        names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
         for suffix in contact_suffixes(problem.declared):
-            columns += [f"active{suffix}", f"max_gap{suffix}"]
-            columns += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
-        self._progress = problem.progress
-        self.table = CsvTable(path, problem.comm, columns, problem.progress if resume else None, key="step")
+            names += [f"active{suffix}", f"max_gap{suffix}"]
+            names += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
+        self._progress, self._asked = problem.progress, Columns(problem, reaction, columns)
+        self.table = CsvTable(path, problem.comm, names + self._asked.names, problem.progress if resume else None, key="step")
         #: Time of the last row.
-        self._last = self.table.last.get(columns[0], -np.inf)
+        self._last = self.table.last.get(names[0], -np.inf)
         #: Steps of the problem that the file knew all about when it was gone on with.
         self._known = problem.progress.steps if self.table.last else -1
 
@@ -97,7 +115,7 @@ class HistoryWriter(Closing):
         for contact in self.problem.declared:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
-        self.table.write(row)
+        self.table.write(row + self._asked.row())
 
     def close(self) -> None:
         """Close the file."""
@@ -126,6 +144,8 @@ class ResultsWriter(Closing):
         path: name of the files without ending; its folder is made.
         problem: what is written.
         fields: further UFL expressions by name, scalar, vector or tensor; one value per cell, in XDMF only.
+        reaction: see ``HistoryWriter``.
+        columns: likewise.
         vtx: whether to write VTX; None does where DOLFINx can.
         resume: go on with XDMF and CSV files that are there: the steps up to the checkpoint stay, later ones are replaced. VTX files
             cannot be gone on with: new steps go to ``PATH_vectors.1.bp``, or the next number. Without files, or where no
@@ -144,6 +164,8 @@ class ResultsWriter(Closing):
         problem: UnitedProblem,
         *,
         fields: Mapping[str, Any] | None = None,
+        reaction: Any = None,
+        columns: Mapping[str, Callable[[], Any]] | None = None,
         vtx: bool | None = None,
         resume: bool = False,
     ):
@@ -163,6 +185,7 @@ class ResultsWriter(Closing):
         degree, sources = geometry_degree(mesh), self._sources()
         shapes = {u.ufl_shape: compat.function_space(mesh, degree, u.ufl_shape) for u in sources.values()}
         self._nodal = {name: fem.Function(shapes[u.ufl_shape], name=name) for name, u in sources.items()}
+        self._history = partial(HistoryWriter, self._name(".csv"), problem, reaction=reaction, columns=columns)
         self._wants_vtx = compat.has_vtx() if vtx is None else vtx
         #: A run that no checkpoint has put forward has nothing to go on with, which is known for sure at the first step.
         self._undecided = resume and not (problem.progress.resumed or problem.progress.steps)
@@ -191,7 +214,7 @@ class ResultsWriter(Closing):
     def _open(self, resume: bool) -> None:
         """Begin the files, or go on with them (collective)."""
         progress = self.problem.progress
-        self.history = HistoryWriter(self._name(".csv"), self.problem, resume=resume)
+        self.history = self._history(resume=resume)
         nodal, cellwise = list(self._nodal.values()), list(self._cellwise.values())
         until = progress.steps if resume else None
         try:
