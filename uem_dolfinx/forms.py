@@ -296,6 +296,13 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     return float(reduced(comm, sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
 
 
+def product(A: PETSc.Mat, x: PETSc.Vec) -> PETSc.Vec:
+    """``A x`` of a square matrix, in a vector made after ``x``: ranks agree on one made after ``A``, as ``A * x`` is (collective)."""
+    y = x.duplicate()
+    A.mult(x, y)
+    return y
+
+
 def free_petsc_garbage(comm: MPI.Comm) -> None:
     """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective)."""
     PETSc.garbage_cleanup(comm)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from uem_dolfinx import forms
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix
 from uem_dolfinx.algebra.entries import SYMMETRIC, stiffen
@@ -202,19 +203,19 @@ class Condensed:
             if self._known is not None and not self.whole:
                 assert self.closure is not None
                 du, forces = self._known
-                left = forces - K * self.closure
+                left = forces - forms.product(K, self.closure)
                 left.array[at] += self._stiffness(self.closure.array_r[at] - du.array_r[at])
                 dq = du.copy()
             else:
                 dq = self._solve_inside(P, rhs)
-                left = K * dq
+                left = forms.product(K, dq)
             left = Q.transpose(left)
             dq.array[at] = self._on_contact(rhs.array_r[at] - left.array_r[at])
             dq.array[~P.used.ravel()] = 0.0
             if self.whole:
                 outer = self.space.vector(np.zeros_like(dq.array_r))
                 outer.array[at] = dq.array_r[at]
-                inside = self._solve_inside(P, rhs - K * P.expand(outer))
+                inside = self._solve_inside(P, rhs - forms.product(K, P.expand(outer)))
                 dq.array[:] = outer.array_r + inside.array_r
         return dq
 
@@ -231,7 +232,7 @@ class Condensed:
             forces = known.copy()
             forces.array[at] += self._stiffness(du.array_r[at] - before.array_r[at])
             return forces
-        forces = K * du
+        forces = forms.product(K, du)
         self._known = (du.copy(), forces.copy()) if exact else None
         return forces
 
@@ -247,7 +248,7 @@ class Condensed:
             du.axpy(-1.0, self._known[0])
             change = self.space.vector(np.zeros_like(du.array_r))
             change.array[at] = du.array_r[at]
-            whole = dq - self._solve_inside(P, K * change)
+            whole = dq - self._solve_inside(P, forms.product(K, change))
         self.whole = True
         return whole
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from uem_dolfinx import forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.geometry.nodes import Nodes
@@ -102,7 +103,7 @@ class _United:
     def mult(self, _: PETSc.Mat, q: PETSc.Vec, y: PETSc.Vec) -> None:
         """``y = P'(K + G)P q``."""
         du = self.P.expand(q)
-        forces = self.K * du
+        forces = forms.product(self.K, du)
         if self.G is not None:
             forces.axpy(1.0, self.G * du)
         self.P.transpose(forces).copy(y)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx import compat, given
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.condensed import Condensed
 from uem_dolfinx.algebra.deflation import MULTIGRID, Deflation, deflated, near_null_space, pressed_hard, without
@@ -427,7 +427,7 @@ class UnitedSolver:
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
         """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
-        return K * du if self.iterative else self._condensed.forces(K, du, self.exact)
+        return forms.product(K, du) if self.iterative else self._condensed.forces(K, du, self.exact)
 
     def begin_at(self, c: PETSc.Vec) -> None:
         """Take what the increment is without the unknowns that are solved for next."""

@@ -49,6 +49,8 @@ class NodeToSurface(OnTarget):
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.chords = chords
+        #: Nodes that contactors followed last ``(n, nt)``, and which of their components may move ``(n, nt, gdim)``.
+        self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
         from uem_dolfinx.contact.concave_edges import create_concave_edges
 
         self.concave_edges = create_concave_edges(config, target, self.free) if self.sliding == "finite" else None
@@ -108,8 +110,11 @@ class NodeToSurface(OnTarget):
         """Which targets can move along the normal (collective)."""
         if not p.nodes.shape[1]:
             return None
-        nodes = np.maximum(p.nodes, 0).ravel()
-        free = self.config.ask_owners(nodes, self.free_of_owned.astype(float)).reshape(*p.nodes.shape, self.config.gdim)
+        nodes = np.maximum(p.nodes, 0)
+        if reduced(self.config.comm, int(not np.array_equal(nodes, self._followed))):
+            self._followed, shape = nodes, (*nodes.shape, self.config.gdim)
+            self._may_move = self.config.ask_owners(nodes.ravel(), self.free_of_owned.astype(float)).reshape(shape)
+        free = self._may_move
         return np.abs(p.weights[:, :, None] * p.normal[:, None] * free).max(axis=(1, 2)) > MOSTLY_PRESCRIBED
 
 

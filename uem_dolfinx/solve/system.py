@@ -303,7 +303,7 @@ class BodySystem:
         """What contact, friction and present forces add to ``F = K du`` (collective)."""
         for more in (self._curvature, state.added):
             if more is not None:
-                F.axpy(1.0, more * du)
+                F.axpy(1.0, forms.product(more, du))
         F.axpy(1.0, self._residual())
         if state.held is not None:
             F.axpy(1.0, state.held)
@@ -398,7 +398,7 @@ class BodySystem:
         passing = not linear or (self._curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(
             state=state,
-            rhs=-Q.transpose(self._predicted_forces(state, c, K * c)),
+            rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
             exact=not iterative and (self.bodies.dynamics is not None or not passing),
             iterative=iterative,
             passing=passing,
