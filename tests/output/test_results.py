@@ -182,6 +182,10 @@ def test_pictures(folder: Path, cell: str) -> None:
         assert (folder / name).stat().st_size > 5000
     with uem.figure(None, comm) as (panel,):
         assert panel is None
+    for picture in (uem.plot_scene(problem), uem.plot_pressure(problem.contacts)):
+        # what Jupyter shows
+        shown = picture._repr_png_()
+        assert shown[:4] == b"\x89PNG" and len(shown) > 5000 if comm.rank == 0 else shown is None
 
 
 def test_pictures_leave_the_backend_of_matplotlib_alone(folder: Path) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from mpi4py import MPI
 
@@ -22,6 +23,20 @@ from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
+class Picture:
+    """A picture in memory: Jupyter shows it where it is the value of a cell.
+
+    Attributes:
+        png: its bytes; none where rank is not 0.
+    """
+
+    def __init__(self, png: bytes):
+        self.png = png
+
+    def _repr_png_(self) -> bytes | None:
+        return self.png or None
+
+
 def new_canvas(what: str, size: tuple[float, float]) -> Any:
     """Figure of this size in inches, without a window; a MissingBackendError that names ``what`` if matplotlib cannot be imported."""
     try:
@@ -36,12 +51,12 @@ def new_canvas(what: str, size: tuple[float, float]) -> Any:
 
 @contextmanager
 def figure(
-    path: str | Path | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8)
+    path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8)
 ) -> Iterator[list[Any]]:
     """Canvas with panels side by side, saved at the end; the backend of matplotlib stays as it is (collective).
 
     Args:
-        path: name of the picture; its folder is made. None draws nothing.
+        path: name of the picture, whose folder is made, or a file that is open. None draws nothing.
         comm: communicator; rank 0 draws, and to it alone everything is gathered.
         panels: number of panels.
         size: width and height of a panel in inches.
@@ -63,16 +78,17 @@ def figure(
             return
         yield list(np.atleast_1d(canvas.subplots(1, panels)))
         try:
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
-            canvas.savefig(path, dpi=150, bbox_inches="tight")
+            if isinstance(path, (str, Path)):
+                Path(path).parent.mkdir(parents=True, exist_ok=True)
+            canvas.savefig(path, format=None if isinstance(path, (str, Path)) else "png", dpi=150, bbox_inches="tight")
         except OSError as error:
             raise OutputError(f"the picture {path} cannot be written ({error}): {REMEDY}") from error
 
 
 @contextmanager
-def _panel(picture: str | Path | Any, comm: MPI.Comm) -> Iterator[Any]:
+def _panel(picture: str | Path | BinaryIO | Any, comm: MPI.Comm) -> Iterator[Any]:
     """The panel that is given, or the one of a picture of this name; what is raised in drawing is raised on all ranks (collective)."""
-    if isinstance(picture, (str, Path)):
+    if isinstance(picture, (str, Path, BytesIO)):
         with figure(picture, comm) as (panel,):
             yield panel
     else:
@@ -82,7 +98,7 @@ def _panel(picture: str | Path | Any, comm: MPI.Comm) -> Iterator[Any]:
 
 def plot_scene(
     problem: UnitedProblem,
-    picture: str | Path | Any,
+    picture: str | Path | Any = ...,
     *,
     field: Any = None,
     label: str = "",
@@ -95,12 +111,13 @@ def plot_scene(
     cmap: str = "viridis",
     view: str | Sequence[float] | None = None,
     surface: Part | None = None,
-) -> None:
+) -> Picture | None:
     """Draw a scene where it is now, coloured by a field: the cells of a 2D scene, the outside of a 3D one (collective).
 
     Args:
         problem: the scene.
-        picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0).
+        picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
+            Jupyter shows it.
         field: scalar UFL expression, averaged at the nodes of each body; a scalar Lagrange Function, drawn with its values at the
             vertices; a contact or a list of them, for their pressure; None is the size of the displacement.
         label: of the colour bar.
@@ -115,6 +132,9 @@ def plot_scene(
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
         surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or what a contact takes; 3D only.
 
+    Returns:
+        The picture if it has neither name nor panel.
+
     Raises:
         MissingBackendError: if matplotlib cannot be imported, or in 3D PyVista.
         InputError, InputTypeError: for an argument that is none in this dimension, or out of its range.
@@ -123,15 +143,16 @@ def plot_scene(
         problem, field=field, label=label, levels=levels, scale=scale, window=window, mirror=mirror, cells=cells, arrows=arrows,
         cmap=cmap, view=view, surface=surface,
     )  # fmt: skip
-    frame = drawing.take()
-    with _panel(picture, problem.comm) as panel:
+    frame, file = drawing.take(), BytesIO()
+    with _panel(file if picture is ... else picture, problem.comm) as panel:
         if panel is not None and frame is not None:
             drawing.over([frame]).draw(panel, frame)
+    return Picture(file.getvalue()) if picture is ... else None
 
 
 def plot_pressure(
     contacts: Contact | Sequence[Contact],
-    picture: str | Path | Any,
+    picture: str | Path | Any = ...,
     *,
     along: Callable[[Array], Array] | None = None,
     reference: Callable[[Array], Array] | None = None,
@@ -140,12 +161,12 @@ def plot_pressure(
     along_label: str | None = None,
     window: tuple[float, float] | None = None,
     mirror: bool = False,
-) -> None:
+) -> Picture | None:
     """Draw the contact pressure at the contactors over a coordinate (collective).
 
     Args:
         contacts: one contact or several.
-        picture: name of the picture, or a panel of :func:`figure`.
+        picture: name of the picture, or a panel of :func:`figure`. Left out, the picture is returned, and Jupyter shows it.
         along: coordinate of reference points ``(n, gdim)`` to draw over ``(n,)``; None is x in 2D, and in 3D the distance
             from the axis through the origin, ``sqrt(x^2 + y^2)``.
         reference: exact pressure as a function of that coordinate.
@@ -155,31 +176,35 @@ def plot_pressure(
         window: part of the coordinate to show; None shows half as much again as the pressed part.
         mirror: draw the reflection at 0 too, for half models.
 
+    Returns:
+        The picture if it has neither name nor panel.
+
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
     """
     pairs: list[Contact] = list(contacts) if isinstance(contacts, Sequence) else [contacts]
     found = [gather_contactors(contact, 0.0) for contact in pairs]
-    with _panel(picture, pairs[0].config.comm) as ax:
-        if ax is None:
-            return
-        gdim = pairs[0].config.gdim
-        along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))
-        curves = [(along(at), pressure) for at, _, pressure in found]
-        pressed = np.concatenate([s[p > 0] for s, p in curves])
-        if window is None:
-            lo, hi = (pressed.min(), pressed.max()) if len(pressed) else (0.0, 1.0)
-            lo = -hi if mirror else (0.0 if gdim == 3 else lo)
-            window = (lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo))
-        if reference is not None:
-            s = np.linspace(*window, 1001)
-            ax.plot(s, reference(s), color="0.25", lw=1.2, label=reference_label, zorder=1)
-        for contact, (s, p) in zip(pairs, curves):
-            if mirror:
-                s, p = np.concatenate([-s, s]), np.concatenate([p, p])
-            ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
-        ax.set(xlim=window, xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
-        # room above pressures that are all the same
-        ax.set_ylim(0.0, max(ax.get_ylim()[1], 1.05 * max(float(p.max(initial=0.0)) for _, p in curves)))
-        ax.grid(alpha=0.25)
-        ax.legend(frameon=False)
+    file = BytesIO()
+    with _panel(file if picture is ... else picture, pairs[0].config.comm) as ax:
+        if ax is not None:
+            gdim = pairs[0].config.gdim
+            along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))
+            curves = [(along(at), pressure) for at, _, pressure in found]
+            pressed = np.concatenate([s[p > 0] for s, p in curves])
+            if window is None:
+                lo, hi = (pressed.min(), pressed.max()) if len(pressed) else (0.0, 1.0)
+                lo = -hi if mirror else (0.0 if gdim == 3 else lo)
+                window = (lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo))
+            if reference is not None:
+                s = np.linspace(*window, 1001)
+                ax.plot(s, reference(s), color="0.25", lw=1.2, label=reference_label, zorder=1)
+            for contact, (s, p) in zip(pairs, curves):
+                if mirror:
+                    s, p = np.concatenate([-s, s]), np.concatenate([p, p])
+                ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
+            ax.set(xlim=window, xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
+            # room above pressures that are all the same
+            ax.set_ylim(0.0, max(ax.get_ylim()[1], 1.05 * max(float(p.max(initial=0.0)) for _, p in curves)))
+            ax.grid(alpha=0.25)
+            ax.legend(frameon=False)
+    return Picture(file.getvalue()) if picture is ... else None
