@@ -1,0 +1,1 @@
+"""A set of contact problems with references, and what compares with them."""
