@@ -36,8 +36,8 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Balance", "Checkpoint", "CheckpointError", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact",
+    "Balance", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics",
+    "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact",
     "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass",
     "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError",
     "OutputError", "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid",
@@ -116,6 +116,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
@@ -128,7 +129,7 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
-    "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
+    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -38,6 +39,7 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_o
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.mortar import Mortar
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair_friction import ValuesOfPairs
@@ -50,7 +52,7 @@ BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size
 #: What there is to be set; the first two are the contact's own.
 SETTINGS = (
     "taken", "config", "contactor", "target", "coupling", "sliding", "normals", "max_penetration", "thickness", "chords", "friction",
-    "measure", "name", "tied", "offset", "adjust",
+    "measure", "name", "tied", "offset", "adjust", "heat",
 )  # fmt: skip
 REACH = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
@@ -78,6 +80,7 @@ class Contact(WatchedContact):
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of place as of ``friction``: after every
             step the contactor has lost the volume ``wear N s`` under the force N that slips by s, with friction or without, and gaps
             are larger by its depth. :attr:`wear` and :attr:`worn_volume` tell it. The target does not wear.
+        heat: a ``Conductance``: heat that passes through the contact, where one of the fields beside the displacement is a temperature.
         measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
             small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
         tied: True unites contactors that are within reach of the target with it, in all components and for good: they never open and never
@@ -120,6 +123,7 @@ class Contact(WatchedContact):
         chords: bool = False,
         friction: Field | FrictionLaw = 0.0,
         wear: Field = 0.0,
+        heat: Conductance | None = None,
         measure: str = "reference",
         name: str | None = None,
     ):
@@ -137,6 +141,7 @@ class Contact(WatchedContact):
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
+            given.kind("heat", heat, heat is None or hasattr(heat, "conductances"), "a Conductance, or None")
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
@@ -158,7 +163,7 @@ class Contact(WatchedContact):
             given.kind("name", name, name is None or isinstance(name, str), "a text, or None for the names of the tags")
         self.contactor, self.target, self.sliding, self.normals = contactor, target, sliding, normals
         self.coupling, self.measure, self.tied, self.adjust = coupling, measure, tied, adjust
-        self.max_penetration, self.thickness, self.chords = max_penetration, thickness, chords
+        self.max_penetration, self.thickness, self.chords, self.heat = max_penetration, thickness, chords, heat
         self.name = (
             name or f"{name_of(contactor)} on {getattr(target, 'name', type(target).__name__) if rigid else name_of(target)}"
         )
@@ -313,7 +318,7 @@ class Contact(WatchedContact):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear,
+            wear=self._wear, heat=None if self.heat is None else list(self.heat.parameters.values()),
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -339,6 +344,16 @@ class Contact(WatchedContact):
                 lower=self._offsets_of_pair().wear,
                 name=self.name,
             )
+        if self.heat is not None:
+            from uem_dolfinx.contact.heat import Heat
+
+            current, surface = self.measure == "current", self.surface
+            self._pair.heat = Heat(
+                self._pair, self.heat, areas=lambda: (surface.current if current else surface.reference)[nodes], current=current,
+                pressures=lambda: self.pressures,
+            )  # fmt: skip
+            if self.heat.perfect:
+                self._pair.trial = self._pair.committed = replace(self._pair.committed, heat=np.zeros(len(nodes)))
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 

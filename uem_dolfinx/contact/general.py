@@ -152,6 +152,7 @@ class GeneralContact:
         max_penetration: float | None = None,
         measure: str = "reference",
         name: str = "general contact",
+        heat: None = None,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
             rigid = [rigid] if hasattr(rigid, "project") else rigid
@@ -168,6 +169,7 @@ class GeneralContact:
             if max_penetration is not None:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
+            given.kind("heat", heat, heat is None, "None: a general contact lets no heat through", "declare a Contact for it")
         self.surfaces, self.bodies, self.friction = surfaces, dict(bodies or {}), friction
         self.max_penetration, self.name, self.self_contact = max_penetration, name, self_contact
         #: Whether a problem has been made of it.

@@ -28,6 +28,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.heat import Heat
     from uem_dolfinx.contact.sliding import Sliding
 
 #: Contactors this part of the model's size from where they belong are there.
@@ -59,6 +60,7 @@ class Interface(Told):
             again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
         tied: contactors that are united with the target in all components for good, beside contact ``(n,)``.
+        heat: what passes through; None without.
     """
 
     kinematics: Kinematics
@@ -81,6 +83,7 @@ class Interface(Told):
         state = PairState.initial(n, g)
         self.trial = self.committed = replace(state, friction=FrictionState.initial(n, g)) if friction else state
         self.initial_overlap, self.mutual = 0.0, False
+        self.heat: Heat | None = None
         none: Bools = np.zeros(n, dtype=bool)
         self.redundant = self.reserved = self.barred = self.tied = none
 
@@ -367,7 +370,7 @@ class Interface(Told):
 
     def with_forces(self, found: Traction) -> PairState:
         """The trial state with contact forces that were read or predicted."""
-        state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force)
+        state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force, heat=found.heat)
         if state.friction is None or found.tau is None:
             return state
         return replace(state, friction=replace(state.friction, tau=found.tau))

@@ -35,6 +35,7 @@ class Traction(NamedTuple):
         force: on the contactor ``(n, gdim)``.
         tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
         bond: multipliers of tied contactors' equations ``(n, gdim)``; None where nothing is ever tied.
+        heat: power that goes from contactors to the target without a jump of temperatures ``(n,)``; None where none ever does.
     """
 
     lam: Array
@@ -42,6 +43,7 @@ class Traction(NamedTuple):
     force: Array
     tau: Array | None = None
     bond: Array | None = None
+    heat: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,12 @@ class Kinematics(Protocol):
             areas: integrals of the shape functions over the one or the other ``(n,)``.
             current: which of the two.
         """
+
+    def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
+        """Of a field at the contactors, and of what is opposite: places, global nodes and weights, which add up to one (collective)."""
+
+    def mean_areas(self, areas: Array, current: bool) -> Array:
+        """What these are means over; arguments as those of :meth:`areas` (collective)."""
 
     # -- derivatives of pressures ----------------------------------------------------------------------------------------
 

@@ -337,6 +337,15 @@ class NodalKinematics:
         """A nodal force is the integral of the pressure over the node's shape function."""
         return areas
 
+    def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
+        """At the nodes themselves, and at their feet."""
+        n = len(self.points)
+        return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)
+
+    def mean_areas(self, areas: Array, current: bool) -> Array:
+        """Integrals of the shape functions."""
+        return areas
+
     def areas_along(self, areas: Array) -> Array:
         """The same."""
         return areas

@@ -15,7 +15,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Indices, cross_products
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import Areas
 from uem_dolfinx.geometry.tags import Part
@@ -201,6 +201,44 @@ class ContactResults:
         """Volume that has been worn off the contactor in all committed steps, the integral of ``wear`` as drawn (collective)."""
         wear = None if self.pair.friction is None else self.pair.friction.wear
         return 0.0 if wear is None else wear.volume(self.pair.committed)
+
+    @property
+    def heat_flux(self) -> fem.Function:
+        """Power per area that goes from the contactor to the target, as a scalar field on the contactor; 0 without ``heat`` (collective).
+
+        The heat that friction makes where surfaces meet is not in it.
+        """
+        return self._field("heat_flux", 0.0 if self.pair.heat is None else self.pair.heat.flux())
+
+    def opposite(self, f: fem.Function) -> fem.Function:
+        """A field of the target at the contactors: what each faces there, as a scalar field on the contactor (collective).
+
+        Nodes of ``coupling="node_to_surface"`` face the point of the target below them, those of ``"mortar"`` a mean over the facets
+        around them.
+
+        Args:
+            f: scalar Function on the mesh, as a temperature.
+
+        Raises:
+            InputError, InputTypeError: for another Function, or a rigid target.
+        """
+        meshed = self.pair.target.n_nodes > 0
+        given.kind("f", f, isinstance(f, fem.Function), "a scalar Function")
+        if f.ufl_shape != () or not compat.is_on(f.function_space, self.config.mesh) or not meshed:
+            raise InputError(f"contact '{self.name}': opposite needs a scalar Function on the mesh, and a target that is meshed")
+        from uem_dolfinx.contact.heat import passage
+
+        values = fem.Function(compat.function_space(self.config.mesh, self.config.degree))
+        values.interpolate(f)
+        at = passage(self.pair, self._areas, False)
+        return self._field("opposite", at.means(at.theirs, values.x.array[: self.config.n_owned]))
+
+    def heat_balance(self) -> float:
+        """Heat that passes through the contact, summed over both bodies, over the sum of its nodal sizes (collective)."""
+        heat = self.pair.heat
+        passing = np.zeros(0) if heat is None else heat.nodal()[0]
+        total, size = reduced(self.config.comm, np.array([passing.sum(), np.abs(passing).sum()]))
+        return float(abs(total) / size) if size > 0 else 0.0
 
     @property
     def force(self) -> fem.Function:

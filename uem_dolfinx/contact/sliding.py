@@ -410,22 +410,25 @@ class Sliding:
     def commit(self, state: PairState, committed: PairState, kinematics: Kinematics) -> PairState:
         """The state to be committed, with slips, work and new anchors (collective)."""
         share, f, held = kinematics.force_per_multiplier[:, None], self.anchored(state, kinematics), self.frame.cornered
-        _, slope = self._cone(state)
-        tau = np.where(held[:, None], friction_in(kinematics.corners, state, committed.facet, slope) * share, f.tau)
-        # a contactor that changes facets slides over both
-        # one that has stuck all along is where its anchor is, whatever rounding says
-        stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
-        start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
+        tau, start, end, taken = self.step(state, committed, kinematics)
         slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
         slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
-        taken = friction.work(_of(committed).tau, tau, start, end, held)
-        self._last = None
-        worn = f.worn
+        self._last, worn = None, f.worn
         if self.wear is not None:
             ways = (np.linalg.norm(self.frame.along(way), axis=1) for way in (start, end))
             worn = worn + self.wear.depths(committed.lam, state.lam, *ways)
         now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
         return replace(state, friction=now)
+
+    def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
+        """Friction at a step's end, ways for a unit of it at start and end ``(n, gdim)``, and the work it takes ``(n,)`` (collective)."""
+        share, held, (_, slope) = kinematics.force_per_multiplier[:, None], self.frame.cornered[:, None], self._cone(state)
+        # a contactor that changes facets slides over both
+        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope) * share, _of(state).tau)
+        # one that has stuck all along is where its anchor is, whatever rounding says
+        stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
+        start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
+        return tau, start, end, friction.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
     def forget(self) -> None:
         """Another step has been begun from."""

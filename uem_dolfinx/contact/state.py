@@ -136,6 +136,7 @@ class PairState:
             partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
         bond: multipliers of the equations of tied contactors ``(n, gdim)``; None where nothing is ever tied.
+        heat: power that goes from contactors to the target without a jump of temperatures ``(n,)``; None where none ever does.
     """
 
     active: Bools
@@ -150,6 +151,7 @@ class PairState:
     cover: Ints
     friction: FrictionState | None = None
     bond: Array | None = None
+    heat: Array | None = None
 
     @property
     def in_corner(self) -> Bools:
@@ -179,8 +181,9 @@ class PairState:
             keys_of: what tells facets in any partition, from their present numbers ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
-        if self.bond is None:
-            del kept["bond"]
+        for name in ("bond", "heat"):
+            if getattr(self, name) is None:
+                del kept[name]
         if self.friction is not None:
             kept |= {OF_FRICTION + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
         return {name: _renumbered(name, array, keys_of) for name, array in kept.items()}

@@ -13,7 +13,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, cross_products
 from uem_dolfinx.contact.duals import Basis, basis_of
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
 from uem_dolfinx.contact.mortar_ends import curvature
-from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, WeightedRows
+from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_turning import Frictional, turning
 from uem_dolfinx.contact.node_to_surface import near_target, past_end
 from uem_dolfinx.contact.on_target import OnTarget
@@ -282,6 +282,36 @@ class MortarKinematics:
         if current and of.sliding != "finite":
             own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
         return np.where(rows.covered, own, areas)
+
+    def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
+        """By the integrals of the dual functions over what is covered; others at their nodes (collective)."""
+        of, rows, at = self.of, self.rows, self.rows.points
+        own, area = at.nodes, at.duals.C.sum(axis=2)
+        f, i = np.nonzero(area > 0)
+        total = of.config.add_at_owners(own[f, i], area[f, i, None])[of.nodes, 0]
+        scale = np.where(rows.covered, total, 1.0)
+        found = []
+        for parts in (terms_of(own, own, (at.duals.C @ of.basis.T)[..., None]), self._opposite()):
+            row, node, weight = of.elimination.at_owners([parts], scale)
+            kept = rows.covered[row]
+            found.append((row[kept], node[kept], weight[kept, 0]))
+        alone, near = np.flatnonzero(~rows.covered), self.nearest
+        k, a = np.nonzero(near.nodes[alone] >= 0)
+        more = (
+            (alone, of.config.to_global(of.nodes[alone]), np.ones(len(alone))),
+            (alone[k], near.nodes[alone][k, a], near.weights[alone][k, a]),
+        )
+        own_terms, theirs = (tuple(np.concatenate(both) for both in zip(*parts)) for parts in zip(found, more))
+        return own_terms, theirs  # type: ignore[return-value]
+
+    def _opposite(self) -> Terms:
+        """Integrals of the dual functions with the target's shape functions."""
+        at = self.rows.points
+        return terms_of(at.nodes[at.facet], at.opposite, (at.duals.A[at.facet] @ at.covered.N)[..., None])
+
+    def mean_areas(self, areas: Array, current: bool) -> Array:
+        """The same as those of forces."""
+        return self.areas(areas, current)
 
     def areas_along(self, areas: Array) -> Array:
         """Of contactors that nothing covers; others see their facets, as ``stretching`` tells."""

@@ -127,8 +127,8 @@ class ResultsWriter(Closing):
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv``, and where DOLFINx has ADIOS2 ``PATH_vectors.bp`` and
     ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``; for every contact its pressure, gap,
-    status and force; and whatever ``fields`` names. XDMF holds nodal values at the nodes of the mesh only: a displacement of degree
-    2 is interpolated. VTX has the fields of the displacement's degree.
+    status and force, and the heat that passes; and whatever ``fields`` names. XDMF holds nodal values at the nodes of the mesh only: a
+    displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
     ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
@@ -251,6 +251,8 @@ class ResultsWriter(Closing):
         for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
             found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
             found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
+            if isinstance(contact, Contact) and contact.heat is not None:
+                found[f"heat_flux{suffix}"] = contact.heat_flux
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:

@@ -16,7 +16,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import UEMError
+from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
@@ -132,6 +132,10 @@ class UnitedProblem:
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
             given.kind("method", method, callable(method), "what makes a united system of bodies and contacts, as BodySystem")
+            if method is not BodySystem and any(getattr(contact, "heat", None) is not None for contact in contacts):
+                raise InputError(
+                    "heat passes through contacts that are eliminated alone: leave method out, or heat out of the contacts"
+                )
             consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -21,7 +22,11 @@ from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import agree
+from uem_dolfinx.solve.bodies import FORCE_ROUNDING
 from uem_dolfinx.solve.newton import IterationState
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.heat import HeatEquations
 
 
 class OverConstraints:
@@ -61,6 +66,9 @@ class OverConstraints:
                 )
         self.stacked = bool(meets.any()) or any(pair.discretisation.chained for pair in pairs)
         self.contestable = self.shared or any(pair.discretisation.prescribed for pair in pairs)
+        if any(_unites_heat(pair) for pair in pairs):
+            # temperatures of both sides stand in the same rows, and may be prescribed
+            self.stacked = self.contestable = True
 
     def restrict(
         self, equations: UnitingEquations, free: Bools, prescribed: Array
@@ -93,6 +101,7 @@ class Rows:
         independent: how conflicts were resolved; None if there could be none.
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
+        heat: equations of temperatures by number of their pair, which come after those of ``equations``.
     """
 
     equations: list[Constraints]
@@ -100,6 +109,7 @@ class Rows:
     independent: IndependentEquations | None
     test: Restriction
     frictionless: Restriction
+    heat: dict[int, HeatEquations]
 
 
 @dataclass(frozen=True)
@@ -132,11 +142,13 @@ def make_rows(
     for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    frictionless = trial = UnitingEquations.join([e.frictionless for e in equations], g)
+    heat = {i: pair.heat.equations() for i, pair in enumerate(pairs) if pair.heat is not None and _unites_heat(pair)}
+    more = [e.rows for e in heat.values()]
+    frictionless = trial = UnitingEquations.join([*(e.frictionless for e in equations), *more], g)
     if any(e.trial is not e.frictionless for e in equations):
-        trial = UnitingEquations.join([e.trial for e in equations], g)
+        trial = UnitingEquations.join([*(e.trial for e in equations), *more], g)
     resisting = stopping = trial
-    if any(e.resisting is not e.trial for e in equations):
+    if heat or any(e.resisting is not e.trial for e in equations):
         resisting = UnitingEquations.join([e.resisting for e in equations], g)
         stopping = UnitingEquations.join([e.stopping for e in equations], g)
     # the derivatives of the gaps tell which motions of a body nothing holds
@@ -144,12 +156,36 @@ def make_rows(
     Q, independent = over_constraints.restrict(frictionless, free, prescribed)
     rotated = Q
     if any(e.test is not e.frictionless for e in equations):
-        test = UnitingEquations.join([e.test for e in equations], g)
+        test = UnitingEquations.join([*(e.test for e in equations), *more], g)
         if independent is not None and independent.found:
             independent = _rotated(pairs, independent, test)
             test = independent.equations
         rotated = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
-    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q)
+    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q, heat)
+
+
+def _unites_heat(pair: Interface) -> bool:
+    """Whether temperatures are the same where the pair's surfaces touch."""
+    return pair.heat is not None and pair.heat.law.perfect
+
+
+def rounding_of_heat(pairs: Sequence[Interface], unknowns: Any) -> Any:
+    """Norms of the residual that rounding of temperatures and slips can make of heat, one for each field; 0 without any (collective)."""
+    heats = [pair.heat for pair in pairs if pair.heat is not None]
+    return FORCE_ROUNDING * sum(unknowns.norms_of(heat.sizes()) for heat in heats) if heats else 0.0
+
+
+def with_heat(
+    pairs: Sequence[Interface], rows: Rows, forces: list[Traction], multipliers: Array, redundant: Bools
+) -> list[Traction]:
+    """Contact forces of every pair with the heat that goes through it, from the multipliers of the last equations of ``rows``."""
+    start = 0
+    for i, equations in rows.heat.items():
+        heat, part = pairs[i].heat, slice(start, start + len(equations.which))
+        assert heat is not None
+        forces[i] = forces[i]._replace(heat=heat.read(equations, multipliers[part], redundant[part]))
+        start = part.stop
+    return forces
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:

@@ -30,7 +30,7 @@ from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
-from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, unbalanced
+from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, rounding_of_heat, unbalanced, with_heat
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
 #: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
@@ -63,6 +63,7 @@ class BodySystem:
     ):
         self.bodies, self.pairs, self.solver = bodies, list(pairs), solver
         self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
+        self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
         self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
@@ -158,6 +159,8 @@ class BodySystem:
         F = self.bodies.residual
         for nodes, forces in filter(None, (pair.known_forces() for pair in self.pairs)):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
+        for heat in self._heats:
+            F.array[:] += heat.residual()
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
@@ -181,6 +184,9 @@ class BodySystem:
             at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest:
                 self._take(self._read_forces(rows, y))
+                if any(heat.lags for heat in self._heats):
+                    residual = rows.test.transpose(F := self._residual())
+                    at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
             if moved:
@@ -204,6 +210,7 @@ class BodySystem:
                 rows = self._rows()
                 residual = rows.test.transpose(self._residual())
         trial, added, held, active, gap = self._trial_of(rows)
+        torn = max([heat.torn() for heat in self._heats], default=0.0)
         return BodyState(
             trial=trial,
             test=rows.test,
@@ -215,7 +222,7 @@ class BodySystem:
             active=active,
             changed=moved or fallen,
             right=at_rest and violated == 0,
-            closed=gap <= CLOSED * self.config.size and self.bodies.dirichlet_met(),
+            closed=gap <= CLOSED * self.config.size and torn <= CLOSED and self.bodies.dirichlet_met(),
             in_contact=bool(pairs),
             rows=rows,
             added=added,
@@ -339,7 +346,7 @@ class BodySystem:
             pair.set_redundant(own, redundant[part])
             found.append(pair.forces(own, lam[part], du))
             start += len(own)
-        return found
+        return with_heat(self.pairs, rows, found, lam[start:], redundant[start:])
 
     def _take(self, forces: list[Traction]) -> None:
         """Hand the contact forces to the pairs."""
@@ -349,7 +356,8 @@ class BodySystem:
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
         active = [pair.nodes[pair.united] for pair in self.pairs]
-        return self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
+        of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
+        return of_bodies + rounding_of_heat(self.pairs, self.unknowns)
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``.

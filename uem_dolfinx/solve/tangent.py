@@ -145,16 +145,22 @@ def curvature_of(pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex:
 
 
 def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
-    """What the directions of slip add to the tangent and to the residual; None without friction in space (collective).
+    """What the directions of slip, and heat through contacts, add to the tangent, and slip to the residual; None for nothing (collective).
 
     Args:
         pairs: of all contacts.
-        du: a vector with the displacement's layout.
+        du: a vector with the layout of all unknowns.
     """
-    g = du.getBlockSize()
+    g, comm = du.getBlockSize(), du.comm.tompi4py()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
-    if not reduced(du.comm.tompi4py(), sum(len(nodes) for nodes, _, _ in parts)) if parts else True:
+    heat = [pair.heat.tangent() for pair in pairs if pair.heat is not None]
+    slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
+    passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
+    if not (slips or passes):
         return None, None
+    added = contact_curvature([*((nodes, blocks) for nodes, blocks, _ in parts), *heat], du)
+    if not slips:
+        return added, None
     held = du.duplicate()
     held.set(0.0)
     for nodes, _, forces in parts:
@@ -162,7 +168,7 @@ def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | N
         index = (nodes[there][:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
         held.setValues(index, forces.reshape(*nodes.shape, g)[there].ravel(), addv=PETSc.InsertMode.ADD)
     held.assemble()
-    return contact_curvature([(nodes, blocks) for nodes, blocks, _ in parts], du), held
+    return added, held
 
 
 def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:

@@ -1,0 +1,322 @@
+"""Heat through the contact of one interface: what leaves contactors enters the target by the same weights, and heat that friction makes.
+
+The temperature is a field beside the displacement. At every contactor i the power ``q_i A_i`` with ``q_i = h (T_i - sum_a N_a T_a)`` stands
+in the field's equations, at the contactor and with the opposite sign at what it faces. With rows ``v_i`` that make jumps of the
+unknowns these are ``sum_i v_i q_i A_i``, and their derivative is ``sum_i A_i h v_i v_i'``, symmetric. Pressures in h, and the heat of
+friction, are those that the last linearised problem has predicted. Perfect conductance unites temperatures, ``v_i' T = 0``, as gaps are
+closed: one unknown of each contactor that touches is eliminated, and the heat is the equation's multiplier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.active_set import GAP_ROUNDING
+from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
+from uem_dolfinx.contact.laws.conductance import Conductance, value
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.fields import ConfigurationAmongFields
+from uem_dolfinx.geometry.nodal_fields import NodalField
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.sliding import Sliding
+
+
+class Pair(Protocol):
+    """What heat asks of an interface; attributes as those of ``Interface``."""
+
+    name: str
+    config: Configuration
+    nodes: Indices
+    trial: PairState
+    committed: PairState
+    kinematics: Kinematics
+    discretisation: Discretisation
+    friction: Sliding | None
+    reserved: Bools
+
+    @property
+    def target(self) -> Target:
+        """What the contactors may touch."""
+
+    @property
+    def projection(self) -> Projection:
+        """Of the contactors, as last placed."""
+
+    @property
+    def united(self) -> Bools:
+        """Contactors that are active or tied ``(n,)``."""
+
+    @property
+    def off(self) -> Bools:
+        """Contactors that have slid past an end of the target ``(n,)``."""
+
+
+@dataclass(frozen=True)
+class Passage:
+    """What is opposite to contactors at one placement.
+
+    Attributes:
+        projection: of the contactors there.
+        halo: of the nodes that count.
+        row: place of the contactor of each term ``(k,)``.
+        own: weights of the contactor's mean, zero in those of the target ``(k,)``.
+        theirs: weights of the target's mean ``(k,)``.
+        areas: that heat passes through ``(n,)``.
+    """
+
+    projection: Projection
+    halo: Halo
+    row: Ints
+    own: Array
+    theirs: Array
+    areas: Array
+
+    @property
+    def jump(self) -> Array:
+        """By what the contactor's mean exceeds the target's ``(k,)``."""
+        return self.own - self.theirs
+
+    def means(self, weights: Array, nodal: Array) -> Array:
+        """Of values at owned nodes ``(n_owned,)``, with the terms' weights ``(n,)`` (collective)."""
+        there = self.halo.take(nodal[:, None].__getitem__)[:, 0]
+        return np.asarray(np.bincount(self.row, weights * there, minlength=len(self.areas)), dtype=float)
+
+    def hand_on(self, weights: Array, amounts: Array) -> Array:
+        """The transpose of ``means``: amounts of contactors ``(n,)`` at owned nodes ``(n_owned,)`` (collective)."""
+        return np.asarray(self.halo.add((weights * amounts[self.row])[:, None])[:, 0])
+
+
+def passage(pair: Pair, areas: Array, current: bool) -> Passage:
+    """What is opposite to contactors where they have been placed; ``areas`` and ``current`` as of ``Kinematics`` (collective)."""
+    k = pair.kinematics
+    (row, node, weight), (their_row, their_node, their_weight) = k.means()
+    none, others = np.zeros(len(row)), np.zeros(len(their_row))
+    return Passage(
+        k.projection,
+        Halo(pair.config, np.concatenate([node, their_node])),
+        np.concatenate([row, their_row]),
+        np.concatenate([weight, others]),
+        np.concatenate([none, their_weight]),
+        k.mean_areas(areas, current),
+    )
+
+
+class HeatEquations(NamedTuple):
+    """Uniting equations of temperatures.
+
+    Attributes:
+        rows: the equations ``(m,)``.
+        which: places of their contactors ``(m,)``.
+        own: by what they were divided, the part of the contactor's own unknown in its mean ``(m,)``.
+    """
+
+    rows: UnitingEquations
+    which: Ints
+    own: Array
+
+
+class Heat:
+    """Heat through one interface.
+
+    Args:
+        pair: the interface.
+        law: what conducts.
+        areas: tells integrals of the shape functions at the contactors ``(n,)`` (collective).
+        current: whether they are those of the surface where it is now.
+        pressures: tells the contactors' pressures ``(n,)`` (collective).
+
+    Raises:
+        InputError, SpaceError: if there is no such field, or if the target's temperature is not known, or given twice.
+    """
+
+    def __init__(
+        self, pair: Pair, law: Conductance, *, areas: Callable[[], Array], current: bool, pressures: Callable[[], Array]
+    ):
+        words, config = f"contact '{pair.name}': heat", pair.config
+        if not isinstance(config, ConfigurationAmongFields):
+            raise InputError(
+                f"{words} needs a temperature among the unknowns: expected a mixed Function with displacement= its displacement's part"
+            )
+        if pair.target.n_nodes and law.temperature is not None:
+            raise InputError(f"{words}: temperature is of a rigid target, and a mesh has its own: leave it out")
+        if not pair.target.n_nodes and law.temperature is None:
+            raise InputError(f"{words}: a rigid target has no temperature of its own: give temperature, a number or a Constant")
+        if law.friction_share is not None and pair.friction is None:
+            raise InputError(
+                f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
+            )
+        self.law, self.field, self._pair = law, NodalField(config, law.field, words), pair
+        self._areas, self._current, self._pressures = areas, current, pressures
+        if law.perfect and self.field.weights.shape[1] > 1:
+            raise SpaceError(
+                f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
+            )
+        #: Contactors whose temperatures could not be united, since conditions prescribe all of them ``(n,)``.
+        self._held: Bools = np.zeros(len(pair.nodes), dtype=bool)
+        self._passage: Passage | None = None
+
+    @property
+    def lags(self) -> bool:
+        """Whether heat depends on contact forces, which an iteration takes from the one before."""
+        return callable(self.law.h) or self.law.friction_share is not None
+
+    # -- perfect conductance ---------------------------------------------------------------------------------------------
+
+    def equations(self) -> HeatEquations:
+        """Of the temperatures of contactors that touch, and of those that may, which only keep their place (collective)."""
+        pair, at, g = self._pair, self.passage, self._pair.config.gdim
+        which = np.flatnonzero(pair.united | pair.reserved)
+        place = np.full(len(pair.nodes), -1, dtype=np.int64)
+        place[which] = np.arange(len(which))
+        known: Any = at.halo.take(self.field.terms)
+        number, weight, row = known[:, 0].astype(np.int64), at.jump * known[:, 1], place[at.row]
+        here = self.field.config.unknowns.numbers[self.field.unknowns[pair.nodes[which], 0]]
+        kept = row >= 0
+        number, weight, row = number[kept], weight[kept], row[kept]
+        itself = number == here[row]
+        own = np.zeros(len(which))
+        np.add.at(own, row[itself], weight[itself])
+        direction, coefficients = np.zeros((len(which), g)), np.zeros((int((~itself).sum()), g))
+        direction[np.arange(len(which)), here % g] = 1.0
+        row, number = row[~itself], number[~itself]
+        coefficients[np.arange(len(row)), number % g] = -weight[~itself] / own[row]
+        node = here // g - self.field.config.unknowns.first
+        rows = UnitingEquations(
+            node.astype(np.int32), direction, self.jump()[which] / own, pair.united[which], row, number // g, coefficients
+        )
+        return HeatEquations(rows, which, own)
+
+    def read(self, equations: HeatEquations, multipliers: Array, redundant: Bools) -> Array:
+        """Power that goes from the contactors to the target ``(n,)``, from the multipliers of equations, some left out, ``(m,)``."""
+        power = np.zeros(len(self._pair.nodes))
+        power[equations.which] = -multipliers / equations.own
+        self._held = np.zeros(len(power), dtype=bool)
+        self._held[equations.which] = redundant
+        return power
+
+    def torn(self) -> float:
+        """Largest jump of temperatures that are united, over the largest temperature there (collective)."""
+        if not self.law.perfect:
+            return 0.0
+        at, united = self.passage, self._pair.united & ~self._held
+        hot = at.means(at.own, np.abs(self.field.values)) + at.means(at.theirs, np.abs(self.field.values))
+        both = np.array([np.abs(self.jump()[united]).max(initial=0.0), hot[united].max(initial=0.0)])
+        jump, size = reduced(self._pair.config.comm, both, op=MPI.MAX)
+        return float(jump / size) if size > 0 else 0.0
+
+    # -- finite conductance ----------------------------------------------------------------------------------------------
+
+    @property
+    def passage(self) -> Passage:
+        """Of the last placement (collective)."""
+        # a projection that is the same on one rank is so on all
+        if self._passage is None or self._passage.projection is not self._pair.projection:
+            self._passage = passage(self._pair, self._areas(), self._current)
+        return self._passage
+
+    def conductances(self) -> Array:
+        """At the contactors ``(n,)``, none past an end of the target (collective)."""
+        pair = self._pair
+        closed = pair.united
+        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(pair.projection.gap, 0.0))
+        if callable(self.law.h):
+            p = np.where(closed, self._pressures(), 0.0)
+        h = self.law.conductances(pair.config.comm, pair.name, p, g, closed)
+        return np.where(closed | ~pair.off, h, 0.0)
+
+    def jump(self) -> Array:
+        """By what contactors are hotter than the target ``(n,)`` (collective)."""
+        at = self.passage
+        rigid = 0.0 if self.law.temperature is None else value(self.law.temperature)
+        return at.means(at.jump, self.field.values) - rigid
+
+    def power(self) -> Array:
+        """That goes from the contactors to the target ``(n,)`` (collective)."""
+        if self.law.perfect:
+            assert self._pair.trial.heat is not None
+            return self._pair.trial.heat
+        return np.asarray(self.conductances() * self.jump() * self.passage.areas)
+
+    def flux(self) -> Array:
+        """The same per area ``(n,)`` (collective)."""
+        if not self.law.perfect:
+            return np.asarray(self.conductances() * self.jump())
+        from uem_dolfinx.contact.bernstein import Bernstein
+
+        power, areas = self.power(), self.passage.areas
+        if isinstance(self._pair.discretisation, Bernstein):
+            # shape functions of degree 2 have no integral at some nodes
+            power, areas = (self._pair.discretisation.family.spread(part) for part in (power, areas))
+        return np.where(areas > 0, power / np.where(areas > 0, areas, 1.0), 0.0)
+
+    def friction(self) -> Array:
+        """Power that the work of friction in the present step is ``(n,)`` (collective)."""
+        pair, state = self._pair, self._pair.trial.friction
+        assert pair.friction is not None and state is not None
+        work = pair.friction.step(pair.trial, pair.committed, pair.kinematics)[-1]
+        # means that stick slip by rounding of places
+        slips = np.abs(work) > GAP_ROUNDING * pair.config.size * np.linalg.norm(state.tau, axis=1)
+        return np.where(slips, work, 0.0) / value(self.law.dt)
+
+    def nodal(self) -> tuple[Array, Array]:
+        """Power that passes from the contactors to the target, as what owned nodes lose, and what friction heats them by ``(n_owned,)``.
+
+        Collective.
+        """
+        at = self.passage
+        passing = at.hand_on(at.jump, self.power())
+        if self.law.friction_share is None:
+            return passing, np.zeros_like(passing)
+        share = self.law.friction_share
+        return passing, at.hand_on(share * at.own + (1.0 - share) * at.theirs, self.friction())
+
+    def sizes(self) -> Array:
+        """Sizes of what the heat's terms are differences of, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        at, pair, hot = self.passage, self._pair, np.abs(self.field.values)
+        size = np.zeros(len(at.areas))
+        if not self.law.perfect:
+            size = self.conductances() * at.areas * (at.means(at.own, hot) + at.means(at.theirs, hot))
+        if self.law.friction_share is not None and pair.trial.friction is not None:
+            # slips are differences of places
+            size = size + pair.config.size * np.linalg.norm(pair.trial.friction.tau, axis=1) / value(self.law.dt)
+        return self.field.rows(at.hand_on(at.own + at.theirs, size))
+
+    def residual(self) -> Array:
+        """What heat adds to the residual, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        passing, made = self.nodal()
+        # what equations hand on stands in no residual
+        return self.field.rows(-made if self.law.perfect else passing - made)
+
+    def tangent(self) -> tuple[Ints, Array]:
+        """Derivative of that with the temperatures: global rows ``(k, m)``, -1 for none, and blocks ``(k, m g, m g)`` (collective)."""
+        at, g = self.passage, self._pair.config.gdim
+        known: Any = at.halo.take(self.field.terms)
+        number, weight = np.hsplit(known, 2)
+        kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
+        some = (weight != 0) & (kappa[at.row] != 0)[:, None]
+        row = np.broadcast_to(at.row[:, None], weight.shape)[some]
+        number, weight = number[some].astype(np.int64), (at.jump[:, None] * weight)[some]
+        # terms of each contactor side by side
+        order = np.argsort(row, kind="stable")
+        which, first, i = np.unique(row[order], return_index=True, return_inverse=True)
+        place = np.arange(len(order)) - first[i]
+        rows = np.full((len(which), int(place.max(initial=-1)) + 1), -1, dtype=np.int64)
+        rows[i, place] = number[order] // g
+        v = np.zeros((*rows.shape, g))
+        v[i, place, number[order] % g] = weight[order]
+        jumps = v.reshape(len(which), rows.shape[1] * g)
+        return rows, kappa[which, None, None] * jumps[:, :, None] * jumps[:, None, :]

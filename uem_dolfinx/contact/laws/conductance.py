@@ -1,0 +1,95 @@
+"""What conducts heat between surfaces in contact, as users declare it: so much power per area and difference of temperatures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import agreed, ask_together
+
+#: A number, or a function of pressures and gaps ``(n,)`` that returns conductances ``(n,)``.
+OfPressureAndGap: TypeAlias = float | Callable[[Array, Array], npt.ArrayLike]
+
+CONDUCTANCE = given.Range("0 or a positive number, infinity, or a function of pressures and gaps", lambda x: x >= 0)
+SHARE = given.Range("a number from 0 to 1, or None for no heat of friction", lambda x: (x >= 0) & (x <= 1))
+
+
+class Conductance:
+    """Heat through a contact: the power ``h (T - T_target)`` per area leaves the contactor and enters the target.
+
+    Args:
+        h: conductance, a power per area and difference of temperatures. A number counts where surfaces touch, and open gaps conduct
+            nothing; infinity unites temperatures where surfaces touch. A function ``h(p, g)`` is given the contact pressures and gaps
+            of all contactors, ``(n,)`` each, one of them 0, and returns ``(n,)`` numbers.
+        field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
+        temperature: of a rigid target, a number or a Constant; None for a meshed target, which has its own.
+        friction_share: part of the heat of friction that enters the contactor; the rest enters the target. None leaves this heat out.
+        dt: time that a step takes, a number or the Constant that the residual has, by which the work of friction in a step becomes a
+            power.
+
+    Raises:
+        InputError, InputTypeError: for a value out of its range.
+    """
+
+    def __init__(
+        self,
+        h: OfPressureAndGap,
+        *,
+        field: int,
+        temperature: float | fem.Constant | None = None,
+        friction_share: float | None = None,
+        dt: float | fem.Constant = 1.0,
+    ):
+        self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
+        whole = isinstance(field, (int, np.integer)) and not isinstance(field, bool)
+        self.field = int(given.kind("field", field, whole, "the number of the part of the mixed space that is the temperature"))
+        self.temperature = temperature if temperature is None else _number("temperature", temperature, given.FINITE)
+        self.friction_share = friction_share if friction_share is None else given.number("friction_share", friction_share, SHARE)
+        self.dt = _number("dt", dt, given.POSITIVE)
+
+    @property
+    def perfect(self) -> bool:
+        """Whether temperatures are the same where surfaces touch."""
+        return self.h == np.inf
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What it was made with, by name."""
+        return dict(vars(self))
+
+    def conductances(self, comm: MPI.Comm, name: str, p: Array, g: Array, closed: Bools) -> Array:
+        """At contactors ``(n,)`` with pressures and gaps ``(n,)`` each, of which some are ``closed`` (collective).
+
+        Raises:
+            InputError, UserFunctionError: if the function raises, or returns anything else than so many numbers, 0 or positive.
+        """
+        if not callable(self.h):
+            return np.where(closed, self.h, 0.0)
+        h = np.array(ask_together(comm, f"contact '{name}': heat, h", self.h, p, g), dtype=float)
+        with agreed(comm):
+            if (h.ndim and h.shape != p.shape) or not given.NOT_NEGATIVE.holds(h).all():
+                raise InputError(
+                    f"contact '{name}': heat, h(p, g) has shape {h.shape}: expected {len(p)} numbers, {given.NOT_NEGATIVE.words}"
+                )
+        return np.broadcast_to(h, p.shape)
+
+
+def value(number: float | fem.Constant) -> float:
+    """What a number or a Constant is now."""
+    return float(number.value) if isinstance(number, fem.Constant) else number
+
+
+def _number(what: str, number: Any, within: given.Range) -> float | fem.Constant:
+    if isinstance(number, fem.Constant):
+        given.number(what, number.value, within)
+        return number
+    return given.number(what, number, within)
