@@ -1,6 +1,11 @@
 """A shallow arch snaps through under dead load, followed by arc length past both limit points and down onto a floor.
 
 python3 demos/arch.py --plot arch.png
+
+Options:
+    n: cells along half of the arch
+    steps: the first step applies 1/steps of the load, and its displacement sets the arc length of all others
+    depth: distance of the floor below the clamps
 """
 
 # %% [markdown]

@@ -1,6 +1,10 @@
 """An elastic bar hits a rigid wall, and is dropped onto it: impact, plateau and rebound against the exact solution.
 
 python3 demos/bar_impact.py --plot bar_impact.png
+
+Options:
+    n: cells along the bar
+    mass: consistent or lumped mass matrix
 """
 
 # %% [markdown]

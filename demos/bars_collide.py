@@ -1,6 +1,12 @@
 """Two equal elastic bars collide and swap their velocities.
 
 mpirun -n 2 python3 demos/bars_collide.py --dim 3
+
+Options:
+    n: cells along each bar
+    n_width: cells across the lower bar; the upper one has one more
+    v1: initial velocity of the lower bar, upwards
+    v2: initial velocity of the upper bar, upwards
 """
 
 # %% [markdown]

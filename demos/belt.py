@@ -1,6 +1,10 @@
 """A belt on a pulley: how much more its tight end pulls than its slack end, against Euler and Eytelwein.
 
 python3 demos/belt.py --plot belt.png
+
+Options:
+    n: cells along the half circle around the pulley
+    t: thickness of the belt
 """
 
 # %% [markdown]

@@ -1,6 +1,9 @@
 """A soft ring is thrown obliquely onto a wall and bounces along it, with large rotations and large deformations.
 
 python3 demos/bouncing_ring.py --plot bouncing_ring.png
+
+Options:
+    n: cells around the ring, a multiple of 4
 """
 
 # %% [markdown]

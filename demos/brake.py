@@ -1,6 +1,10 @@
 """Heat of friction: a pad on a rigid disc, whose temperature is known, and an elastic block on a base that is drawn under it.
 
 mpirun -n 2 python3 demos/brake.py --plot brake.png
+
+Options:
+    n: cells over the height of the block
+    steps: time steps until 0.4 of the time that heat takes through the block
 """
 
 # %% [markdown]

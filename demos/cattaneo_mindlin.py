@@ -1,6 +1,12 @@
 """Cattaneo and Mindlin's contact: a body is pressed onto a block, then pushed to and fro; part of the contact sticks, part slips.
 
 python3 demos/cattaneo_mindlin.py --plot cattaneo_mindlin.png
+
+Options:
+    h: size of the cells relative to the contact zone; 0: 1/60 in 2D, 1/5 in 3D
+    part: largest tangential force relative to mu P
+    steps: load steps of the first push, and of each half of a reversal; 0: 4 in 2D, 2 in 3D
+    loops: how often it is pushed back and forth again; 0: 2 in 2D, 1 in 3D
 """
 
 # %% [markdown]

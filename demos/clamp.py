@@ -1,6 +1,12 @@
 """A ring whose lips close on each other, self contact without any declaration of surfaces, against its half on a rigid plane.
 
 python3 demos/clamp.py --plot clamp.png
+
+Options:
+    n: cells across the ring
+    m: cells along half of the ring
+    slot: width of the slot
+    way: displacement of each grip
 """
 
 # %% [markdown]

@@ -21,6 +21,27 @@ import uem_dolfinx as uem
 
 MESHES = Path(__file__).resolve().parent.parent / "meshes"
 comm = MPI.COMM_WORLD
+#: What options mean in most demos that have them; the docstring of a demo explains all others.
+WORDS = {
+    "dim": "space dimension, 2 or 3",
+    "h": "size of the cells in the contact zone",
+    "ratio": "size of the target's cells relative to the contactor's",
+    "layers": "cells through the wall",
+    "quads": "1: quadrilaterals or hexahedra instead of triangles or tetrahedra",
+    "degree": "polynomial degree of the elements",
+    "refinements": "number of meshes, each twice as fine as the one before",
+    "E": "Young's modulus",
+    "nu": "Poisson's ratio",
+    "mu": "coefficient of friction",
+    "friction": "coefficient of friction",
+    "coupling": "contact conditions at nodes, or in integrals over both surfaces",
+    "normals": "normals of the target's facets, or averaged at its nodes",
+    "steps": "load steps",
+    "dt": "time step",
+    "end": "time at which the run ends",
+    "cfl": "Courant number: time step times wave speed over the length of a cell",
+    "runs": "timed runs, of which the quickest counts",
+}
 
 
 def ratio(text: str) -> float:
@@ -28,24 +49,36 @@ def ratio(text: str) -> float:
     return float(Fraction(text.replace(":", "/")))
 
 
-def arguments(description: str | None, **options: Any) -> argparse.Namespace:
+def explanations(docstring: str | None) -> dict[str, str]:
+    """Meaning of each option: the shared words, and those of a docstring that ends in "Options:" and lines ``name: meaning``."""
+    own = (docstring or "").partition("\nOptions:\n")[2]
+    return WORDS | dict(line.strip().split(": ", 1) for line in own.splitlines() if line.strip())
+
+
+def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
     """Parse the command line.
 
     Args:
-        description: docstring of the demo; its first line is shown.
-        options: the demo's own options, by name: the default, or a tuple of choices whose first is the default.
+        docstring: of the demo; ``--help`` shows its first line, and what it says of the options.
+        options: the demo's own options, by name: the default, or a tuple of choices whose first is the default; False makes a flag.
     """
-    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(docstring or "").partition("\n")[0])
     parser.add_argument("--json", metavar="FILE", help="write the figures measured")
     parser.add_argument("--plot", metavar="FILE.png", help="draw a picture")
     parser.add_argument("--output", metavar="DIR", help="write fields for ParaView and a CSV history")
     parser.add_argument("--verbose", action="store_true", help="show every Newton iteration, and where time went")
+    words = explanations(docstring)
     for name, value in options.items():
+        default = value[0] if isinstance(value, tuple) else value
         if isinstance(value, tuple):
-            kind: Any = {"choices": value, "default": value[0]}
+            kind: Any = {"choices": value}
+        elif value is False:
+            kind = {"action": "store_true"}
         else:
-            kind = {"type": ratio if isinstance(value, float) else type(value), "default": value}
-        parser.add_argument("--" + name.replace("_", "-"), help=f"default: {kind['default']}", **kind)
+            kind = {"type": ratio if isinstance(value, float) else type(value)}
+        shown = "none" if default == "" else f"{default:g}" if isinstance(default, float) else default
+        text = f"{words.get(name, '')} (default: {shown})".strip()
+        parser.add_argument("--" + name.replace("_", "-"), default=default, help=text.replace("%", "%%"), **kind)
     logging.basicConfig(format="%(message)s")
     return parser.parse_args()
 

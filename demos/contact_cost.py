@@ -1,6 +1,9 @@
 """What contact costs: its share of a Newton iteration, and CG iterations against the same bodies meshed as one.
 
 python3 demos/contact_cost.py --json cost.json
+
+Options:
+    dofs: unknowns of each scene at degree 1, approximately
 """
 
 # %% [markdown]

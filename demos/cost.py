@@ -1,6 +1,13 @@
 """What contact costs: time, memory and iterations with contact over those of the same bodies without, and where the time goes.
 
 python3 demos/cost.py --json cost.json --plot cost.png
+
+Options:
+    linear: sizes of linear elastic scenes, dimension:unknowns, comma-separated
+    finite: sizes of scenes at finite strain, dimension:unknowns, comma-separated
+    cg: unknowns of the 3D scenes in which CG iterations are counted, comma-separated
+    stiffness: Young's moduli of the sphere relative to the block's, comma-separated, at the first size of --cg; 1 at others
+    amg: multigrid of these scenes; best: hypre where PETSc has it
 """
 
 # %% [markdown]

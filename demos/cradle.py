@@ -1,6 +1,12 @@
 """Five equal bars in a row: the first arrives with a velocity, the last leaves with it, the others rest.
 
 python3 demos/cradle.py --plot cradle.png
+
+Options:
+    bars: number of bars
+    n: cells along each bar
+    gap: gap between neighbouring bars
+    v: initial velocity of the first bar
 """
 
 # %% [markdown]

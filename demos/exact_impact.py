@@ -1,6 +1,9 @@
 """A mass on an elastic-plastic spring falls onto the ground: every phase of the motion against its exact solution.
 
 python3 demos/exact_impact.py --plot exact_impact.png
+
+Options:
+    length: length of the spring
 """
 
 # %% [markdown]

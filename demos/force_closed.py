@@ -1,6 +1,10 @@
 """Contact closed by a force: a half disc falls onto a block under nothing but its weight, plane strain.
 
 python3 demos/force_closed.py --plot force_closed.png
+
+Options:
+    gap: initial gap between the bodies
+    weight: weight of the half disc per unit thickness
 """
 
 # %% [markdown]

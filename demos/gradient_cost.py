@@ -1,6 +1,11 @@
 """What a gradient through contact costs: its time over that of the forward solve, for 1, 100 and 10,000 moduli.
 
 python3 demos/gradient_cost.py --json gradient_cost.json
+
+Options:
+    linear: sizes of linear elastic scenes, dimension:unknowns, comma-separated
+    finite: sizes of scenes at finite strain, dimension:unknowns, comma-separated
+    controls: numbers of moduli by which the force is differentiated, comma-separated
 """
 
 # %% [markdown]

@@ -1,6 +1,14 @@
 """Elastic discs fall into a box and come to rest in a heap: all of them against each other and the walls by one declaration.
 
 python3 demos/granular.py --plot granular.png
+
+Options:
+    rows: rows of discs
+    columns: discs in a row
+    n: facets around each disc
+    gamma: drag of the medium per unit of mass and velocity, an inverse time
+    tau: viscosity of the discs divided by E, a time
+    falling: time steps of the run without contact, whose time is compared
 """
 
 # %% [markdown]

@@ -1,6 +1,10 @@
 """Hertzian contact of two elastic bodies: a cylinder pressed onto a block, plane strain.
 
 python3 demos/hertz_cylinder.py --plot hertz.png
+
+Options:
+    tangent: tangent with the curvature of the contact, or without
+    chords: 1: P is built with the chords of curved target facets
 """
 
 # %% [markdown]

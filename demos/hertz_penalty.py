@@ -1,6 +1,9 @@
 """Hertzian contact with a rigid indenter: united elements and the penalty method on the same mesh in one run.
 
 python3 demos/hertz_penalty.py --plot penalty.png
+
+Options:
+    N: cells along each horizontal side of the block; half as many over its height
 """
 
 # %% [markdown]

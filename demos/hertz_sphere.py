@@ -1,6 +1,10 @@
 """Hertzian contact of two elastic bodies in 3D: a half sphere pressed onto a block, CG with algebraic multigrid.
 
 mpirun -n 2 python3 demos/hertz_sphere.py --plot sphere.png
+
+Options:
+    h: size of the cells in the contact zone, on the finest mesh
+    d: displacement of the half sphere's flat top, downwards
 """
 
 # %% [markdown]

@@ -1,6 +1,12 @@
 """Hub on a shaft: a press fit by an offset, a torque until it slips, and the fit released again.
 
 python3 demos/hub.py --plot hub.png
+
+Options:
+    n_shaft: cells around the shaft, a multiple of 4
+    n_hub: cells around the hub, a multiple of 4
+    layers: cells through the shaft's wall; the hub has twice as many
+    steps: load steps of the torque
 """
 
 # %% [markdown]

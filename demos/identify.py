@@ -1,6 +1,14 @@
 """Two moduli of a coated block from the forces with which a disc indents it, by exact gradients through the contact.
 
 python3 demos/identify.py --plot identify.png
+
+Options:
+    depth: largest displacement of the disc's top, downwards
+    steps: depths at which the force is measured
+    layer: thickness of the coating
+    soft: Young's modulus of the coating
+    hard: Young's modulus of the block under it
+    noise: relative standard deviation of the noise in the forces
 """
 
 # %% [markdown]

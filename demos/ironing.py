@@ -1,6 +1,14 @@
 """Ironing: a stiff rounded tool is pressed into a soft slab, dragged along it and off its end, with friction or without.
 
 python3 demos/ironing.py --plot ironing.png
+
+Options:
+    tool: deformable tool, or rigid one
+    n: elements along the slab
+    n_tip: elements along the tool's tip; 0: 9 in 2D, 8 in 3D
+    layers: elements through the slab's height; 0: 5 in 2D, 3 in 3D
+    steps_per_pitch: load steps per element along the slab
+    samples: load steps over the one element where mean forces are taken
 """
 
 # %% [markdown]

@@ -1,6 +1,13 @@
 """What general contact costs by the number of bodies: seconds to set a problem up and for a step, with contact and without.
 
 python3 demos/many_bodies.py --json bodies.json --plot bodies.png
+
+Options:
+    sizes: numbers of discs, comma-separated
+    columns: discs in a row
+    n: facets around each disc
+    steps: time steps that are timed, after a first one
+    apart: gap between the discs of a row relative to their diameter
 """
 
 # %% [markdown]

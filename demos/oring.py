@@ -1,6 +1,10 @@
 """A rubber cord squeezed between plates: nu = 0.4999 from displacements alone, without locking, against a fine mesh.
 
 python3 demos/oring.py --plot oring.png
+
+Options:
+    n: cells along each side of the core of the quarter; the reference has four times as many
+    squeeze: relative reduction of the cord's height
 """
 
 # %% [markdown]

@@ -1,6 +1,9 @@
 """Contact patch test: a constant pressure between two blocks whose meshes do not match.
 
 python3 demos/patch_test.py --plot patch_test.png
+
+Options:
+    n: cells along each side of the coarser block; mortar has meshes of its own, but for the picture
 """
 
 # %% [markdown]

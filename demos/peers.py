@@ -1,6 +1,15 @@
 """Against other codes: CalculiX, GetFEM and Kratos on the same mesh of a cylinder or sphere on a block, with the same tolerance.
 
 python3 demos/peers.py --plot peers.png
+
+Options:
+    friction: coefficient of friction, in 2D
+    sizes: nodes of the meshes, comma-separated; none: sizes that fit the scene
+    codes: codes to compare, comma-separated
+    runs: timed runs, whose median counts
+    timeout: seconds that a run of another code may take
+    reference: size of the reference's cells in the contact zone, in 2D without friction
+    kratos: Python interpreter that has Kratos; none: this one
 """
 
 # %% [markdown]

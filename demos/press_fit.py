@@ -1,6 +1,12 @@
 """Press fit: a solid disc slightly too large for the ring around it, against Lamé's pressure.
 
 python3 demos/press_fit.py --plot press_fit.png
+
+Options:
+    h: size of the disc's cells at the interface, on the finest mesh
+    delta: interference: the disc's radius less that of the bore
+    sliding: contactors are projected in every iteration, once per step, or once for all
+    kind: plane strain, or plane stress
 """
 
 # %% [markdown]

@@ -1,6 +1,9 @@
 """A rounded punch pressed into a cylinder, axisymmetric, with friction and without: the NAFEMS contact benchmark 2.
 
 python3 demos/punch_axisymmetric.py --plot punch_axisymmetric.png
+
+Options:
+    n: cells around the punch's rounded edge, on the coarsest mesh
 """
 
 # %% [markdown]

@@ -1,6 +1,13 @@
 """The shape of a stiff punch that presses evenly, by exact gradients through the contact, against the closed form.
 
 python3 demos/punch_shape.py --plot punch_shape.png
+
+Options:
+    n: cells along half of the punch's bottom
+    width: half width, and depth, of the base relative to the half width of the punch
+    stiff: Young's modulus of the punch relative to that of the base
+    pressure: mean contact pressure relative to Young's modulus of the base
+    iterations: largest number of L-BFGS iterations
 """
 
 # %% [markdown]

@@ -1,6 +1,11 @@
 """Pyramids of 3, 6 and 10 discs without friction between two walls: what the floor and the walls carry.
 
 python3 demos/pyramid.py --plot pyramid.png
+
+Options:
+    bases: discs in the lowest row of each pyramid, comma-separated
+    n: sides of the coarsest discs, a multiple of 24
+    apart: gap between the discs of a row relative to their diameter
 """
 
 # %% [markdown]

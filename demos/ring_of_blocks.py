@@ -1,6 +1,12 @@
 """Bodies about a line, each contactor of the next: nobody comes first, and the ring of equations is closed.
 
 python3 demos/ring_of_blocks.py --plot ring_of_blocks.png
+
+Options:
+    sectors: number of sectors, 3 or more
+    cells: cells along the sides of the first sector on each mesh, comma-separated
+    more: cells more along the sides of each further sector
+    eps: inward displacement of the rim relative to the radius
 """
 
 # %% [markdown]

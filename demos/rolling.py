@@ -1,6 +1,10 @@
 """A disc rolls down a rough incline, or slides, against the closed forms of a rigid one.
 
 python3 demos/rolling.py --plot rolling.png
+
+Options:
+    n: cells around the disc, a multiple of 4
+    layers: cells along the radius
 """
 
 # %% [markdown]

@@ -1,6 +1,16 @@
 """How contact scales: speed-up of a Hertz scene on several ranks, what ranks receive in a search, and its time against its size.
 
 python3 demos/scaling.py --json scaling.json --plot scaling.png
+
+Options:
+    where: apart: a call of mpiexec for each number of ranks; here: the ranks of this call
+    dofs: unknowns of the timed scene, approximately; 0: not measured
+    ranks: numbers of ranks on which it is timed, comma-separated
+    plates: cells along a side of the plates whose traffic is measured, comma-separated
+    plate_ranks: numbers of ranks for --plates, comma-separated
+    searches: cells along a side of the plates whose search is timed on one rank, comma-separated
+    counted: unknowns of the scene in which collective calls are counted, approximately; 0: not measured
+    count_ranks: numbers of ranks for --counted, comma-separated
 """
 
 # %% [markdown]

@@ -1,6 +1,11 @@
 """A rubber seal pressed into its groove at nu = 0.5: the pressure is a field of its own, and contact leaves it alone.
 
 python3 demos/seal_up.py --plot seal.png
+
+Options:
+    n: cells along each side of the core of the quarter; the reference has four times as many
+    squeeze: relative reduction of the cord's height
+    wall: distance of each side wall from the middle relative to the cord's radius
 """
 
 # %% [markdown]
@@ -76,17 +81,15 @@ reference = Seal(4 * args.n, 0.4999, mixed=False)
 rows, seals = [], {}
 for nu in (0.4999, 0.49999, 0.5):
     seal = seals[nu] = Seal(args.n, nu, mixed=True)
-    rows.append(
-        {
-            "nu": nu,
-            "force": seal.force,
-            "force_error": seal.force / reference.force - 1,
-            "side": seal.side,
-            "side_error": seal.side / reference.side - 1,
-            "volume_change": seal.volume - 1,
-            "newton_iterations": sum(step.newton_iterations for step in seal.steps),
-        }
-    )
+    rows.append({
+        "nu": nu,
+        "force": seal.force,
+        "force_error": seal.force / reference.force - 1,
+        "side": seal.side,
+        "side_error": seal.side / reference.side - 1,
+        "volume_change": seal.volume - 1,
+        "newton_iterations": sum(step.newton_iterations for step in seal.steps),
+    })  # fmt: skip
 results = {
     "rows": rows,
     "reference_force": reference.force,

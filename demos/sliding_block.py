@@ -1,6 +1,10 @@
 """A block on a rough base: driven, pushed, on an incline, and thrown along it until it stops; rigid and deformable base.
 
 python3 demos/sliding_block.py --plot sliding_block.png
+
+Options:
+    n: cells along the block's height, an even number
+    steps: time steps in which the thrown block comes to rest
 """
 
 # %% [markdown]

@@ -1,6 +1,9 @@
 """Snap-through of two cantilevers in contact, led by displacement control past the limit point and off the target's end.
 
 python3 demos/snap_through.py --plot snap_through.png
+
+Options:
+    dw: prescribed displacement per load step, rounded so that 1/dw is whole
 """
 
 # %% [markdown]

@@ -1,6 +1,12 @@
 """A spinning ring is thrown obliquely onto a rough wall, and rolls away from it.
 
 python3 demos/spinning_ring.py --plot spinning_ring.png
+
+Options:
+    n: cells around the ring, a multiple of 4
+    spin: initial angular velocity, counterclockwise: backspin
+    along: initial velocity along the wall
+    fall: initial velocity towards the wall
 """
 
 # %% [markdown]

@@ -1,6 +1,12 @@
 """Stability: every method of contact in extreme cases, and whether it is right, says why not, or is wrong.
 
 python3 demos/stability.py --methods united --quick
+
+Options:
+    quick: quick cases alone, no condition numbers
+    methods: methods or columns of the table, comma-separated, or all
+    cases: rows of the table, comma-separated, or all
+    known: JSON files of earlier runs, comma-separated, whose cells are not run again
 """
 
 # %% [markdown]
@@ -35,10 +41,7 @@ from benchmarks.cases_scales import springs
 
 import uem_dolfinx as uem
 
-flags = argparse.ArgumentParser(add_help=False)
-flags.add_argument("--quick", action="store_true")
-flag, sys.argv[1:] = flags.parse_known_args()
-args = common.arguments(__doc__, methods="all", cases="all", known="")
+args = common.arguments(__doc__, quick=False, methods="all", cases="all", known="")
 asked, picked = args.methods.split(","), args.cases.split(",")
 COLUMN_NAMES = [column.name for column in COLUMNS]
 columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.method in asked]
@@ -50,7 +53,7 @@ every = [
     *cases_friction.CASES,
     *cases_motion.CASES,
 ]
-rows = [c for c in every if (args.cases == "all" and (c.quick or not flag.quick)) or c.name in picked]
+rows = [c for c in every if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
 if not columns or not rows:
     sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in every)}")
 # what other runs have found, by case and method, and their condition numbers: files of theirs are --known
@@ -124,7 +127,7 @@ def condition(column: Column, ratio: float = 1.0, n: int = 4, factor: float | No
 
 LADDER = {"ratio": [10.0**k for k in range(-9, 10, 3)], "n": [2, 4, 8, 16], "factor": [10.0**k for k in range(-2, 7)]}
 curves = []
-if comm.size == 1 and args.cases == "all" and not flag.quick:
+if comm.size == 1 and args.cases == "all" and not args.quick:
     for column in (c for c in columns if methods.available(c.method)):
         found = [curve for curve in known_curves if curve["method"] == column.name]
         curves += found

@@ -1,6 +1,11 @@
 """Three blocks on each other, hard between soft, the middle one contactor below and target above.
 
 python3 demos/stack.py --plot stack.png
+
+Options:
+    n: cells along each side of the lowest block; those above have 2 and 4 times as many
+    ratio: Young's modulus of the middle block relative to that of the others
+    d: displacement of the stack's top, downwards
 """
 
 # %% [markdown]

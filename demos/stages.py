@@ -1,6 +1,10 @@
 """What a scene does not need is not done: how often every demo runs each stage of the method.
 
 python3 demos/stages.py --plot stages.png
+
+Options:
+    demos: demos to run, comma-separated; none: all
+    seconds: 1: a table of the time as well
 """
 
 # %% [markdown]

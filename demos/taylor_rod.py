@@ -1,6 +1,14 @@
 """Taylor's test: a copper rod hits a rigid wall at 227 m/s and stays behind as a mushroom, against published figures.
 
 mpirun -n 2 python3 demos/taylor_rod.py --plot taylor_rod.png
+
+Options:
+    n: cells along each side of the three blocks of the quarter section
+    layers: cells along the rod
+    dt: time step in microseconds
+    end: end of the run in microseconds
+    rho_inf: part of the fastest motions that a time step keeps, 0 to 1
+    contactors: contactors with their mass, or without
 """
 
 # %% [markdown]

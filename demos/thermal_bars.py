@@ -1,6 +1,10 @@
 """Heat through two bars in series: the jump of temperatures between them, and a gap that heat closes.
 
 mpirun -n 2 python3 demos/thermal_bars.py --coupling mortar --plot thermal_bars.png
+
+Options:
+    n: cells along a bar, half as many again in the upper one with mortar
+    steps: load steps of the heating
 """
 
 # %% [markdown]

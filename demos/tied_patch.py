@@ -1,6 +1,10 @@
 """Tied meshes: any stress passes through a tie of two meshes that do not match, and a tied cantilever bends as one piece.
 
 python3 demos/tied_patch.py --plot tied_patch.png
+
+Options:
+    n: cells along each side of the coarser block, and over the height of the beam at its support
+    load: downward force at the end of the cantilever per unit thickness
 """
 
 # %% [markdown]
@@ -17,7 +21,6 @@ import numpy as np
 import ufl
 from common import comm
 from dolfinx import fem
-
 from benchmarks import patches
 
 import uem_dolfinx as uem
@@ -48,9 +51,8 @@ def patch(dim: int, degree: int, cells: tuple[int, int], side: str, quads: int =
     nodes = np.unique(np.concatenate([fem.locate_dofs_topological(V, dim - 1, tag.entities) for tag in outside]))
     sides = {"lower": tags["top_1"], "upper": tags["bottom_2"]}
     tie = uem.Contact(sides.pop(side), *sides.values(), coupling=args.coupling, tied=True)
-    problem = uem.UnitedProblem(
-        material.residual(u, v) * ufl.dx, u, bcs=[fem.dirichletbc(exact, nodes.astype(np.int32))], contacts=[tie]
-    )
+    F, bcs = material.residual(u, v) * ufl.dx, [fem.dirichletbc(exact, nodes.astype(np.int32))]
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[tie])
     problem.solve()
     stress = [fem.Function(uem.function_space(mesh, ("DG", 0), (dim, dim))) for _ in range(2)]
     for s, field in zip(stress, (u, exact)):
@@ -96,8 +98,7 @@ def beam(parts: int) -> tuple[uem.UnitedProblem, float]:
 
 length, inertia, G = 10.0, 1 / 12, E / 2 / (1 + nu)
 theory = args.load * (length**3 / (3 * E * inertia) + length / (5 / 6 * G))
-tied, deflection = beam(2)
-_, whole = beam(1)
+(tied, deflection), (_, whole) = beam(2), beam(1)
 results = {
     "tied_error": error, "patches": errors, "deflection_over_theory": deflection / theory, "one_piece_over_theory": whole / theory,
     "tied_against_one_piece": abs(deflection / whole - 1), "force": float(-tied.contacts[0].resultant().force[1] / args.load),

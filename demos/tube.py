@@ -1,6 +1,12 @@
 """A thin tube that collapses under pressure from outside until its wall touches itself, against the elastica.
 
 python3 demos/tube.py --plot tube.png
+
+Options:
+    n: cells around the tube, a multiple of 4
+    t: thickness of the wall relative to R
+    out_of_round: relative deviation of the radius
+    load: largest pressure, in EI / R^3
 """
 
 # %% [markdown]

@@ -1,6 +1,10 @@
 """Two blocks of very different stiffness, one pushed onto the other, against the closed form.
 
 python3 demos/two_blocks.py --plot two_blocks.png
+
+Options:
+    n: cells along each side of the coarser block
+    d: displacement of the upper block's top, downwards
 """
 
 # %% [markdown]

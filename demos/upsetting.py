@@ -1,6 +1,11 @@
 """A metal billet is upset between rough tools to half its height, against the slab method.
 
 python3 demos/upsetting.py --plot upsetting.png
+
+Options:
+    n: cells along half of the height; half of the width has three times as many
+    reduction: relative reduction of the billet's height
+    hardening: increase of the yield stress per equivalent plastic strain
 """
 
 # %% [markdown]

@@ -1,6 +1,10 @@
 """Wear by Archard's law: a flat pin and a round one on a floor that is drawn under them, plane strain.
 
 python3 demos/wear_pin.py --plot wear.png
+
+Options:
+    h: size of the round pin's cells in the contact zone
+    steps: steps in which the floor is drawn under the pins
 """
 
 # %% [markdown]

@@ -1,6 +1,12 @@
 """Work and precision: the united elements and other methods of contact, error against time, on problems with known answers.
 
 python3 demos/work_precision.py --plot work_precision.png
+
+Options:
+    sizes: largest number of meshes, or time steps, of each problem
+    runs: timed runs, whose median counts; 0: the first run counts
+    problems: problems to solve, comma-separated
+    methods: methods to compare, comma-separated
 """
 
 # %% [markdown]

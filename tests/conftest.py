@@ -135,15 +135,20 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         # where the foot stays behind, the forces of a pair lie on two lines
         assert balance is None or (balance.force < 1e-11 and (balance.moment < lever(contact) or contact.sliding != "finite"))
         left -= contact.force.x.array.reshape(-1, config.gdim)[:n]
+    if problem.linear is not None:
+        left -= problem.linear.forces(problem.linear.multipliers)
     assert highest(config.comm, np.abs(left * bodies.free[:n])) <= 1e-5 * scale + rounding
 
 
 def lever(contact: uem.Contact) -> float:
     """Bound on the moment that a contact leaves behind: friction of mortar acts where gaps vanish in the mean, not everywhere.
 
-    Friction and corners push at the foot, from which an offset holds contactors off.
+    Friction and corners push at the foot, from which an offset holds contactors off, and shear of a preloaded section acts across its
+    opening.
     """
     pair = contact.pair
+    if isinstance(contact, uem.Preload):
+        return np.inf
     sideways = pair.frictional or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
     if pair.projection.offset is not None and sideways:
         return np.inf

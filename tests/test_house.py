@@ -10,14 +10,15 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import common
 import pytest
 import thresholds
 
 REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
-    ("arrays", "errors", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",), ("contact",),
-    ("materials", "dynamics"), ("restart",), ("solve",), ("output",), ("scripting",),
+    ("arrays", "errors", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
+    ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("output",), ("scripting",),
 ]  # fmt: skip
 LONGEST = 450
 #: Names of modules whose versions differ.
@@ -113,6 +114,44 @@ def test_demos_stand_on_their_own():
     edges = imports(modules(REPOSITORY / "demos" / "benchmarks") | scripts)
     with_rivals = {name for name in scripts if any(to.startswith("benchmarks.rivals") for to in reached(name, edges))}
     assert with_rivals == {"cost", "peers", "stability", "work_precision"}
+
+
+def test_options_of_demos_are_explained():
+    """Each by the docstring of its demo or by a word shared by two demos at least; nothing is explained that is no option."""
+    shared = Counter()
+    for path in set((REPOSITORY / "demos").glob("*.py")) - {Path(common.__file__)}:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        assert not any(ast.unparse(call.func).endswith("add_argument") for call in calls), path
+        (call,) = (call for call in calls if ast.unparse(call.func) == "common.arguments")
+        assert [ast.unparse(argument) for argument in call.args] == ["__doc__"], path
+        options = {keyword.arg for keyword in call.keywords}
+        told = common.explanations(ast.get_docstring(tree))
+        own = {name for name, words in told.items() if words != common.WORDS.get(name)}
+        assert options <= told.keys(), f"{path}: {options - told.keys()} are not explained under Options: in the docstring"
+        assert own <= options and all(told.values()), f"{path}: {own - options} are no options"
+        shared.update(options - own)
+    assert {name for name in common.WORDS if shared[name] < 2} == set()
+
+
+def test_help_shows_meaning_and_default(monkeypatch, capsys):
+    options = {"n": 8, "h": 1 / 60, "plain": 3, "files": "", "kind": ("a", "b"), "quick": False}
+    docstring = "A demo.\n\nOptions:\n    n: cells: 5 % of them\n    files: to read\n"
+    monkeypatch.setattr("sys.argv", ["demo.py", "--help"])
+    with pytest.raises(SystemExit):
+        common.arguments(docstring, **options)
+    text = " ".join(capsys.readouterr().out.split())
+    for told in (
+        "--n N cells: 5 % of them (default: 8)",
+        f"--h H {common.WORDS['h']} (default: 0.0166667)",
+        "--plain PLAIN (default: 3)",
+        "to read (default: none)",
+        "--kind {a,b} (default: a)",
+    ):
+        assert told in text, text
+    monkeypatch.setattr("sys.argv", ["demo.py", "--h", "1/30", "--quick"])
+    found = vars(common.arguments(docstring, **options))
+    assert {name: found[name] for name in options} == options | {"h": 1 / 30, "kind": "a", "quick": True}
 
 
 def test_tests_do_not_import_from_each_other():

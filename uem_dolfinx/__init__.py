@@ -37,16 +37,17 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Balance", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics",
-    "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact",
-    "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass",
-    "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError",
-    "OutputError", "PenetrationError", "PrecisionError", "Resultant", "ResultsWriter", "RigidCylinder", "RigidParaboloid",
-    "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError",
-    "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Voce",
-    "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh",
-    "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh",
-    "read_mesh", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity", "FloatingBodyError", "FrictionError",
+    "GeneralContact", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError",
+    "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
+    "OrientationError", "OutputError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant",
+    "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError",
+    "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError",
+    "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass",
+    "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
+    "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
+    "periodic", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test", "time_steps",
+    "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -116,8 +117,11 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
+    from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
+    from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
@@ -126,14 +130,19 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.frames import outline
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
+    from uem_dolfinx.solve.modes import Vibrations, modes
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
+    "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
+    "Equation": "conditions.equation", "periodic": "conditions.equation",
+    "Preload": "contact.preload",
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
+    "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import blocks, gathered_matrix, linear, scattered
+from helpers import at, blocks, box, clamp, gathered_matrix, linear, modulus, scattered, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.deflation import deflated, pressed_hard
@@ -57,6 +57,28 @@ def test_much_stiffer_contactors_are_found(ratio, found):
     hard = pressed_hard(problem.config, solver.A, problem.bodies.tangent.K, problem.system.restriction())
     assert bool(COMM.allreduce(int(hard.sum()))) == found
     assert (solver.ksp.getPC().getType() == "python") == found
+
+
+def test_several_stiff_bodies():
+    """Two stiff blocks on a soft one have rigid motions of their own, all independent, and answers are those of a factorisation."""
+    cell, sizes, found = "hexahedron", (2, 3), []
+    uppers = [box(cell, [x, 0.0, 0.0], [x + 1.0, 1.0, 1.0], [n] * 3) for x, n in zip((0.0, 1.5), sizes)]
+    s = scene(COMM, cell, [box(cell, [-0.2, -0.2, -1.0], [2.7, 1.2, 0.0], [4, 2, 2]), *uppers])
+    V = uem.function_space(s.mesh, 1, (3,))
+    low, tops = s.tag("low", 0, at(2, 0.0)), [s.tag("top", i, at(2, 1.0)) for i in (1, 2)]
+    bcs = [*clamp(V, s.tag("bottom", 0, at(2, -1.0))), *(bc for top in tops for bc in clamp(V, top, value=[0.0, 0.0, -0.01]))]
+    for options in ({"ksp_type": "cg", "ksp_rtol": 1e-10} | uem.multigrid_options("gamg"), None):
+        u = fem.Function(V)
+        contacts = [uem.Contact(s.tag("high", i, at(2, 0.0)), low, sliding="small", name=f"block {i}") for i in (1, 2)]
+        problem = uem.UnitedProblem(linear(u, modulus(s, 1.0, 1e4, 1e4)), u, bcs=bcs, contacts=contacts, petsc_options=options)
+        problem.solve()
+        found.append([contact.resultant().force[2] for contact in contacts])
+        if options is not None:
+            solver, P = problem.system.solver, problem.system.restriction()
+            W = deflated(problem.config, solver.A, P, pressed_hard(problem.config, solver.A, problem.bodies.tangent.K, P))
+            assert solver.ksp.getPC().getType() == "python"
+            assert np.linalg.matrix_rank(gathered_matrix(W)) == W.getSize()[1]
+    assert found[0] == pytest.approx(found[1], rel=1e-7)
 
 
 def test_deflated_unknowns_are_solved_exactly():

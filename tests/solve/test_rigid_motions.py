@@ -44,6 +44,21 @@ def test_what_counts_as_open(body):
         assert motions.open_motions(motions.rates(equations)).shape[1] == left
 
 
+def test_what_counts_as_held_by_springs():
+    """A spring of 3e-13 of the diagonal of K along x leaves a square open, one of 3e-12 holds it, in all units of force and length."""
+    for size, E in ((1.0, 1.0), (1e-6, 2e11)):
+        s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [size, size], [3, 3])])
+        u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+        free = uem.UnitedProblem(linear(u, E), u)
+        diagonal = COMM.allreduce(free.bodies.initial_stiffness()[:, 0].sum())
+        for part, left in ((0.0, 3), (3e-13, 3), (3e-12, 2)):
+            spring = uem.PointSpring((size, size / 3), (part * diagonal, 0.0))
+            problem = uem.UnitedProblem(linear(u, E), u, points=[spring])
+            motions = RigidMotions(problem.config, problem.bodies.free[: problem.config.n_owned], False)
+            motions.ask_stiffness(problem.bodies.update_tangent())
+            assert motions.open_motions(None).shape[1] == left
+
+
 def test_what_counts_as_loaded(body):
     """Of forces that cancel but for a part: 3e-7 of them drives nothing, 3e-6 moves the body along the rest."""
     motions, config = body

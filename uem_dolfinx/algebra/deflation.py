@@ -156,7 +156,8 @@ def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> 
     size, mixed = np.linalg.eigh(gram)
     independent = size > INDEPENDENT**2 * size[:, -1:]
     column = (np.cumsum(independent) - 1).reshape(independent.shape)
-    modes = np.einsum("ngk,nkl->ngl", modes, mixed / np.sqrt(np.where(independent, size, 1.0))[:, None, :])
+    mixed = mixed / np.sqrt(np.where(independent, size, 1.0))[:, None, :]
+    modes = np.einsum("ngk,nkl->ngl", modes, mixed[number])
     i, c, k = np.nonzero((modes != 0) & independent[number][:, None, :])
     return column[number[i], k], mine[i] * space.block + c, modes[i, c, k]
 

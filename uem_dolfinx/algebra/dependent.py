@@ -76,6 +76,7 @@ class IndependentEquations:
         equations: of this rank's contactors.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, block)``.
         ring: equations that follow each other in rings and depend on each other ``(m,)``; None for none.
+        firm: equations that are never left out for others, and depend on no other firm ones ``(m,)``; None for none.
 
     Attributes:
         equations: the independent ones.
@@ -84,7 +85,9 @@ class IndependentEquations:
         found: whether any equations on any rank conflict.
     """
 
-    def __init__(self, space: Nodes, equations: UnitingEquations, free: Bools, ring: Bools | None = None):
+    def __init__(
+        self, space: Nodes, equations: UnitingEquations, free: Bools, ring: Bools | None = None, firm: Bools | None = None
+    ):
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
         self.undetermined: Bools = self.redundant
         conflicting = equations.active & _cannot_eliminate(equations, free)
@@ -96,7 +99,10 @@ class IndependentEquations:
             return
         self._conflicting = _with_neighbours(space, equations, conflicting)
         self._space, self._rank = space, _ranks_of_groups(space, equations, self._conflicting)
-        self._groups = _solve(space, self._gather(equations), free)
+        together = self._gather(equations)
+        own = np.zeros(len(equations), dtype=bool) if firm is None else firm
+        (first,) = self._gathered.send(own[self._conflicting])
+        self._groups = _solve(space, together, free, first)
         self._scatter(equations)
 
     def rotated(self, equations: UnitingEquations) -> IndependentEquations:
@@ -166,7 +172,7 @@ class IndependentEquations:
         return given
 
 
-def _solve(space: Nodes, rows: UnitingEquations, free: Bools) -> list[Group]:
+def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> list[Group]:
     """Solve conflicting equations group by group, on the rank that has them (collective)."""
     node, place = np.unique(np.concatenate([rows.node, rows.followed]), return_inverse=True)
     movable = space.ask_owners(node, free.astype(float)) > 0
@@ -186,7 +192,7 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools) -> list[Group]:
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
-        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which))
+        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, firm[which]))
     return groups
 
 
@@ -224,14 +230,14 @@ def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Boo
     return rank[label]
 
 
-def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints) -> Group:
+def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, firm: Bools | None = None) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
     Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which
     pivots do not change; it is then left out, and the others go on.
 
     In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
-    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides.
+    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those that are ``firm (m,)`` come first.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
@@ -241,9 +247,12 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints) -> Grou
     A, h, across = A / scale[:, None, None], h / scale, movable / scale[:, None]
     order: list[int] = []
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
-    while (rest := rest & (np.linalg.norm(across, axis=1) > DEPENDENT)).any():
+    first = np.zeros(m, dtype=bool) if firm is None else firm
+    least = np.where(first, MOSTLY_PRESCRIBED, DEPENDENT)
+    while (rest := rest & (np.linalg.norm(across, axis=1) > least)).any():
         size = np.linalg.norm(A * free, axis=2)
-        i, t = np.unravel_index(np.argmax(np.where(rest[:, None], size, -1.0)), size.shape)
+        among = rest & first if (rest & first).any() else rest
+        i, t = np.unravel_index(np.argmax(np.where(among[:, None], size, -1.0)), size.shape)
         q = across[i] / np.linalg.norm(across[i])
         across -= (across @ q)[:, None] * q
         d = A[i, t] * free[t]

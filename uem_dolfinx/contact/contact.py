@@ -291,6 +291,10 @@ class Contact(WatchedContact):
         own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
         return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
+    def words(self) -> dict[str, str]:
+        """How it is tied, for checkpoints, which go on with the same alone."""
+        return {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
+
     def attach(
         self, config: Configuration, free: Bools, *, at: float = 0.0, duration: Callable[[], float] | None = None
     ) -> Interface:

@@ -208,9 +208,13 @@ class Tied(Interface):
     def equations(self) -> Constraints:
         """As of ``Interface``, and after those of contact those of what is tied (collective)."""
         own = super().equations()
-        if self.rows is None:
-            return own
-        return TiedConstraints.join(own, self._equations(), *np.nonzero(self.rows.has))
+        return own if self.rows is None else TiedConstraints.join(own, *self._uniting())
+
+    def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
+        """Equations that unite what is tied, their contactors and components ``(m,)`` (collective)."""
+        assert self.rows is not None
+        i, c = np.nonzero(self.rows.has)
+        return self._equations(), i, c
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
         """As of ``Interface``."""
@@ -226,10 +230,16 @@ class Tied(Interface):
         """As of ``Interface``, with the multipliers of what is tied (collective)."""
         if not isinstance(equations, TiedConstraints):
             return super().forces(equations, multipliers, du)._replace(bond=np.zeros(self._left_out.shape))
-        k, bond = len(equations.contact), np.zeros(self._left_out.shape)
-        bond[equations.contactor[k:], equations.kind[k:]] = multipliers[k:]
+        k = len(equations.contact)
+        bond = self._bond(equations.contactor[k:], equations.kind[k:], multipliers[k:])
         found = super().forces(equations.contact, multipliers[:k], du)
         return found._replace(force=found.force + self._on_contactors(bond), bond=bond)
+
+    def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
+        """Multipliers of all that is tied ``(n, gdim)``, from those of the equations of ``_uniting (m,)`` (collective)."""
+        bond = np.zeros(self._left_out.shape)
+        bond[contactor, kind] = multipliers
+        return bond
 
     def _on_contactors(self, bond: Array) -> Array:
         """Forces on the contactors of multipliers ``bond (n, gdim)``: ``(n, gdim)`` (collective)."""

@@ -1,12 +1,12 @@
-"""What an interface tells of its contactors, for results, checks and checkpoints; one with tied contactors tells of these, too."""
+"""What an interface tells of its contactors, for results, checks and checkpoints; one whose contactors are tied tells of these, too."""
 
 from __future__ import annotations
 
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx.arrays import Array, Bools, Indices
-from uem_dolfinx.contact.kinematics import Kinematics
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import reduced
@@ -20,6 +20,7 @@ class Told:
     trial: PairState
     tied: Bools
     kinematics: Kinematics
+    discretisation: Discretisation
 
     @property
     def united(self) -> Bools:
@@ -47,6 +48,20 @@ class Told:
     def torn(self) -> Array:
         """How far contactors are from where they are tied if their equations were left out ``(n,)``."""
         return np.zeros(len(self.nodes))
+
+    @property
+    def chained(self) -> bool:
+        """Whether contactors may follow each other."""
+        return self.discretisation.chained
+
+    @property
+    def works(self) -> bool:
+        """Whether its forces do work by themselves, as where a rigid target moves."""
+        return self.discretisation.target.motion is not None
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without any (collective)."""
+        return None
 
     @property
     def functions(self) -> dict[str, fem.Function]:

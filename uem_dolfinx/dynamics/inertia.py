@@ -5,7 +5,8 @@ They turn a static residual into a dynamic one: the solver adds these forces to 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -245,6 +246,20 @@ class Dynamics:
     def restore(self) -> None:
         """Leave a step that has begun; the forces are those of the committed state again."""
         self._until, self.moving = self.time, False
+
+    @contextmanager
+    def without_inertia(self) -> Iterator[None]:
+        """For a while, a tangent without mass and damping."""
+        rate = None if self.damping is None else float(self._rate.value)
+        factor, self.factor = self.factor, 0.0
+        if rate is not None:
+            self._rate.value = 0.0
+        try:
+            yield
+        finally:
+            self.factor = factor
+            if rate is not None:
+                self._rate.value = rate
 
     @timed("inertia forces")
     def load(self) -> PETSc.Vec:

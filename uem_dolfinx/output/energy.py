@@ -33,7 +33,8 @@ class Energies:
         dissipated: by plastic flow.
         damped: by the damping form.
         external: work of the external forces, of gravity and of what drives the Dirichlet conditions.
-        contact: work of the contact forces; zero but for friction, rounding, moving rigid targets and the step in which bodies meet.
+        contact: work of the contact forces; zero but for friction, rounding, moving rigid targets, forces of preloads and the step in
+            which bodies meet.
         friction: what friction has taken of that work, so that with still targets it and ``contact`` add up to zero but for rounding.
         defect: what the sum of energies has gained beyond the work of the external and contact forces.
     """
@@ -58,7 +59,8 @@ class EnergyBook(Closing):
     Args:
         problem: with ``dynamics``.
         stored: energy of the bodies' strain as a UFL form; that of materials with history is added.
-        external: virtual work of the external forces as a UFL form, linear in a test function: what F has it with a minus.
+        external: virtual work of the external forces as a UFL form, linear in a test function: what F has it with a minus. Loads and
+            springs at nodes, and linear equations, are known.
         path: name of the CSV file; None writes none.
         resume: keep what a file that is there says about the time up to now, and go on after it.
 
@@ -129,8 +131,11 @@ class EnergyBook(Closing):
         problem.bodies.assemble()
         # the work of supports on mass, where velocities jump, is what the mass has got
         driving = problem.bodies.residual.array_r - self.dynamics.forces.x.array[:n]
-        reaction = (driving - contact) * ~problem.bodies.free[: problem.config.n_owned].ravel()
-        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
+        linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
+        reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
+        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external) + linear
+        if problem.bodies.points is not None:
+            outer += problem.bodies.points.loads().ravel()
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])
         self._resultants = np.array([c.resultant().force for c in problem.contacts]).reshape(-1, problem.config.gdim)
@@ -144,6 +149,7 @@ class EnergyBook(Closing):
         """Energies kinetic, stored and dissipated (collective)."""
         stored = forms.assemble_scalar(self._stored, self.problem.comm) if self._stored is not None else 0.0
         stored += sum(material.energy() for material in self.problem.materials)
+        stored += 0.0 if (points := self.problem.bodies.points) is None else points.energy()
         dissipated = float(sum(material.dissipation() for material in self.problem.materials))
         return self.dynamics.kinetic_energy(), stored, dissipated
 

@@ -109,10 +109,10 @@ class ArcLength:
     def _differentiate(self) -> None:
         """Derivative of the residual with respect to the load factor (collective)."""
         bodies, factor = self._bodies, self.factor
-        before = bodies.residual
+        before = self._system.residual()
         self._problem.set_load(factor + DIFFERENCE)
         bodies.assemble()
-        self._slope = bodies.residual
+        self._slope = self._system.residual()
         self._slope.axpy(-1.0, before)
         self._slope.scale(1.0 / DIFFERENCE)
         self._problem.set_load(factor)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -22,6 +22,9 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.solve.tangent import Inversions, Tangent
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import AtPoints
 
 #: Multiple of the rounding of K u that the residual may be left with.
 #: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]
@@ -43,6 +46,7 @@ class Bodies:
         bcs: Dirichlet conditions.
         materials: with history, whose stresses are brought up to date before the residual is assembled.
         dynamics: inertia, or None in statics.
+        points: loads and springs at nodes, or None.
         check_inversion: whether to look for cells turned inside out; None does so unless K is constant.
 
     Attributes:
@@ -51,6 +55,7 @@ class Bodies:
         free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
         wanted: values that the Dirichlet conditions ask for, at their unknowns, ghosts included ``(n,)``.
         tangent: K.
+        points: loads and springs at nodes, or None.
         stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, by which forces are told from rounding; None until known.
     """
 
@@ -62,14 +67,15 @@ class Bodies:
         *,
         materials: Sequence[HistoryMaterial] = (),
         dynamics: Dynamics | None = None,
+        points: AtPoints | None = None,
         check_inversion: bool | None = None,
     ):
         self.config, self.comm, self.u, self.bcs = config, config.comm, config.whole, list(bcs)
         self.unknowns = config.unknowns
-        self.materials, self.dynamics = list(materials), dynamics
+        self.materials, self.dynamics, self.points = list(materials), dynamics, points
         #: The residual in UFL.
         self.F = F
-        self.tangent = Tangent(F, config, self.materials, dynamics)
+        self.tangent = Tangent(F, config, self.materials, dynamics, points)
         with compiling("the residual"):
             self._F = forms.form(F)
         self._b = compat.create_vector(self.u.function_space)
@@ -112,6 +118,8 @@ class Bodies:
             self.dynamics.update_rates()
         with timed("assemble residual"):
             forms.assemble_vector(self._b, self._F)
+            if self.points is not None:
+                self.points.add_forces(self._b.array)
             if self.dynamics is not None:
                 self._b.array[:] += self.dynamics.load().array_r
         return bool(np.isfinite(self._b.norm()))

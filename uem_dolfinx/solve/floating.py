@@ -8,7 +8,7 @@ statically determinate way, where the reaction is zero.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -22,6 +22,9 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.united_rows import UnitedRows
 
 #: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]
@@ -44,32 +47,41 @@ class FloatingBodies:
 
     Args:
         bodies: without contact.
-        pairs: of all contacts; without any, nothing is done about bodies that float.
+        pairs: of all contacts.
+        linear: equations of users, None for none; without contacts and these nothing is done about bodies that float.
 
     Attributes:
         rigid: rigid motions of the bodies; None without contacts.
         motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
-    def __init__(self, bodies: Bodies, pairs: Sequence[Interface]):
-        self._bodies, self._pairs = bodies, pairs
+    def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UnitedRows | None = None):
+        self._bodies, self._pairs, self._linear = bodies, pairs, linear
         config, dynamics = bodies.config, bodies.dynamics
         self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
-        if pairs:
+        if pairs or linear is not None:
             free, finite = bodies.free[: config.n_owned], not bodies.tangent.linear
             self.rigid = RigidMotions(config, free, finite)
-            self._at_rest = self.rigid if self.rigid.any_open() else None
+            self._at_rest = self._floating(self.rigid)
             if dynamics is not None:
                 # in a step in time, inertia holds what has mass
                 moving = RigidMotions(config, free & ~dynamics.massy, finite)
-                self._in_motion = moving if moving.any_open() else None
+                self._in_motion = self._floating(moving)
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
         #: Likewise with those that friction alone resists, where all contactors slip.
         self._sliding: Array = np.zeros((0, 0))
+
+    def _floating(self, motions: RigidMotions) -> RigidMotions | None:
+        """The motions, if neither conditions nor springs in the form hold all bodies; else None (collective)."""
+        if not motions.any_open():
+            return None
+        self._bodies.initial_stiffness()
+        motions.ask_stiffness(self._bodies.tangent.K)
+        return motions if motions.any_open() else None
 
     def begin_step(self, place: Callable[[], None]) -> None:
         """Let bodies fall until they touch; ``place`` projects all contactors (collective).
@@ -129,7 +141,7 @@ class FloatingBodies:
         """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
         if self.motions is None:
             return False
-        force = self.motions.load(self._open, self._bodies.forces)
+        force = self.motions.load(self._open, self._forces())
         return bool(force.any())
 
     def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
@@ -153,6 +165,13 @@ class FloatingBodies:
         if self.motions is None:
             return du
         return du - self.motions.part(self._sliding, du.reshape(-1, self._bodies.config.gdim)).ravel()
+
+    def _forces(self) -> Array:
+        """Forces of the bodies, less the loads of contacts, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        F = self._bodies.forces
+        for nodes, loads in filter(None, (pair.applied_forces() for pair in self._pairs)):
+            F = F - self._bodies.config.add_at_owners(nodes, loads)
+        return F
 
     def _rates(self, equations: UnitingEquations) -> Any:
         """Rates of the equations that hold, see ``RigidMotions`` (collective)."""
@@ -207,13 +226,14 @@ class FloatingBodies:
         ahead = [pair.approach for pair in self._pairs]
         equations = [pair.equations() for pair in self._pairs]
         united = [e.resisting.select(e.resisting.active) for e in equations]
-        rows = UnitingEquations.join(ahead + united, config.gdim)
+        more = [] if self._linear is None else [self._linear.at_present()]
+        rows = UnitingEquations.join(ahead + united + more, config.gdim)
         kinds = [np.full(len(e), AHEAD) for e in ahead]
         for pair, e in zip(self._pairs, equations):
             kinds.append(np.where(e.tied | pair.frictional, HELD, UNITED)[e.resisting.active])
-        kind = np.concatenate(kinds)
-        R, force, scale = motions.rates(rows), *motions.forces(self._bodies.forces)
-        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._bodies.forces).any()
+        kind = np.concatenate([*kinds, *(np.full(len(e), HELD) for e in more)])
+        R, force, scale = motions.rates(rows), *motions.forces(self._forces())
+        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._forces()).any()
         if not (loose or freely):
             return None, False
         # friction holds what sticks in all directions; contactors without it may part again

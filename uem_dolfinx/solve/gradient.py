@@ -130,6 +130,8 @@ def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.tied for contact in problem.contacts):
             raise InputError("gradients do not know how a tie changes with what it ties: expected contacts that are not tied")
+        if problem.linear is not None or problem.bodies.points is not None:
+            raise InputError("gradients do not know equations, forces and springs of nodes: expected a problem without them")
         if not problem.progress.steps:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         if what == "controls":

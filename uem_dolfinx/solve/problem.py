@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import ufl
@@ -43,6 +43,11 @@ from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
 
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
+    from uem_dolfinx.conditions.equation import Equation, Periodic
+    from uem_dolfinx.conditions.united_rows import UnitedRows
+
 ACCURACY = given.between(0.0, 1.0)
 
 
@@ -61,6 +66,8 @@ class UnitedProblem:
             other parts are solved for as well, and contact leaves them alone.
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
+        equations: linear equations between displacements of nodes: of ``Equation`` and ``periodic``.
+        points: forces and springs at nodes, as ``PointLoad`` and ``PointSpring``, which are no terms of F.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
             iterative solve is as accurate as its Newton iteration can use.
@@ -99,6 +106,8 @@ class UnitedProblem:
         displacement: int | None = None,
         bcs: Sequence[fem.DirichletBC] = (),
         contacts: Sequence[Contact | GeneralContact] = (),
+        equations: Sequence[Equation | Periodic] = (),
+        points: Sequence[PointLoad | PointSpring] = (),
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
         load: fem.Constant | Mapping[fem.Constant, Any] | Callable[[float], None] | None = None,
@@ -124,6 +133,12 @@ class UnitedProblem:
                 "contacts", contacts, lambda one: isinstance(one, Contact | GeneralContact), "a Contact or a GeneralContact"
             )
             check_new(contacts)
+            equations = given.items(
+                "equations", equations, lambda one: hasattr(one, "n_values"), "an Equation, or what periodic returns"
+            )
+            points = given.items(
+                "points", points, lambda one: hasattr(one, "force_and_stiffness"), "a PointLoad or a PointSpring"
+            )
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -140,6 +155,7 @@ class UnitedProblem:
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
+            equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
             newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
@@ -149,7 +165,11 @@ class UnitedProblem:
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")
-        F = revolved(F)
+        F, at_points = revolved(F), None
+        if points:
+            from uem_dolfinx.conditions.at_points import AtPoints
+
+            at_points = AtPoints(self.config, points)
         #: What the bodies do without contact.
         self.bodies = Bodies(
             self.config,
@@ -157,6 +177,7 @@ class UnitedProblem:
             bcs,
             materials=self.materials,
             dynamics=dynamics,
+            points=at_points,
             check_inversion=check_inversion,
         )
         self.solver = UnitedSolver(self.config.unknowns, petsc_options_prefix, petsc_options)
@@ -169,7 +190,15 @@ class UnitedProblem:
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
-        self.system = method(self.bodies, pairs, self.solver, newton=newton, consistent_tangent=consistent_tangent)
+        options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
+        #: Linear equations of users; None without any.
+        self.linear: UnitedRows | None = None
+        if equations:
+            from uem_dolfinx.conditions.united_rows import unite
+
+            nodes = [pair.nodes for pair in pairs]
+            self.linear = options["linear"] = unite(self.config, equations, free, nodes, self.load, clock.get("at", 0.0))
+        self.system = method(self.bodies, pairs, self.solver, **options)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
         #: How far the problem is, in steps and in load.
@@ -177,7 +206,7 @@ class UnitedProblem:
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         #: Where the rigid targets were then; None for those that had not moved, and for meshes.
-        self.motions = self._rigid_motions()
+        self.motions = self.rigid_motions()
         #: Norm of the largest forces of all steps, as far as they are told from rounding.
         self.largest_forces: Norm = 0.0
         #: What the last step began with, where its ramp began, how far it went, and whether something led its load.
@@ -189,7 +218,10 @@ class UnitedProblem:
             contact.begin()
         from uem_dolfinx.solve.settings import Settings
 
-        self._settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics)
+        #: What the run is made with, for checkpoints.
+        beside = {"equations": equations, "points": points}
+        names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
+        self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
 
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""
@@ -213,6 +245,8 @@ class UnitedProblem:
             ask_together(self.comm, f"load({at:.6g})", self.load, at)
         for contact in self.contacts:
             contact.take_load(at)
+        if self.linear is not None:
+            self.linear.take_load(at)
 
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
@@ -237,7 +271,7 @@ class UnitedProblem:
         from uem_dolfinx.solve.memory import Memory, move_targets
 
         led = start, fraction, arc = self._led
-        dynamics, now, moved, found = self.dynamics, Memory.of(self), self._rigid_motions(), np.array(self.u.x.array)
+        dynamics, now, moved, found = self.dynamics, Memory.of(self), self.rigid_motions(), np.array(self.u.x.array)
         self._before.put_back(self)
         move_targets(self, moved)
         if arc:
@@ -289,6 +323,8 @@ class UnitedProblem:
         self.bodies.wanted[:] = start + fraction * (wanted - start) if fraction < 1.0 else wanted
         try:
             self.bodies.begin_step()
+            if self.linear is not None:
+                self.linear.begin_step(self.config.of(start)[: self.config.n_owned], fraction)
             self.system.begin_step()
             history = solve_united(
                 self.bodies,
@@ -336,7 +372,7 @@ class UnitedProblem:
         for pair in self.pairs:
             pair.commit()
             pair.project()
-        self.motions = self._rigid_motions()
+        self.motions = self.rigid_motions()
         for contact, state in zip(self.contacts, before):
             contact.look_at_ends()
             contact.look_at_corners(self.bodies.stiffness)
@@ -359,54 +395,9 @@ class UnitedProblem:
         Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
         added must differ from those here.
         """
-        stiffness, own, config = fem.Function(self.config.V), self.config.functions(), self.config
-        starts = {name: fem.Function(f.function_space) for name, f in own.items()}
-        functions = own | {"stiffness": stiffness}
-        for i, pair in enumerate(self.pairs, 1):
-            functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
-        ramped = self.dynamics is None
-        if self.dynamics is None:
-            functions |= {"load start" + name.removeprefix("displacement"): f for name, f in starts.items()}
-        else:
-            d = self.dynamics
-            functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
-            functions["mean velocity"] = d.mean_velocity
-        for i, material in enumerate(self.materials, 1):
-            functions |= {f"{name} {i}": f for name, f in material.history.items()}
-        state = State(self.config.mesh, functions, self.contacts, settings=self._settings.describe(self.comm))
+        from uem_dolfinx.solve.kept import state_of
 
-        def collect() -> None:
-            config.functions()
-            known = self.bodies.to_checkpoint(stiffness)
-            # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
-            self.system.forget()
-            state.numbers |= {"largest forces": np.asarray(self.largest_forces).tolist(), "stiffness known": known}
-            state.numbers |= self.progress.to_checkpoint(ramped)
-            if ramped and self.progress.ramp:
-                config.fill(starts, self.progress.start)
-            if self.dynamics is not None:
-                state.numbers |= self.dynamics.to_checkpoint() | self.step_control.to_checkpoint()
-
-        def restore() -> None:
-            if config.unknowns.mixed:
-                self.u.x.array[:] = config.values_of(own)
-                for pair in self.pairs:
-                    # they have been projected where the bodies were before
-                    pair.remember(pair.memory())
-                    pair.project()
-            self.committed, self.motions = np.array(self.u.x.array), self._rigid_motions()
-            self.largest_forces = np.asarray(state.numbers["largest forces"])[()]
-            self.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
-            self.progress.from_checkpoint(state.numbers, config.values_of(starts) if ramped else None)
-            if self.dynamics is not None:
-                self.dynamics.from_checkpoint(state.numbers)
-                self.step_control.from_checkpoint(state.numbers)
-            for contact in self.contacts:
-                contact.take_load(self.progress.factor if self.dynamics is None else self.dynamics.time, known=True)
-
-        state.collect.append(collect)
-        state.restore.append(restore)
-        return state
+        return state_of(self)
 
     def reaction(self, tag: Part) -> np.ndarray:
         """Force with which the Dirichlet conditions act on the nodes of a part of the mesh: their sum ``(gdim,)`` (collective).
@@ -421,6 +412,8 @@ class UnitedProblem:
         force = self.bodies.forces[nodes]
         for contact in self.contacts:
             force = force - contact.force.x.array.reshape(-1, self.config.gdim)[nodes]
+        if self.linear is not None:
+            force = force - self.linear.forces(self.linear.multipliers)[nodes]
         sums = self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0))
         return self.config.of_circles(np.sum(sums, axis=0))
 
@@ -429,7 +422,7 @@ class UnitedProblem:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
 
-    def _rigid_motions(self) -> list[Motion | None]:
+    def rigid_motions(self) -> list[Motion | None]:
         """Where the rigid targets are now; None for those that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.pairs]
 

@@ -12,6 +12,7 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
+from petsc4py import PETSc
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
@@ -30,6 +31,9 @@ SAME_PLACE = 1e-9
 #: A motion is loaded if the forces along it exceed this part of all forces; supports may be left with less.
 #: [convention; sum of all forces; test_rigid_motions.py::test_what_counts_as_loaded]
 LOADED = 1e-6
+#: Springs hold a body along a motion if they resist it with more than this part of the diagonal of K; the rest is rounding.
+#: [convention; work of the diagonal of K; test_rigid_motions.py::test_what_counts_as_held_by_springs]
+SPRINGY = 1e-12
 
 
 class RigidMotions:
@@ -59,6 +63,8 @@ class RigidMotions:
         #: Modes that are no motions of rigid bodies: of axisymmetric ones all but the shift along the axis.
         self._strained = [0, 2] if config.axisymmetric else []
         self._supports: tuple[Array, Bools] | None = None
+        #: Motions that forces of the form resist, as those of springs, body by body; None where none was asked for.
+        self._springs: Array | None = None
         #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; where bodies turn little always the same.
         self._unheld: Any | None = None
         self.share = 0.0
@@ -131,6 +137,8 @@ class RigidMotions:
             resisted = reduced(self.comm, self._products(body, modes, modes))
             # the bodies resist them themselves
             resisted[:, self._strained, self._strained] = 1.0
+            if self._springs is not None:
+                resisted += self._springs
             values, vectors = np.linalg.eigh(resisted)
             b, k = np.nonzero(values < OPEN**2)
             self._unheld = self._spread(vectors[b, :, k], b).T.tocsr()
@@ -145,6 +153,35 @@ class RigidMotions:
             return vectors, values < OPEN**2
 
         return (free @ by_block(resisted, least)).tocsc()
+
+    def ask_stiffness(self, K: PETSc.Mat) -> None:
+        """Take motions that K resists, as springs in a form do, as held (collective).
+
+        With the modes R of a body and the work D of each on the diagonal of K, these are the eigenvectors of ``D^-1/2 R'KR D^-1/2`` whose
+        eigenvalues are no rounding.
+
+        Args:
+            K: tangent of the bodies; one that is not finite tells nothing.
+        """
+        config, unknowns, own = self.config, self.config.unknowns, self._body[: self.config.n_owned]
+        modes, size = self._modes(self._places, own), config.n_owned * config.gdim
+        sides = []
+        for k in range(self.n_modes):
+            v = unknowns.vector()
+            v.array[:size] = modes[:, k].ravel()
+            sides.append((K * v).array_r[:size].reshape(-1, config.gdim))
+        work = np.einsum("nmg,kng->nmk", modes, np.array(sides))
+        diagonal = np.abs(K.getDiagonal().array_r[:size].reshape(-1, config.gdim))
+        parts = np.concatenate([work, np.einsum("nmg,ng->nm", modes**2, diagonal)[:, :, None]], axis=2)
+        sums = reduced(self.comm, sums_of_rows(own, parts.reshape(len(own), -1), self.count))
+        if not np.isfinite(sums).all():
+            return
+        G, D = np.split(sums.reshape(self.count, self.n_modes, -1), [self.n_modes], axis=2)
+        S = np.sqrt(D / D.max(axis=1, keepdims=True))
+        scale = np.where(D > 0, 1.0 / np.sqrt(np.where(D > 0, D, 1.0)), 0.0)
+        values, vectors = np.linalg.eigh(0.5 * (G + G.transpose(0, 2, 1)) * scale * scale.transpose(0, 2, 1))
+        held = S * np.where(values > SPRINGY, 1.0, 0.0)[:, None, :] * vectors
+        self._springs, self._unheld = held @ held.transpose(0, 2, 1), None
 
     def any_open(self) -> bool:
         """Whether the conditions leave any motion open (collective)."""

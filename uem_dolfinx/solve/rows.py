@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -15,17 +15,17 @@ from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Constraints, Traction
 from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
-from uem_dolfinx.parallel import agree
-from uem_dolfinx.solve.bodies import FORCE_ROUNDING
+from uem_dolfinx.parallel import agree, reduced
 from uem_dolfinx.solve.newton import IterationState
 
 if TYPE_CHECKING:
+    from uem_dolfinx.conditions.united_rows import UnitedRows
     from uem_dolfinx.contact.heat import HeatEquations
 
 
@@ -35,6 +35,7 @@ class OverConstraints:
     Args:
         config: configuration of the displacement.
         pairs: of all contacts; they are told whether their surfaces are contactor and target of each other.
+        linear: equations of users; None for none.
 
     Attributes:
         shared: whether a node is a contactor of several pairs.
@@ -43,7 +44,7 @@ class OverConstraints:
         contestable: whether equations can conflict that follow each other in no ring.
     """
 
-    def __init__(self, config: Configuration, pairs: Sequence[Interface]):
+    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UnitedRows | None = None):
         self._unknowns = config.unknowns
         follows = [followed_nodes(config, pair.discretisation.followed) for pair in pairs]
         meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
@@ -64,11 +65,26 @@ class OverConstraints:
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
-        self.stacked = bool(meets.any()) or any(pair.discretisation.chained for pair in pairs)
+        self.stacked = bool(meets.any()) or any(pair.chained for pair in pairs)
         self.contestable = self.shared or any(pair.discretisation.prescribed for pair in pairs)
         if any(_unites_heat(pair) for pair in pairs):
             # temperatures of both sides stand in the same rows, and may be prescribed
             self.stacked = self.contestable = True
+        self._n_linear = 0
+        if linear is not None:
+            self._meet(config, linear.equations, contactors, follows)
+
+    def _meet(self, config: Configuration, linear: UnitingEquations, contactors: Indices, follows: Sequence[Bools]) -> None:
+        """Take in how equations of users meet each other and those of contacts (collective)."""
+        self._n_linear = len(linear)
+        eliminated = np.zeros(config.n_local, dtype=bool)
+        eliminated[linear.node] = True
+        at_contactors = bool(eliminated[contactors].any())
+        followed = any(bool(f[linear.node].any()) for f in follows)
+        eliminated[contactors] = True
+        followed |= bool((config.ask_owners(linear.followed, eliminated[: config.n_owned, None].astype(float)) > 0).any())
+        at_contactors, followed = reduced(config.comm, np.array([at_contactors, followed])) > 0
+        self.stacked, self.contestable = self.stacked or bool(followed), self.contestable or bool(at_contactors)
 
     def restrict(
         self, equations: UnitingEquations, free: Bools, prescribed: Array
@@ -76,18 +92,19 @@ class OverConstraints:
         """P or Q of equations, and how conflicts among them were resolved (collective).
 
         Args:
-            equations: of all pairs together.
+            equations: of all pairs together, and after them those of users.
             free: components that are not held ``(n_rows, gdim)``.
             prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
         """
-        independent = IndependentEquations(self._unknowns, equations, free) if self.contestable else None
+        firm = np.arange(len(equations)) >= len(equations) - self._n_linear
+        independent = IndependentEquations(self._unknowns, equations, free, firm=firm) if self.contestable else None
         own = equations if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         try:
             return Restriction(self._unknowns, own, free, prescribed, stacked), independent
         except DependentRingError as error:
             ring = error.rows if independent is None else independent.of_given(error.rows)
-        independent = IndependentEquations(self._unknowns, equations, free, ring)
+        independent = IndependentEquations(self._unknowns, equations, free, ring, firm)
         return Restriction(self._unknowns, independent.equations, free, prescribed), independent
 
 
@@ -96,12 +113,12 @@ class Rows:
     """Uniting equations of all pairs in one state, and what was made of them.
 
     Attributes:
-        equations: of every pair.
+        equations: of every pair; those of users come after them in P and Q.
         trial: all that P is made of; None where it is ``frictionless``.
         independent: how conflicts were resolved; None if there could be none.
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
-        heat: equations of temperatures by number of their pair, which come after those of ``equations``.
+        heat: equations of temperatures by number of their pair, which come after those of ``equations``, before those of users.
     """
 
     equations: list[Constraints]
@@ -126,6 +143,7 @@ def make_rows(
     pairs: Sequence[Interface],
     hold: Callable[[UnitingEquations, UnitingEquations], Bools],
     prescribed: Array,
+    linear: UnitedRows | None = None,
 ) -> Rows:
     """Equations of all pairs in their present states, and Q (collective).
 
@@ -134,6 +152,7 @@ def make_rows(
         pairs: of all contacts.
         hold: free components ``(n_rows, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
         prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
+        linear: equations of users; None for none.
 
     Raises:
         FrictionError: if contactors wedge where several equations meet.
@@ -143,14 +162,17 @@ def make_rows(
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
     heat = {i: pair.heat.equations() for i, pair in enumerate(pairs) if pair.heat is not None and _unites_heat(pair)}
-    more = [e.rows for e in heat.values()]
+    users = [] if linear is None else [linear.at_present()]
+    more = [*(e.rows for e in heat.values()), *users]
     frictionless = trial = UnitingEquations.join([*(e.frictionless for e in equations), *more], g)
     if any(e.trial is not e.frictionless for e in equations):
         trial = UnitingEquations.join([*(e.trial for e in equations), *more], g)
     resisting = stopping = trial
     if heat or any(e.resisting is not e.trial for e in equations):
-        resisting = UnitingEquations.join([e.resisting for e in equations], g)
-        stopping = UnitingEquations.join([e.stopping for e in equations], g)
+        resisting, stopping = (
+            UnitingEquations.join([*parts, *users], g)
+            for parts in ([e.resisting for e in equations], [e.stopping for e in equations])
+        )
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
     Q, independent = over_constraints.restrict(frictionless, free, prescribed)
@@ -169,23 +191,31 @@ def _unites_heat(pair: Interface) -> bool:
     return pair.heat is not None and pair.heat.law.perfect
 
 
-def rounding_of_heat(pairs: Sequence[Interface], unknowns: Any) -> Any:
-    """Norms of the residual that rounding of temperatures and slips can make of heat, one for each field; 0 without any (collective)."""
-    heats = [pair.heat for pair in pairs if pair.heat is not None]
-    return FORCE_ROUNDING * sum(unknowns.norms_of(heat.sizes()) for heat in heats) if heats else 0.0
+def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array | None) -> tuple[list[Traction], Array]:
+    """Contact forces of every pair, with the heat that goes through it, and multipliers of users' equations ``(m,)`` (collective).
 
-
-def with_heat(
-    pairs: Sequence[Interface], rows: Rows, forces: list[Traction], multipliers: Array, redundant: Bools
-) -> list[Traction]:
-    """Contact forces of every pair with the heat that goes through it, from the multipliers of the last equations of ``rows``."""
-    start = 0
+    Args:
+        pairs: of all contacts; they are told which of their equations are redundant.
+        rows: their equations.
+        y: forces that were passed on by Q.
+        du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
+    """
+    lam = rows.test.multipliers(y)
+    redundant = np.zeros(len(lam), dtype=bool)
+    if rows.independent is not None:
+        lam, redundant = rows.independent.forces(lam), rows.independent.redundant
+    found, start = [], 0
+    for pair, own in zip(pairs, rows.equations):
+        part = slice(start, start + len(own))
+        pair.set_redundant(own, redundant[part])
+        found.append(pair.forces(own, lam[part], du))
+        start = part.stop
     for i, equations in rows.heat.items():
         heat, part = pairs[i].heat, slice(start, start + len(equations.which))
         assert heat is not None
-        forces[i] = forces[i]._replace(heat=heat.read(equations, multipliers[part], redundant[part]))
+        found[i] = found[i]._replace(heat=heat.read(equations, lam[part], redundant[part]))
         start = part.stop
-    return forces
+    return found, lam[start:]
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
@@ -212,14 +242,24 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
     return rotated
 
 
-def unbalanced(pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction]) -> tuple[Array, Array]:
+def unbalanced(
+    pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction], more: Array | None = None
+) -> tuple[Array, Array]:
     """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
 
-    ``forces`` are those of every pair.
+    ``forces`` are those of every pair, ``more (n_owned, gdim)`` those of equations of users, None without any.
     """
     config = pairs[0].config
     every = F.array_r.reshape(-1, config.gdim)[: config.n_owned].copy()
-    left = every.copy()
+    left = every.copy() if more is None else every - more
     for pair, found in zip(pairs, forces):
         left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(found)))
     return left, every
+
+
+def several_answers() -> FrictionError:
+    """The refusal of an equilibrium between which and that without friction the united matrix was singular."""
+    return FrictionError(
+        "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP has another sign than "
+        "without friction; take less friction, or stiffer bodies"
+    )

@@ -7,7 +7,7 @@ no partition changes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import blake2b
 from typing import Any
 
@@ -40,6 +40,7 @@ class Settings:
         contacts: of the problem.
         materials: likewise.
         dynamics: likewise, or None.
+        beside: words for what else there is, by name.
     """
 
     def __init__(
@@ -49,10 +50,11 @@ class Settings:
         contacts: Sequence[Contact],
         materials: Sequence[Any],
         dynamics: Dynamics | None,
+        beside: Mapping[str, str],
     ):
         self._contacts, self._dynamics = contacts, dynamics
         #: Words that are the same on all ranks, and values whose extent over all ranks counts, by name.
-        self._words: dict[str, str] = {}
+        self._words: dict[str, str] = dict(beside)
         self._values: dict[str, Array] = {}
         history = [f for material in materials for f in vars(material).values() if isinstance(f, fem.Function)]
         for name, form in forms.items():
@@ -78,8 +80,7 @@ class Settings:
             name = f"contact {i} '{contact.name}'"
             for what in ("coupling", "sliding", "normals", "thickness", "chords"):
                 words[f"{name}, {what}"] = str(getattr(contact, what))
-            if contact.tied or contact.adjust:
-                words[f"{name}, tied and adjust"] = f"{contact.tied}, {contact.adjust}"
+            words |= {f"{name}, {what}": value for what, value in contact.words().items()}
             for k, value in enumerate(parameters(as_law(contact.friction))[1:], 2):
                 words[f"{name}, parameter {k} of friction"] = described(value)
             if follows_load(as_law(contact.friction)):

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -24,14 +25,17 @@ from uem_dolfinx.contact.kinematics import Traction
 from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
-from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.exchanges import Exchanges, count
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
-from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, rounding_of_heat, unbalanced, with_heat
+from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, read_forces, several_answers, unbalanced
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.united_rows import UnitedRows
 
 #: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_predicts]
@@ -50,6 +54,7 @@ class BodySystem:
         solver: of the united system.
         newton: ``"full"`` or ``"modified"``.
         consistent_tangent: whether the curvature of the contact is added to K.
+        linear: equations of users; None for none.
     """
 
     def __init__(
@@ -60,8 +65,9 @@ class BodySystem:
         *,
         newton: str = "full",
         consistent_tangent: bool = True,
+        linear: UnitedRows | None = None,
     ):
-        self.bodies, self.pairs, self.solver = bodies, list(pairs), solver
+        self.bodies, self.pairs, self.solver, self.linear = bodies, list(pairs), solver, linear
         self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
         self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
         self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
@@ -79,11 +85,12 @@ class BodySystem:
         self._adrift = False
         #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
         self._swept = False
+        self._multipliers: Array = np.zeros(0)  # of the equations of users, as read last ``(m,)``
         #: Equations where the contactors were placed last, with the directions of slip there; None before they were asked for.
         self._here: Rows | None = None
         #: How equations of several contacts can meet.
-        self.over_constraints = OverConstraints(self.config, self.pairs)
-        self.floating = FloatingBodies(bodies, self.pairs)
+        self.over_constraints = OverConstraints(self.config, self.pairs, linear)
+        self.floating = FloatingBodies(bodies, self.pairs, linear)
         self.place()
         for pair in self.pairs:
             check_initial(pair)
@@ -132,32 +139,28 @@ class BodySystem:
             if pair.sliding == "small":
                 pair.project()
         self.floating.begin_step(self.place)
-        if self.bodies.dynamics is None and self.floating.motions is None:
+        if self.pairs and self.bodies.dynamics is None and self.floating.motions is None:
             touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
         for pair in self.pairs:
             check_prescribed(pair)
+        if self.linear is not None:
+            self.linear.check()
         self.floating.end_step()
         if self._not_unique is not None:
-            self._refuse_one_of_several(*self._not_unique)
-
-    def _refuse_one_of_several(self, state: BodyState, negative: bool) -> None:
-        """Refuse an equilibrium between which and that without friction the united matrix was singular (collective)."""
-        added = together(self._curvature, state.added)
-        if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
-            raise FrictionError(
-                "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP has another sign than "
-                "without friction; take less friction, or stiffer bodies"
-            )
+            state, negative = self._not_unique
+            added = together(self._curvature, state.added)
+            if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
+                raise several_answers()
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def _residual(self) -> PETSc.Vec:
-        """Forces of the bodies less those of friction that are known, which do not grow with the force along the normal (collective)."""
+    def residual(self) -> PETSc.Vec:
+        """Forces of the bodies less loads of contacts, and friction that does not grow with the force along the normal (collective)."""
         F = self.bodies.residual
-        for nodes, forces in filter(None, (pair.known_forces() for pair in self.pairs)):
+        for nodes, forces in filter(None, (known() for pair in self.pairs for known in (pair.known_forces, pair.applied_forces))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         for heat in self._heats:
             F.array[:] += heat.residual()
@@ -176,7 +179,7 @@ class BodySystem:
         if bodies.stiffness is None and pairs:
             # what tells tension from rounding
             bodies.update_tangent()
-        F, rounding = self._residual(), self.rounding()
+        F, rounding = self.residual(), self.rounding()
         with timed("uniting equations"):
             rows, self._here = self._rows_here(), None
             y = rows.test.pass_on(F)
@@ -185,7 +188,7 @@ class BodySystem:
             if at_rest:
                 self._take(self._read_forces(rows, y))
                 if any(heat.lags for heat in self._heats):
-                    residual = rows.test.transpose(F := self._residual())
+                    residual = rows.test.transpose(F := self.residual())
                     at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
@@ -208,7 +211,7 @@ class BodySystem:
             fallen = self.floating.fall_again(self.place, unsettled, at_rest)
             if moved or fallen:
                 rows = self._rows()
-                residual = rows.test.transpose(self._residual())
+                residual = rows.test.transpose(self.residual())
         trial, added, held, active, gap = self._trial_of(rows)
         torn = max([heat.torn() for heat in self._heats], default=0.0)
         return BodyState(
@@ -241,7 +244,7 @@ class BodySystem:
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         hold = partial(self.floating.hold, self.bodies.free_rows)
-        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed)
+        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed, self.linear)
 
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
@@ -252,9 +255,10 @@ class BodySystem:
         trial = rows.frictionless
         if apart is not None:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
-        largest = max((pair.largest_gap_here() for pair in self.pairs), default=0.0)
+        gaps = [pair.largest_gap_here() for pair in self.pairs]
+        gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
         united = sum(int(pair.united.sum()) for pair in self.pairs)
-        told = gathered(self.comm, np.array([united, largest])) if self.pairs else np.zeros((1, 2))
+        told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
         return trial, *slip_terms(self.pairs, self.unknowns.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
@@ -311,7 +315,7 @@ class BodySystem:
         for more in (self._curvature, state.added):
             if more is not None:
                 F.axpy(1.0, forms.product(more, du))
-        F.axpy(1.0, self._residual())
+        F.axpy(1.0, self.residual())
         if state.held is not None:
             F.axpy(1.0, state.held)
         return F
@@ -321,8 +325,9 @@ class BodySystem:
         if self.floating.motions is None or not self.frictional:
             return None
         # known forces are among those of the contact
-        every = F + (self.bodies.residual - self._residual())
-        return self.floating.slide(*unbalanced(self.pairs, every, forces))
+        every = F + (self.bodies.residual - self.residual())
+        more = None if self.linear is None else self.linear.forces(self._multipliers)
+        return self.floating.slide(*unbalanced(self.pairs, every, forces, more))
 
     def _along(self, pair: Interface) -> Array:
         """Stiffness of the pair's contactors along their normals ``(n,)``."""
@@ -335,36 +340,28 @@ class BodySystem:
 
     def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[Traction]:
         """Contact forces of every pair, from forces that were passed on (collective)."""
-        lam = rows.test.multipliers(y)
-        redundant = np.zeros(len(lam), dtype=bool)
-        if rows.independent is not None:
-            lam = rows.independent.forces(lam)
-            redundant = rows.independent.redundant
-        found, start = [], 0
-        for pair, own in zip(self.pairs, rows.equations):
-            part = slice(start, start + len(own))
-            pair.set_redundant(own, redundant[part])
-            found.append(pair.forces(own, lam[part], du))
-            start += len(own)
-        return with_heat(self.pairs, rows, found, lam[start:], redundant[start:])
+        forces, self._multipliers = read_forces(self.pairs, rows, y, du)
+        return forces
 
     def _take(self, forces: list[Traction]) -> None:
         """Hand the contact forces to the pairs."""
         for pair, own in zip(self.pairs, forces):
             pair.set_forces(own)
+        if self.linear is not None:
+            self.linear.multipliers = self._multipliers
 
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
         active = [pair.nodes[pair.united] for pair in self.pairs]
         of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
-        return of_bodies + rounding_of_heat(self.pairs, self.unknowns)
+        return of_bodies + FORCE_ROUNDING * sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``.
 
         Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
         """
-        return self._rows_here().test.transpose(self._residual())
+        return self._rows_here().test.transpose(self.residual())
 
     def accelerate(self) -> None:
         """Find the acceleration that the bodies start with (collective)."""
@@ -373,7 +370,7 @@ class BodySystem:
             self.place()
             self.bodies.assemble()
             self.floating.begin_motion()
-            dynamics.accelerate(self.restriction(), self.bodies.residual)
+            dynamics.accelerate(self.restriction(), self.residual())
 
     # -- linear system ---------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ A part of the seventh step on the data's way; K is assembled only when something
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
@@ -23,6 +24,9 @@ from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import reduced
 
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import AtPoints
+
 
 class Tangent:
     """K = dF/du, with the mass's part of it in dynamics, assembled when it has changed.
@@ -32,13 +36,19 @@ class Tangent:
         config: configuration of the displacement.
         materials: whose stresses in F are no expressions of u; they add their stiffness.
         dynamics: whose inertia forces depend on u, or None.
+        points: loads and springs at nodes, or None.
 
     Raises:
         SpaceError: if F does not depend on u.
     """
 
     def __init__(
-        self, F: ufl.Form, config: Configuration, materials: Sequence[HistoryMaterial] = (), dynamics: Dynamics | None = None
+        self,
+        F: ufl.Form,
+        config: Configuration,
+        materials: Sequence[HistoryMaterial] = (),
+        dynamics: Dynamics | None = None,
+        points: AtPoints | None = None,
     ):
         u = config.whole
         J = ufl.derivative(F, u)
@@ -49,7 +59,7 @@ class Tangent:
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
         #: Whether K is the same for every u.
         self.linear: bool = u not in J.coefficients()
-        self._dynamics, self._factor = dynamics, 0.0
+        self._dynamics, self._factor, self._points = dynamics, 0.0, points
         self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
         with compiling("the tangent"):
@@ -72,6 +82,8 @@ class Tangent:
             return
         with timed("assemble tangent"):
             forms.assemble_matrix(self.K, self._form)
+            if self._points is not None:
+                self._points.add_stiffness(self.K)
             if self._dynamics is not None and factor:
                 self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
             self._unknowns.complete(self.K, self.free)

@@ -205,7 +205,7 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     assert problem.dynamics is not None
     if problem.dynamics.contactors != "massless":
         return []
-    still = [c for c in problem.contacts if c.pair.target.motion is None]
+    still = [c for c in problem.contacts if not c.pair.works]
     return [np.array(c.force.x.array[: problem.config.gdim * problem.config.n_owned]) for c in still if c.n_active]
 
 

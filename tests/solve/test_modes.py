@@ -1,0 +1,111 @@
+"""Natural frequencies against closed forms of linear elements, and of bodies in contact against one piece."""
+
+from __future__ import annotations
+
+import sys
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, blocks, box, clamp, linear, modulus, refused, run, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+pytest.importorskip("slepc4py")
+COMM = MPI.COMM_WORLD
+E, RHO = 3.0, 0.5
+
+
+def discrete(kh, h):
+    """Frequencies of waves of wave number k in linear elements of length h with consistent mass."""
+    return np.sqrt(6.0 * E / RHO * (1.0 - np.cos(kh)) / (2.0 + np.cos(kh))) / h / (2 * np.pi)
+
+
+def column(n):
+    """A column of 2n cells, so narrow that its lowest modes move along y alone: scene, space, displacement and conditions."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, -1.0], [0.1, 1.0], [1, 2 * n])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    bcs = [bc for x in (0.0, 0.1) for bc in clamp(V, s.tag("side", 0, at(0, x)), 0)]
+    return s, V, fem.Function(V, name="u"), bcs
+
+
+def test_a_bar():
+    """One end held: the closed form of the mesh; modes have the mass one, and vibrate apart from each other."""
+    s, V, u, bcs = column(4)
+    problem = uem.UnitedProblem(linear(u, E, 0.0), u, bcs=[*bcs, *clamp(V, s.tag("foot", 0, at(1, -1.0)), 1)])
+    mass = uem.consistent_mass(V, RHO)
+    found = uem.modes(problem, 3, mass=mass)
+    k = (np.arange(3) + 0.5) * np.pi / 2.0
+    assert np.allclose(found.frequencies, discrete(k / 4, 0.25), rtol=1e-9)
+    assert np.allclose(found.frequencies, np.sqrt(found.eigenvalues) / (2 * np.pi), rtol=1e-14)
+    vectors = [problem.config.vector(f.x.array[: mass.M.getLocalSize()[0]]) for f in found.functions]
+    gram = np.array([[a.dot(mass.M * b) for b in vectors] for a in vectors])
+    assert np.abs(gram - np.eye(3)).max() <= 1e-8
+
+
+def test_a_periodic_column():
+    """Nothing holds it: it floats, and waves run both ways with the same frequency."""
+    s, V, u, bcs = column(4)
+    ends = s.tag("head", 0, at(1, 1.0)), s.tag("foot", 0, at(1, -1.0))
+    problem = uem.UnitedProblem(linear(u, E, 0.0), u, bcs=bcs, equations=[uem.periodic(*ends)])
+    found = uem.modes(problem, 5, mass=uem.consistent_mass(V, RHO)).frequencies
+    k = np.array([1, 1, 2, 2]) * np.pi
+    assert abs(found[0]) <= 1e-5 * found[1]
+    assert np.allclose(found[1:], discrete(k / 4, 0.25), rtol=1e-8)
+
+
+@pytest.mark.parametrize("how", [{"friction": 10.0, "sliding": "fixed"}, {"tied": True, "coupling": "mortar"}])
+def test_pieces_that_stick(how):
+    """Two blocks that are pressed together and stick, or are tied, have the frequencies of one piece."""
+    b = blocks(COMM, "quadrilateral", 3, 3)
+    contact = uem.Contact(b.high, b.low, **how)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0), *clamp(b.V, b.top, 1, value=-0.01)]
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, E, E)), b.u, bcs=bcs, contacts=[contact])
+    mass = uem.consistent_mass(b.V, RHO)
+    run(problem)
+    assert contact.n_active == 4
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, -1.0], [1.0, 1.0], [3, 6])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    held = [*clamp(V, s.tag("bottom", 0, at(1, -1.0))), *clamp(V, s.tag("top", 0, at(1, 1.0)))]
+    whole = uem.modes(uem.UnitedProblem(linear(u, E), u, bcs=held), 4, mass=uem.consistent_mass(V, RHO))
+    assert np.allclose(uem.modes(problem, 4, mass=mass).frequencies, whole.frequencies, rtol=1e-9)
+
+
+def test_in_dynamics():
+    """Frequencies are those of statics, whatever step was taken, and the next step is what it would have been."""
+    ends = []
+    for ask in (True, False):
+        s, V, u, bcs = column(2)
+        dynamics = uem.Dynamics(
+            uem.consistent_mass(V, RHO),
+            velocity=(0.0, 0.01),
+            damping=lambda v, V=V: 0.1 * ufl.dot(v, ufl.TestFunction(V)) * ufl.dx,
+        )
+        foot = clamp(V, s.tag("foot", 0, at(1, -1.0)), 1)
+        problem = uem.UnitedProblem(linear(u, E, 0.0), u, bcs=[*bcs, *foot], dynamics=dynamics)
+        for _ in uem.time_steps(problem, 0.05, 0.1):
+            if ask:
+                assert uem.modes(problem, 1).frequencies[0] == pytest.approx(discrete(np.pi / 8, 0.5), rel=1e-9)
+        ends.append(np.array(u.x.array))
+    assert np.array_equal(*ends)
+
+
+def test_refused(monkeypatch):
+    s, V, u, bcs = column(2)
+    problem = uem.UnitedProblem(linear(u, E, 0.0), u, bcs=bcs)
+    mass = uem.consistent_mass(V, RHO)
+    for error, words, call in (
+        (uem.InputTypeError, "problem", lambda: uem.modes(u)),
+        (uem.InputError, "give mass", lambda: uem.modes(problem)),
+        (uem.InputTypeError, "mass = 3", lambda: uem.modes(problem, mass=3)),
+        (uem.InputError, "n = 0", lambda: uem.modes(problem, 0, mass=mass)),
+        (uem.InputError, "no more than 10 modes", lambda: uem.modes(problem, 11, mass=mass)),
+    ):
+        refused(error, words, call)
+    monkeypatch.setitem(sys.modules, "slepc4py", None)
+    refused(uem.MissingBackendError, "install python3-slepc4py-real", lambda: uem.modes(problem, mass=mass))

@@ -1,0 +1,135 @@
+"""Forces and springs at nodes, which forms have no measure for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import AnyArray, Array
+from uem_dolfinx.conditions.places import nodes_at
+from uem_dolfinx.errors import InputError, InputTypeError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.parallel import agreed, reduced
+
+
+class PointLoad:
+    """A force at a node, or at each of several.
+
+        uem.PointLoad(tags["tip"], (0.0, -3.0))
+        P = fem.Constant(mesh, (0.0, 0.0)); uem.PointLoad((2.0, 1.0), P)      # with load={P: (0.0, -3.0)}
+
+    Args:
+        at: tag of points, as a physical point of a ``.geo`` file, ``(meshtags, value)``, a list of these, or reference coordinates of a
+            node ``(gdim,)``.
+        force: numbers, or a ``fem.Constant``, which may change between steps and follow the load ``(gdim,)``; of axisymmetric bodies that
+            around the whole circle.
+
+    Raises:
+        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place where no node is; then a TagError for
+            what is no tag of points.
+    """
+
+    def __init__(self, at: Any, force: npt.ArrayLike | fem.Constant):
+        self.at, self.force = at, force
+        given.vector("force", self._values)
+
+    @property
+    def _values(self) -> Any:
+        return self.force.value if isinstance(self.force, fem.Constant) else self.force
+
+    def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
+        """Force ``(gdim,)`` as it is now, and stiffness ``(gdim, gdim)``, None without any."""
+        return given.vector("the force of a PointLoad", self._values, gdim), None
+
+
+class PointSpring:
+    """A linear spring between a node, or each of several, and where it was drawn: the force on the node is ``-k u``.
+
+        uem.PointSpring(tags["foot"], 1e4)              # alike in all directions
+        uem.PointSpring(tags["foot"], (0.0, 1e4))       # along y
+
+    Args:
+        at: as of ``PointLoad``.
+        stiffness: a number for all directions, numbers for each axis ``(gdim,)``, or a symmetric matrix without negative eigenvalues
+            ``(gdim, gdim)``.
+
+    Raises:
+        InputError, InputTypeError, TagError: as of ``PointLoad``.
+    """
+
+    def __init__(self, at: Any, stiffness: npt.ArrayLike):
+        self.at = at
+        words = "numbers that are not negative, one, one for each axis, or a symmetric matrix"
+        try:
+            self._k = np.array(stiffness, dtype=float)
+        except (TypeError, ValueError):
+            raise InputTypeError(given.sentence("stiffness", stiffness, words)) from None
+        k = np.diag(np.atleast_1d(self._k)) if self._k.ndim < 2 else self._k
+        square = k.ndim == 2 and k.shape[0] == k.shape[1] <= 3 and bool(np.isfinite(k).all())
+        if not square or not np.array_equal(k, k.T) or np.linalg.eigvalsh(k)[0] < -np.finfo(float).eps * np.abs(k).max():
+            raise InputError(given.sentence("stiffness", stiffness, words))
+
+    def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
+        """As of ``PointLoad``."""
+        k = self._k * np.eye(gdim) if self._k.ndim == 0 else np.diag(self._k) if self._k.ndim == 1 else self._k
+        if k.shape != (gdim, gdim):
+            raise InputError(given.sentence("the stiffness of a PointSpring", self._k, f"a number, or {gdim} for each axis"))
+        return np.zeros(gdim), k
+
+
+class AtPoints:
+    """All loads and springs at nodes of a problem (collective).
+
+    Args:
+        config: configuration of the displacement.
+        declared: as users declared them.
+    """
+
+    def __init__(self, config: Configuration, declared: Sequence[PointLoad | PointSpring]):
+        self._config = config
+        self._parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
+        with agreed(config.comm):
+            for one, _ in self._parts:
+                one.force_and_stiffness(config.gdim)
+        n = len(config.whole.x.array)
+        #: Unknowns that the components of the nodes are ``(n_local, gdim)``.
+        self._unknowns = config.of(np.arange(n))
+
+    def add_forces(self, b: AnyArray) -> None:
+        """Add what a residual, internal minus external forces, lacks at the owned unknowns ``(n,)``."""
+        config = self._config
+        for one, nodes in self._parts:
+            force, k = one.force_and_stiffness(config.gdim)
+            np.subtract.at(b, self._unknowns[nodes], force if k is None else -config.displacement[nodes] @ k)
+
+    def loads(self) -> Array:
+        """Forces but those of springs, at the owned nodes ``(n_owned, gdim)``."""
+        found = np.zeros((self._config.n_owned, self._config.gdim))
+        for one, nodes in self._parts:
+            np.add.at(found, nodes, one.force_and_stiffness(self._config.gdim)[0])
+        return found
+
+    def energy(self) -> float:
+        """Energy that the springs have stored (collective)."""
+        u, parts = (
+            self._config.displacement,
+            [(nodes, one.force_and_stiffness(self._config.gdim)[1]) for one, nodes in self._parts],
+        )
+        own = sum(0.5 * float(np.einsum("ng,gh,nh->", u[nodes], k, u[nodes])) for nodes, k in parts if k is not None)
+        return float(reduced(self._config.comm, float(own)))
+
+    def add_stiffness(self, K: PETSc.Mat) -> None:
+        """Add the springs to an assembled tangent (collective)."""
+        config, g = self._config, self._config.gdim
+        for one, nodes in self._parts:
+            _, k = one.force_and_stiffness(g)
+            for node in config.to_global(nodes) if k is not None else ():
+                rows = (node * g + np.arange(g)).astype(PETSc.IntType)
+                K.setValues(rows, rows, k, addv=PETSc.InsertMode.ADD)
+        K.assemble()

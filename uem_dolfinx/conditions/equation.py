@@ -1,0 +1,290 @@
+"""Linear equations between displacements of nodes, as users declare them: single ones, families, periodic surfaces.
+
+What they make is ``GivenRows``, which ``united_rows`` turns into uniting equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.conditions.places import NEAR, described, global_nodes, middle_of, nodes_at, partners
+from uem_dolfinx.errors import InputError, InputTypeError, SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.tags import Part, name_of
+from uem_dolfinx.parallel import agree, agreed, ask_together, gathered, reduced
+
+Value: TypeAlias = "npt.ArrayLike | fem.Constant | Callable[[float], Any]"
+
+
+@dataclass(frozen=True)
+class GivenRows:
+    """Equations ``sum_k c_k . u_k = b`` of this rank, each with its terms.
+
+    Attributes:
+        value: number of the value b among those of the declaration ``(m,)``.
+        row: the equation that each term belongs to ``(k,)``.
+        node: global node of each term ``(k,)``; the first one of an equation tells its place.
+        coefficients: c of each term ``(k, gdim)``.
+    """
+
+    value: Ints
+    row: Ints
+    node: Ints
+    coefficients: Array
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @staticmethod
+    def join(parts: Sequence[GivenRows]) -> GivenRows:
+        """All of several lists, in this order; values keep their numbers."""
+        first = np.cumsum([0, *(len(p) for p in parts)])
+        rows = [p.row + f for p, f in zip(parts, first)]
+        others = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(GivenRows) if f.name != "row"}
+        return GivenRows(row=np.concatenate(rows), **others)
+
+    def select(self, which: npt.NDArray[np.bool_]) -> GivenRows:
+        """Some of them, in their order ``(m,)``."""
+        place, terms = np.cumsum(which) - 1, which[self.row]
+        return GivenRows(self.value[which], place[self.row[terms]], self.node[terms], self.coefficients[terms])
+
+
+class LinearEquations(Protocol):
+    """What makes linear equations of a displacement.
+
+    Attributes:
+        b: right-hand side, as users may change it between steps.
+        firm: whether it is a mistake that one of them follows from those before it.
+    """
+
+    b: Any
+    firm: bool
+
+    def rows(self, config: Configuration, role: str) -> GivenRows:
+        """The equations (collective)."""
+
+    def n_values(self, gdim: int) -> int:
+        """How many different right-hand sides there are."""
+
+
+class Equation:
+    """A linear equation between displacements of nodes: ``sum_k c_k . u(place_k) = b``.
+
+        uem.Equation([(tags["tip"], (0, 1)), ((0.0, 1.0), (0, -2))])                       # u_y of the tip is twice that at (0, 1)
+        uem.Equation([(tags["top"], (0, 1)), (tags["corner"], (0, -1))], b=0.0)            # the top stays level
+
+    Equations are handed to ``UnitedProblem(..., equations=[...])``; each eliminates one component of a node, without multipliers.
+
+    Args:
+        terms: pairs of a place and a vector ``c (gdim,)``. Places are tags of points, or of anything with one node, or reference
+            coordinates of a node. One place may have many nodes, as a surface: then there is one equation for each of them but those
+            that are named by other terms.
+        b: a number, a ``fem.Constant`` or a function of the load factor or time. A number or a Constant that ``load`` does not set is
+            approached along with the Dirichlet values.
+
+    Raises:
+        InputError, InputTypeError: for terms or values of another form. When the problem is made also a TagError for places that are
+            none, and a ConflictError for equations that leave nothing to eliminate, or follow from or contradict others.
+    """
+
+    firm = True
+
+    def __init__(self, terms: Sequence[tuple[Any, npt.ArrayLike]], b: Value = 0.0):
+        expected = "a list of pairs, each of a place and a vector, as [(tags['tip'], (0, 1)), ((0.0, 1.0), (0, -1))]"
+        given.kind("terms", terms, isinstance(terms, Sequence) and not isinstance(terms, str) and len(terms) > 0, expected)
+        for i, term in enumerate(terms):
+            given.kind(f"terms[{i}]", term, isinstance(term, Sequence) and len(term) == 2, "a pair of a place and a vector")
+        self._terms = [(where, given.vector(f"the vector of terms[{i}]", c)) for i, (where, c) in enumerate(terms)]
+        self.b = checked_value("b", b, 1)
+
+    def n_values(self, gdim: int) -> int:
+        """As of ``LinearEquations``."""
+        return 1
+
+    def rows(self, config: Configuration, role: str) -> GivenRows:
+        """As of ``LinearEquations``."""
+        found, many = [], []
+        for i, (where, c) in enumerate(self._terms):
+            with agreed(config.comm):
+                given.vector(f"the vector of terms[{i}] of {role}", c, config.gdim)
+            nodes = nodes_at(config, where, f"the place of terms[{i}] of {role}")
+            found.append(nodes)
+            if reduced(config.comm, len(nodes)) > 1:
+                many.append(i)
+        if len(many) > 1:
+            names = " and ".join(described(self._terms[i][0]) for i in many[:2])
+            raise InputError(f"{role}: the places {names} have several nodes each: expected one such place at most; see periodic")
+        family = many[0] if many else 0
+        single = {i: global_nodes(config, nodes) for i, nodes in enumerate(found) if i != family}
+        own = config.to_global(found[family])
+        own = own[~np.isin(own, np.concatenate([np.zeros(0, np.int64), *single.values()]))] if many else own
+        order = [family, *single]
+        node = np.column_stack([own, *(np.full(len(own), single[i][0]) for i in single)])
+        c = np.broadcast_to([self._terms[i][1] for i in order], (len(own), len(order), config.gdim))
+        return _of_terms(np.zeros(len(own), dtype=np.int64), node, c)
+
+
+class Periodic:
+    """Nodes of a surface that move as their images do: what ``periodic`` makes."""
+
+    firm = False
+
+    def __init__(
+        self,
+        follower: Part,
+        leader: Part,
+        map: Callable[[Array], Array] | None,
+        turn: npt.ArrayLike | None,
+        jump: Value,
+    ):
+        self._follower, self._leader = follower, leader
+        self._map = given.kind("map", map, map is None or callable(map), "a function of places (n, gdim), or None")
+        self._turn = None if turn is None else _rotation(turn)
+        self.b = checked_value("jump", jump, None)
+
+    def n_values(self, gdim: int) -> int:
+        """As of ``LinearEquations``."""
+        return gdim
+
+    def rows(self, config: Configuration, role: str) -> GivenRows:
+        """As of ``LinearEquations``."""
+        g = config.gdim
+        R = np.eye(g) if self._turn is None else self._turn
+        with agreed(config.comm):
+            if R.shape != (g, g):
+                raise InputError(f"{role}: turn has the shape {R.shape}: expected ({g}, {g})")
+        follower = nodes_at(config, self._follower, f"the follower of {role}")
+        leader = nodes_at(config, self._leader, f"the leader of {role}")
+        x = config.X[follower]
+        images = self._images(config, x, middle_of(config, leader) - middle_of(config, follower), role)
+        self._check_sizes(config, len(follower), len(leader), role)
+        there, distance, following = partners(config, images, leader)
+        error, bad = None, distance > NEAR * following
+        if bad.any():
+            i = int(np.argmax(np.where(bad, distance, -1.0)))
+            place = ", ".join(f"{v:.6g}" for v in images[i])
+            error = SurfaceError(
+                f"{role}: the node at {config.describe(int(follower[i]))} has no partner: its image ({place}) is {distance[i]:.3g} away "
+                f"from the nearest node of '{name_of(self._leader)}'. Expected matching meshes, as by gmsh's Periodic, and a map from the "
+                "follower onto the leader; meshes that do not match are united by Contact(..., tied=True)"
+            )
+        agree(config.comm, error)
+        # a node on the axis is its own image
+        node = np.column_stack([config.to_global(follower), there])
+        n, apart = len(node), node[:, 0] != node[:, 1]
+        c = np.empty((n, g, 2, g))
+        c[:, :, 0], c[:, :, 1] = np.eye(g), -R
+        node = np.broadcast_to(node[:, None], (n, g, 2))
+        value = np.broadcast_to(np.arange(g), (n, g))
+        if self._turn is None:
+            # without a turn its equations say nothing
+            c, node, value = c[apart], node[apart], value[apart]
+        return _of_terms(value.ravel(), node.reshape(-1, 2), c.reshape(-1, 2, g))
+
+    def _images(self, config: Configuration, x: Array, shift: Array, role: str) -> Array:
+        """Where the partners of followers at ``x (n, gdim)`` are (collective)."""
+        if self._map is not None:
+            images = ask_together(config.comm, f"the map of {role}", self._map, np.array(x))
+            with agreed(config.comm):
+                images = np.asarray(images, dtype=float)
+                if images.shape != x.shape or not np.isfinite(images).all():
+                    raise InputError(
+                        f"the map of {role} returned an array of shape {images.shape}: expected finite ones of {x.shape}"
+                    )
+            return images
+        return x @ self._turn if self._turn is not None else x + shift
+
+    def _check_sizes(self, config: Configuration, n_follower: int, n_leader: int, role: str) -> None:
+        n = gathered(config.comm, np.array([n_follower, n_leader])).sum(axis=0)
+        if n[0] != n[1]:
+            raise SurfaceError(
+                f"{role}: '{name_of(self._follower)}' has {n[0]} nodes, '{name_of(self._leader)}' {n[1]}: expected matching meshes, as by "
+                "gmsh's Periodic; meshes that do not match are united by Contact(..., tied=True)"
+            )
+
+
+def periodic(
+    follower: Part,
+    leader: Part,
+    *,
+    map: Callable[[Array], Array] | None = None,
+    turn: npt.ArrayLike | None = None,
+    jump: Value = 0.0,
+) -> Periodic:
+    """Equations ``u(x) = R u(map(x)) + jump`` for all nodes of a surface, whose mesh matches that of another one.
+
+        uem.periodic(tags["right"], tags["left"], jump=strain @ (L, 0.0))        # a periodic cell under a mean strain
+        uem.periodic(tags["cut_2"], tags["cut_1"], turn=R)                        # a sector of a ring, R turns cut_1 into cut_2
+
+    Of periodicity in several directions equations at edges follow from each other; those are left out.
+
+    Args:
+        follower: surface whose nodes are eliminated.
+        leader: surface that they follow, with as many nodes.
+        map: takes places ``(n, gdim)`` of the follower to those of the leader; None shifts them by the distance of the surfaces, or, with
+            a ``turn``, turns them back about the origin.
+        turn: rotation ``R (gdim, gdim)`` of the components; None leaves them.
+        jump: a number for all components, or numbers ``(gdim,)``, a ``fem.Constant`` of such, or a function of the load factor or time that
+            returns such. Followed as ``b`` of ``Equation``.
+
+    Returns:
+        What ``UnitedProblem(..., equations=[...])`` takes.
+
+    Raises:
+        InputError, InputTypeError: as of ``Equation``; SurfaceError, when the problem is made, for surfaces that do not match.
+    """
+    return Periodic(follower, leader, map, turn, jump)
+
+
+def _of_terms(value: Ints, node: Ints, c: Array) -> GivenRows:
+    """Rows of values ``(m,)`` with nodes ``(m, t)`` and vectors ``(m, t, gdim)``; terms at one node are added, vanishing ones left out."""
+    (m, t), g = node.shape, c.shape[-1]
+    row = np.repeat(np.arange(m), t)
+    # the first term of each node stands for all of them
+    first = (node[:, :, None] == node[:, None, :]).argmax(axis=2)
+    sums = np.zeros((m, t, g))
+    np.add.at(sums, (row, first.ravel()), c.reshape(-1, g))
+    kept = (first == np.arange(t)).ravel()
+    return GivenRows(value, row[kept], node.ravel()[kept], sums.reshape(-1, g)[kept])
+
+
+def _rotation(turn: npt.ArrayLike) -> Array:
+    try:
+        R = np.array(turn, dtype=float)
+    except (TypeError, ValueError):
+        raise InputTypeError(given.sentence("turn", turn, "a rotation matrix")) from None
+    if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.abs(R @ R.T - np.eye(len(R))).max() < NEAR:
+        raise InputError(given.sentence("turn", turn, "a rotation matrix (gdim, gdim)"))
+    return R
+
+
+def checked_value(what: str, value: Any, size: int | None) -> Any:
+    """A right-hand side as it was given, if it can be one: of ``size`` numbers, None for 1, 2 or 3."""
+    if not callable(value) or isinstance(value, fem.Constant):
+        values_of(what, value, size)
+    return value
+
+
+def values_of(what: str, value: Any, size: int | None) -> Array:
+    """Numbers of a right-hand side: ``(size,)``, one number stands for all.
+
+    Raises:
+        InputTypeError, InputError: if they are no finite numbers, or more or less of them.
+    """
+    words = "a finite number" if size == 1 else f"a finite number, or {size or '2 or 3'} of them"
+    try:
+        array = np.array(value.value if isinstance(value, fem.Constant) else value, dtype=float, ndmin=1)
+    except (TypeError, ValueError):
+        raise InputTypeError(given.sentence(what, value, f"{words}, a Constant, or a function of the load factor")) from None
+    sizes = (1, size) if size else (1, 2, 3)
+    if array.ndim != 1 or len(array) not in sizes or not np.isfinite(array).all():
+        raise InputError(given.sentence(what, value, words))
+    return np.broadcast_to(array, (size,)) if size else array

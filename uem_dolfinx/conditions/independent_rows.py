@@ -1,0 +1,195 @@
+"""Which component each linear equation eliminates, and which equations follow from others: pure algebra of distributed rows.
+
+With the equations ``A u = b`` of all ranks and one component p of each, ``A_p`` being the columns of these, the independent rows are
+
+    R = T A,    R u = T b,    R_p = 1
+
+Most equations have a component that no other one has, which goes at once, and T only divides by its coefficient. Those that are left
+without one, as at the edges of cells that are periodic in several directions, are solved together by elimination, on every rank.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
+from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.parallel import reduced
+
+#: Coordinates that differ by less are the same where equations are put in order.
+#: [bound; the model's size; -]
+SAME_ROW = 1e-9
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Independent rows, of which this rank has those whose eliminated node it owns.
+
+    Attributes:
+        pivot: eliminated component, as ``global node * gdim + component`` ``(m,)``.
+        row: the row of each entry of R but those of the pivots ``(k,)``.
+        column: component of each, likewise numbered ``(k,)``.
+        entry: of R ``(k,)``.
+        weight_row: the row of each entry of T ``(l,)``.
+        weight_value: number of the value b that it takes ``(l,)``.
+        weight: of T ``(l,)``.
+    """
+
+    pivot: Ints
+    row: Ints
+    column: Ints
+    entry: Array
+    weight_row: Ints
+    weight_value: Ints
+    weight: Array
+
+
+def sizes(config: Configuration, rows: GivenRows, free: Bools) -> Array:
+    """Sizes of the coefficients that can be eliminated by, over the largest of their rows ``(k, gdim)`` (collective).
+
+    Args:
+        config: configuration of the displacement.
+        rows: of this rank.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+    """
+    largest = np.zeros(len(rows))
+    np.maximum.at(largest, rows.row, np.abs(rows.coefficients).max(axis=1, initial=0.0))
+    movable = config.ask_owners(rows.node, free.astype(float)) > 0
+    size = np.where(movable, np.abs(rows.coefficients) / np.where(largest > 0, largest, 1.0)[rows.row, None], 0.0)
+    return np.where(size > MOSTLY_PRESCRIBED, size, 0.0)
+
+
+def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) -> Ints:
+    """Components that a row has alone when those before it are gone, ``term * gdim + component (m,)``; -1 for none (collective).
+
+    Args:
+        config: configuration of the displacement.
+        rows: of this rank.
+        size: as of ``sizes``; a row without any takes no part.
+        spared: terms of nodes that are eliminated only where nothing else can be ``(k,)``.
+    """
+    g, counted = config.gdim, (size > 0).astype(float)
+    counts, halo = config.add_at_owners(rows.node, counted), Halo(config, rows.node)
+    chosen = np.full(len(rows), -1)
+    row = np.repeat(rows.row, g)
+    for allowed in (~spared, np.ones_like(spared)):
+        while True:
+            alone = (halo.take(counts.__getitem__) == 1.0) & allowed[:, None] & (chosen < 0)[rows.row, None]
+            value = np.where(alone, size, 0.0).ravel()
+            order = np.lexsort((-value, row))
+            first = order[np.unique(row[order], return_index=True)[1]]
+            first = first[value[first] > 0.0]
+            chosen[row[first]] = first
+            gone = np.zeros(len(rows), dtype=bool)
+            gone[row[first]] = True
+            terms = gone[rows.row]
+            counts = counts - config.add_at_owners(rows.node[terms], counted[terms])
+            if not reduced(config.comm, len(first)):
+                break
+    return chosen
+
+
+def divided(rows: GivenRows, chosen: Ints) -> Solved:
+    """Rows that each eliminate a component which they alone have; of any node."""
+    m, g = len(rows), rows.coefficients.shape[1]
+    column = (rows.node[:, None] * g + np.arange(g)).ravel()
+    scale = rows.coefficients.ravel()[chosen]
+    row, entry = np.repeat(rows.row, g), rows.coefficients.ravel() / np.repeat(scale[rows.row], g)
+    others = (entry != 0.0) & (np.arange(len(entry)) != chosen[row])
+    return Solved(column[chosen], row[others], column[others], entry[others], np.arange(m), rows.value, 1.0 / scale)
+
+
+def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, spared: Bools) -> tuple[Solved, Bools]:
+    """Rows that share all of their components, solved in the order of their declaration and place (collective).
+
+    Args:
+        config: configuration of the displacement.
+        rows: of this rank.
+        item: number of the declaration of each ``(m,)``.
+        size: as of ``sizes``.
+        spared: as of ``singles``.
+
+    Returns:
+        The independent rows whose nodes this rank owns, and which of the given ones follow from those before them ``(m,)``.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    comm, g = config.comm, config.gdim
+    first = np.searchsorted(rows.row, np.arange(len(rows)))
+    known = config.ask_owners(rows.node[first], config.X[: config.n_owned])
+    mine = rows.value, item, known, np.bincount(rows.row, minlength=len(rows)), rows.node, rows.coefficients, size > 0, spared
+    parts = comm.allgather(mine)
+    value, declared, x, count, node, c, movable, last = (np.concatenate(arrays) for arrays in zip(*parts))
+    places = np.round(x / (SAME_ROW * config.size))
+    order = np.lexsort([value, *places.T[::-1], declared])
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    row = np.repeat(rank, count)
+    columns, at = np.unique((node[:, None] * g + np.arange(g)).ravel(), return_inverse=True)
+    A = coo_matrix((c.ravel(), (np.repeat(row, g), at)), shape=(len(order), len(columns))).tocsr()
+    free, spare = np.zeros((2, len(columns)), dtype=bool)
+    free[at[movable.ravel()]] = True
+    spare[at] = np.repeat(last, g)
+    links = A[:, free]
+    n_groups, label = connected_components(links @ links.T, directed=False)
+    dependent = np.ones(len(order), dtype=bool)
+    made = []
+    for k in range(n_groups):
+        which = np.flatnonzero(label == k)
+        own = np.unique(A[which].indices)
+        R, T, pivot = _gauss_jordan(A[which][:, own].toarray(), free[own], spare[own])
+        kept = pivot >= 0
+        dependent[which[kept]] = False
+        made.append((columns[own[pivot[kept]]], R[kept], columns[own], T[kept], value[order][which]))
+    start = sum(len(part[0]) for part in parts[: comm.rank])
+    return _owned(config, made), dependent[rank[start : start + len(rows)]]
+
+
+def _gauss_jordan(A: Array, free: Bools, spare: Bools) -> tuple[Array, Array, Ints]:
+    """``R = T A`` with a column of the identity for each row that does not follow from those before it.
+
+    Returns:
+        R, T, and each row's column, -1 where it follows.
+    """
+    m = len(A)
+    R, T, pivot = A.copy(), np.eye(m), np.full(m, -1)
+    scale = np.abs(A).max(axis=1)
+    for i in range(m):
+        size = np.abs(R[i]) * free
+        if size.max() <= MOSTLY_PRESCRIBED * scale[i]:
+            continue
+        good = (size > DEPENDENT * size.max()) & ~spare
+        p = pivot[i] = int(np.argmax(np.where(good, size, 0.0) if good.any() else size))
+        T[i], R[i] = T[i] / R[i, p], R[i] / R[i, p]
+        factor = R[:, p].copy()
+        factor[i] = 0.0
+        R -= factor[:, None] * R[i]
+        T -= factor[:, None] * T[i]
+        R[:, p] = 0.0
+        R[i, p] = 1.0
+    return R, T, pivot
+
+
+def _owned(config: Configuration, made: list[tuple[Ints, Array, Ints, Array, Ints]]) -> Solved:
+    """Those of solved groups whose pivots are of nodes that this rank owns."""
+    none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
+    lists: list[list[Any]] = [[numbers], [numbers], [numbers], [none], [numbers], [numbers], [none]]
+    count = 0
+    for pivot, R, columns, T, values in made:
+        own = config.owner_of(pivot // config.gdim) == config.comm.rank
+        pivot, R, T = pivot[own], R[own], T[own]
+        R = np.where(columns == pivot[:, None], 0.0, R)
+        i, j = np.nonzero(np.abs(R) > np.finfo(float).eps)
+        k, v = np.nonzero(T)
+        for part, found in zip(lists, (pivot, i + count, columns[j], R[i, j], k + count, values[v], T[k, v])):
+            part.append(found)
+        count += len(pivot)
+    return Solved(*(np.concatenate(part) for part in lists))

@@ -1,0 +1,244 @@
+"""Linear equations of users as uniting equations that hold always, with right-hand sides that follow loads and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, values_of
+from uem_dolfinx.conditions.independent_rows import Solved, divided, eliminated, singles, sizes
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.parallel import Exchange, agree, agreed, ask_together, reduced
+
+#: Equations that were left out because they follow from others hold up to this part of the displacements and values in them.
+#: [convention; displacements and values; test_equation.py::test_what_contradicts]
+CONTRADICTING = 1e-8
+
+
+class UnitedRows:
+    """All linear equations of a problem (collective).
+
+    Args:
+        config: configuration of the displacement.
+        declared: the equations as users declared them.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+        contactors: owned nodes of contacts, which are eliminated where nothing else can be ``(n_owned,)``.
+        loaded: Constants that the load sets; values of others grow along with the Dirichlet values.
+        at: load factor or time at which functions are asked for their values first.
+
+    Attributes:
+        equations: of this rank, with the gaps of the last call of ``at_present``.
+        multipliers: forces of the equations along what they eliminate ``(m,)``, as last taken.
+
+    Raises:
+        ConflictError: for equations that leave nothing to eliminate, or follow from others or contradict them.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        declared: Sequence[LinearEquations],
+        free: Bools,
+        contactors: Bools,
+        loaded: Collection[fem.Constant] = (),
+        at: float = 0.0,
+    ):
+        self._config, self._declared = config, list(declared)
+        counts = [one.n_values(config.gdim) for one in self._declared]
+        self._n_values = sum(counts)
+        self._asked: list[Any] = [None] * len(counts)
+        ramped = [_grows(one.b, loaded) for one in self._declared]
+        self._make(np.cumsum([0, *counts]), free, contactors)
+        self._halo = Halo(config, self.equations.followed)
+        left = self._left
+        self._left_halo = Halo(config, left.node)
+        grows = np.repeat(ramped, counts)
+        #: Rows whose values grow along with the Dirichlet values, and likewise of those left out.
+        self._ramped = np.asarray(self._weights[:, ~grows].getnnz(axis=1) == 0), grows[left.value]
+        #: What the left-hand sides were where the ramp began, of rows and of those left out, and how far it has come.
+        self._start, self._fraction = (np.zeros(len(self.equations)), np.zeros(len(left))), 1.0
+        self.multipliers: Array = np.zeros(len(self.equations))
+        self.take_load(at)
+        self._wanted = self._values()
+
+    def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
+        """Choose what each equation eliminates (collective)."""
+        config = self._config
+        parts = [one.rows(config, f"equations[{i}]") for i, one in enumerate(self._declared)]
+        item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+        rows = GivenRows.join([replace(p, value=p.value + f) for p, f in zip(parts, first)])
+        size = sizes(config, rows, free)
+        able = np.zeros(len(rows), dtype=bool)
+        able[rows.row[(size > 0).any(axis=1)]] = True
+        self._refuse(rows, item, ~able, "leaves nothing to eliminate, as its components are prescribed or cancel: leave it out")
+        spared = config.ask_owners(rows.node, contactors[:, None].astype(float))[:, 0] > 0
+        chosen = singles(config, rows, size, spared)
+        alone, shared = chosen >= 0, able & (chosen < 0)
+        # terms of those alone are renumbered
+        place = np.cumsum(alone[rows.row]) - 1
+        g = config.gdim
+        own = chosen[alone]
+        solved = [self._sent(divided(rows.select(alone), place[own // g] * g + own % g))]
+        follows = np.zeros(len(rows), dtype=bool)
+        if reduced(config.comm, int(shared.sum())):
+            terms = shared[rows.row]
+            more, follows[shared] = eliminated(config, rows.select(shared), item[shared], size[terms], spared[terms])
+            solved.append(more)
+        self._refuse(rows, item, follows, "follows from the equations before it, or contradicts them: leave it out or mend it")
+        self._left = rows.select(~able | follows)
+        self._take(solved)
+
+    def _refuse(self, rows: GivenRows, item: Ints, which: Bools, words: str) -> None:
+        """Raise if any of these is an equation that says what it should not (collective)."""
+        firm = np.array([one.firm for one in self._declared], dtype=bool)
+        bad, error = np.flatnonzero(which & firm[item]), None
+        X = self._config.ask_owners(rows.node, self._config.X[: self._config.n_owned])
+        if len(bad):
+            place = ", ".join(f"{x:.6g}" for x in X[np.searchsorted(rows.row, bad[0])])
+            error = ConflictError(f"equations[{item[bad[0]]}], at the node at ({place}), {words}")
+        agree(self._config.comm, error)
+
+    def _sent(self, rows: Solved) -> Solved:
+        """Rows with one weight each, on the ranks that own the nodes that they eliminate (collective)."""
+        comm, order = self._config.comm, np.argsort(rows.row, kind="stable")
+        rank = self._config.owner_of(rows.pivot // self._config.gdim)
+        counts = np.bincount(rows.row, minlength=len(rows.pivot))
+        pivot, n_terms, value, weight = Exchange.to(comm, rank).send(rows.pivot, counts, rows.weight_value, rows.weight)
+        column, entry = Exchange.to(comm, rank[rows.row[order]]).send(rows.column[order], rows.entry[order])
+        every = np.arange(len(pivot))
+        return Solved(pivot, np.repeat(every, n_terms), column, entry, every, value, weight)
+
+    def _take(self, solved: list[Solved]) -> None:
+        """Make uniting equations of independent rows whose nodes this rank owns."""
+        from scipy.sparse import csr_matrix
+
+        config, g = self._config, self._config.gdim
+        first = np.cumsum([0, *(len(s.pivot) for s in solved)])
+        pivot, column, entry, value, weight = (
+            np.concatenate([getattr(s, name) for s in solved]) for name in ("pivot", "column", "entry", "weight_value", "weight")
+        )
+        row, weight_row = (
+            np.concatenate([getattr(s, name) + f for s, f in zip(solved, first)]) for name in ("row", "weight_row")
+        )
+        m = len(pivot)
+        node = (pivot // g - config.first).astype(np.int32)
+        terms, at = np.unique(np.stack([row, column // g], axis=1), axis=0, return_inverse=True)
+        coefficients = np.zeros((len(terms), g))
+        coefficients[at.ravel(), column % g] = -entry
+        self.equations = UnitingEquations(
+            node, np.eye(g)[pivot % g], np.zeros(m), np.ones(m, dtype=bool), terms[:, 0], terms[:, 1], coefficients
+        )
+        self._weights = csr_matrix((weight, (weight_row, value)), shape=(m, self._n_values))
+        #: What rounding of displacements of size one makes of the gaps.
+        self._size = 1.0 + np.bincount(terms[:, 0], np.abs(coefficients).sum(axis=1), m)
+
+    # -- right-hand sides ------------------------------------------------------------------------------------------------
+
+    def take_load(self, at: float) -> None:
+        """Ask functions for the values of a load factor or time; a UserFunctionError if one raises (collective)."""
+        for i, one in enumerate(self._declared):
+            if callable(one.b) and not isinstance(one.b, fem.Constant):
+                self._asked[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
+
+    def _values(self) -> Array:
+        """Right-hand sides as they are now ``(n_values,)`` (collective)."""
+        with agreed(self._config.comm):
+            found = [
+                values_of(f"the value of equations[{i}]", one.b if asked is None else asked, one.n_values(self._config.gdim))
+                for i, (one, asked) in enumerate(zip(self._declared, self._asked))
+            ]
+        return np.concatenate(found)
+
+    def begin_step(self, start: Array, fraction: float) -> None:
+        """Begin a step whose ramp began at a displacement of the owned nodes ``(n_owned, gdim)`` and goes so far (collective)."""
+        self._start, self._fraction = (self._sides(start), self._left_sides(start)), fraction
+        self._wanted = self._values()
+
+    def _sides(self, u: Array) -> Array:
+        """Left-hand sides of a displacement ``(m,)`` (collective)."""
+        eq = self.equations
+        there = np.einsum("kg,kg->k", eq.coefficients, self._halo.take(u.__getitem__))
+        return np.einsum("mg,mg->m", eq.direction, u[eq.node]) - np.bincount(eq.row, there, len(eq))
+
+    def _left_sides(self, u: Array) -> Array:
+        """Likewise of the equations that were left out."""
+        left = self._left
+        there = np.einsum("kg,kg->k", left.coefficients, self._left_halo.take(u.__getitem__))
+        return np.asarray(np.bincount(left.row, there, len(left)), dtype=float)
+
+    def _targets(self, b: Array, start: Array, ramped: Bools) -> Array:
+        return np.where(ramped, start + self._fraction * (b - start), b) if self._fraction < 1.0 else b
+
+    def at_present(self) -> UnitingEquations:
+        """The equations with the gaps of the present displacement (collective)."""
+        wanted = self._targets(self._weights @ self._wanted, self._start[0], self._ramped[0])
+        here = self._config.displacement[: self._config.n_owned]
+        self.equations = replace(self.equations, gap=self._sides(here) - wanted)
+        return self.equations
+
+    def largest_gap_here(self) -> float:
+        """Largest gap over the sum of the coefficients of its equation, a length, on this rank."""
+        return float((np.abs(self.equations.gap) / self._size).max(initial=0.0))
+
+    def check(self) -> None:
+        """Refuse values that contradict each other, or Dirichlet values: what follows from others must hold, too (collective).
+
+        Raises:
+            ConflictError: naming the place.
+        """
+        config, left = self._config, self._left
+        if not reduced(config.comm, len(left)):
+            return
+        u, b = config.displacement[: config.n_owned], self._wanted[left.value]
+        apart = np.abs(self._left_sides(u) - self._targets(b, self._start[1], self._ramped[1]))
+        scale = float(reduced(config.comm, np.abs(u).max(initial=0.0), op=MPI.MAX)) + np.abs(b)
+        X, error = config.ask_owners(left.node, config.X[: config.n_owned]), None
+        bad = np.flatnonzero(apart > CONTRADICTING * scale)
+        if len(bad):
+            i = int(bad[np.argmax(apart[bad])])
+            place = ", ".join(f"{x:.6g}" for x in X[np.searchsorted(left.row, i)])
+            error = ConflictError(
+                f"an equation of the node at ({place}) is missed by {apart[i]:.4g}: it follows from other equations and Dirichlet "
+                "conditions but for its value, which contradicts theirs; give values that agree"
+            )
+        agree(config.comm, error)
+
+    # -- forces ----------------------------------------------------------------------------------------------------------
+
+    def forces(self, multipliers: Array) -> Array:
+        """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective).
+
+        Args:
+            multipliers: forces along what they eliminate ``(m,)``.
+        """
+        eq, config = self.equations, self._config
+        nodes = np.concatenate([config.to_global(eq.node), eq.followed])
+        own, theirs = multipliers[:, None] * eq.direction, -multipliers[eq.row, None] * eq.coefficients
+        return config.add_at_owners(nodes, np.concatenate([own, theirs]))
+
+
+def unite(
+    config: Configuration, declared: Sequence[LinearEquations], free: Bools, contactors: Sequence[Indices], load: Any, at: float
+) -> UnitedRows:
+    """Equations of users among contactors ``(n,)`` of several contacts, with the load that a problem is handed (collective)."""
+    spared = np.zeros(config.n_owned, dtype=bool)
+    for nodes in contactors:
+        spared[nodes] = True
+    return UnitedRows(config, declared, free, spared, list(load) if isinstance(load, Mapping) else [], at)
+
+
+def _grows(b: Any, loaded: Collection[fem.Constant]) -> bool:
+    """Whether a value is approached along with the Dirichlet values."""
+    if isinstance(b, fem.Constant):
+        return not any(b is constant for constant in loaded)
+    return not callable(b)

@@ -1,0 +1,185 @@
+"""Preload: a bolt is cut at a section whose opening is one unknown that carries a given force, and is locked at the length found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy.typing as npt
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Bools, Indices
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.kinematics import Discretisation
+from uem_dolfinx.contact.mortar import Mortar
+from uem_dolfinx.contact.preloaded import Preloaded
+from uem_dolfinx.contact.sliding import Sliding
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.tags import Part, communicator_of
+from uem_dolfinx.parallel import agreed, ask_together
+
+
+class Preload(Contact):
+    """A section of a bolt, between two facing surfaces of its parts, that carries a given force, or keeps the length found with it.
+
+    The surfaces are tied in all components but for an opening along the axis, which is one and the same all over the section. It is free
+    while the force is given: both parts draw up to each other, and past, until the section carries the force to rounding. ``lock`` keeps
+    the opening from then on, so that the bolt is a spring among others.
+
+    It is a ``Contact`` with ``tied=True`` and has its results: ``force`` is the field of nodal forces on both faces, as of any contact,
+    and ``carried`` the force across the section.
+
+    Args:
+        contactor: one face of the section, as of ``Contact``.
+        target: the other, of a mesh; the two need not match.
+        axis: direction of the bolt ``(gdim,)``, of any length and either sign; None is the section's mean normal. It stays as it is when
+            bodies turn.
+        force: that the section carries, positive in tension: of what is modelled of it, so that half a bolt carries half of the force; on
+            axisymmetric meshes of the whole circle. A number acts in full from the first step on, a function of the load factor, in time
+            steps of the time, follows it.
+        coupling: as of ``Contact``.
+        measure: likewise.
+        name: likewise.
+
+    Raises:
+        InputError, InputTypeError: for an axis or a force that is none, or a rigid target.
+    """
+
+    def __init__(
+        self,
+        contactor: Part,
+        target: Part,
+        axis: npt.ArrayLike | None = None,
+        *,
+        force: float | Callable[[float], float],
+        coupling: str | Callable[..., Discretisation] = "node_to_surface",
+        measure: str = "reference",
+        name: str | None = None,
+    ):
+        with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
+            meshed = not hasattr(target, "project")
+            given.kind(
+                "target",
+                target,
+                meshed,
+                "the other face of the section",
+                "hold a part of the bolt by Dirichlet conditions instead",
+            )
+            self._axis = None if axis is None else given.direction("axis", axis)
+            self._force = _given_force(force)
+        super().__init__(contactor, target, coupling=coupling, tied=True, measure=measure, name=name)
+
+    def __repr__(self) -> str:
+        """Its name, coupling, and what it has been given."""
+        axis = "" if self._axis is None else f", axis={self._axis.tolist()}"
+        return f"Preload({self.name!r}{axis}, force={given.shown(self._force)}, coupling={self.coupling!r})"
+
+    # -- what users do with it -------------------------------------------------------------------------------------------
+
+    def tighten(self, force: float | Callable[[float], float]) -> None:
+        """Give another force, from the next step on; a locked section is free again (collective).
+
+        Raises:
+            InputError, InputTypeError: for what is no force.
+        """
+        pair = self._section
+        with agreed(self.config.comm):
+            force = _given_force(force)
+        given.alike(self.config.comm, self._words, force=force)
+        self._force = force
+        self._take_force()
+        pair.release()
+
+    def lock(self) -> None:
+        """Keep the present opening from the next step on; nothing else changes, and a locked section stays as it is (collective)."""
+        if not self._section.locked:
+            self._section.lock()
+
+    @property
+    def locked(self) -> bool:
+        """Whether the opening is kept."""
+        return self._section.locked
+
+    @property
+    def opening(self) -> float:
+        """How much farther the faces are apart along the axis than drawn, a length; negative where the bolt is shortened (collective)."""
+        return self._section.find_opening()
+
+    @property
+    def carried(self) -> float:
+        """Force that the section carries in the last step, positive in tension, whether it is locked or not (collective)."""
+        return self._section.carried
+
+    # -- in a problem ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _section(self) -> Preloaded:
+        assert isinstance(self.pair, Preloaded)
+        return self.pair
+
+    @property
+    def _words(self) -> str:
+        return f"preload '{self.name}'"
+
+    def words(self) -> dict[str, str]:
+        """As of ``Contact``, and the axis."""
+        axis = "normal" if self._axis is None else " ".join(f"{a:.6g}" for a in self._axis)
+        return super().words() | {"axis": axis}
+
+    def attach(self, config: Configuration, free: Bools, **clock: Any) -> Interface:
+        """As of ``Contact``; also (collective).
+
+        Raises:
+            InputError: if the axis is of another dimension, or leaves that of an axisymmetric mesh, or lies in the section.
+        """
+        with agreed(config.comm):
+            if self._axis is not None:
+                given.direction(f"{self._words}: axis", self._axis, config.gdim)
+                if is_axisymmetric(config.mesh) and self._axis[0] != 0.0:
+                    raise InputError(given.sentence(f"{self._words}: axis", self._axis, "the axis of symmetry, (0, 1)"))
+        given.alike(config.comm, self._words, force=self._force, axis=self._axis)
+        self._free = free
+        super().attach(config, free, **clock)
+        self._take_force()
+        return self.pair
+
+    def _interface(
+        self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any
+    ) -> Interface:
+        pair = Preloaded(
+            self.config, nodes, discretisation, friction, axis=self._axis, free=self._free[nodes], means=means, reach=None, **of
+        )
+        pair.project()
+        pair.tie()
+        return pair
+
+    def begin(self) -> None:
+        """As of ``Contact``; faces that are drawn past each other are inside the other part (collective)."""
+        super().begin()
+        self._corners = None
+
+    def take_load(self, at: float, known: bool = False) -> None:
+        """As of ``Contact``, and the force (collective)."""
+        super().take_load(at, known)
+        if callable(self._force):
+            self._take_force()
+
+    def _take_force(self) -> None:
+        """Hand the force that belongs to the present load factor or time to the pair (collective)."""
+        force = self._force
+        if callable(force):
+            words = f"{self._words}: force({self._at:.6g})"
+            value = ask_together(self.config.comm, words, force, self._at)
+            with agreed(self.config.comm):
+                force = given.number(words, value)
+        self._section.force = force
+
+
+def _given_force(force: Any) -> Any:
+    """A number or a function of the load factor; refuse all else."""
+    return force if callable(force) else given.number("force", force)

@@ -1,0 +1,64 @@
+"""What a checkpoint keeps of a ``UnitedProblem``, and how it is read back into one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx.restart.state import State
+
+
+def state_of(problem: Any) -> State:
+    """Functions and numbers of a problem; read back, its next step is the one that would have come (collective)."""
+    stiffness, own, config = fem.Function(problem.config.V), problem.config.functions(), problem.config
+    starts = {name: fem.Function(f.function_space) for name, f in own.items()}
+    functions = own | {"stiffness": stiffness}
+    for i, pair in enumerate(problem.pairs, 1):
+        functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
+    ramped = problem.dynamics is None
+    if problem.dynamics is None:
+        functions |= {"load start" + name.removeprefix("displacement"): f for name, f in starts.items()}
+    else:
+        d = problem.dynamics
+        functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
+        functions["mean velocity"] = d.mean_velocity
+    for i, material in enumerate(problem.materials, 1):
+        functions |= {f"{name} {i}": f for name, f in material.history.items()}
+    state = State(problem.config.mesh, functions, problem.contacts, settings=problem.settings.describe(problem.comm))
+
+    def collect() -> None:
+        config.functions()
+        known = problem.bodies.to_checkpoint(stiffness)
+        # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
+        problem.system.forget()
+        state.numbers |= {"largest forces": np.asarray(problem.largest_forces).tolist(), "stiffness known": known}
+        state.numbers |= problem.progress.to_checkpoint(ramped)
+        if ramped and problem.progress.ramp:
+            config.fill(starts, problem.progress.start)
+        if problem.dynamics is not None:
+            state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
+
+    def restore() -> None:
+        if config.unknowns.mixed:
+            problem.u.x.array[:] = config.values_of(own)
+            for pair in problem.pairs:
+                # they have been projected where the bodies were before
+                pair.remember(pair.memory())
+                pair.project()
+        problem.committed, problem.motions = np.array(problem.u.x.array), problem.rigid_motions()
+        problem.largest_forces = np.asarray(state.numbers["largest forces"])[()]
+        problem.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
+        problem.progress.from_checkpoint(state.numbers, config.values_of(starts) if ramped else None)
+        if problem.dynamics is not None:
+            problem.dynamics.from_checkpoint(state.numbers)
+            problem.step_control.from_checkpoint(state.numbers)
+        for contact in problem.contacts:
+            contact.take_load(problem.progress.factor if problem.dynamics is None else problem.dynamics.time, known=True)
+        if problem.linear is not None:
+            problem.linear.take_load(problem.progress.factor if problem.dynamics is None else problem.dynamics.time)
+
+    state.collect.append(collect)
+    state.restore.append(restore)
+    return state

@@ -1,0 +1,163 @@
+"""Natural frequencies of bodies in the state of contact that they are in: ``P'KP q = omega^2 P'MP q``, by SLEPc."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import given
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.mass import Mass
+from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.checks import refuse_other_fields
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.rows import make_rows
+from uem_dolfinx.solve.system import BodySystem
+from uem_dolfinx.solve.tangent import curvature_of, together
+
+#: Eigenvalues are looked for beside minus this part of about the largest one, so that bodies that float leave nothing singular.
+#: [heuristic; the largest eigenvalue; test_modes.py::test_a_periodic_column]
+SHIFT = 1e-9
+#: Relative error of the eigenvalues.
+#: [bound; the eigenvalue; -]
+EIGENVALUE = 1e-10
+
+
+@dataclass(frozen=True)
+class Vibrations:
+    """Natural vibrations about an equilibrium.
+
+    Attributes:
+        frequencies: in cycles per unit of time, ascending ``(n,)``; negative where a motion grows instead, as the equilibrium is unstable.
+        eigenvalues: squares of the circular frequencies ``(n,)``.
+        functions: displacements of the modes, with ``v'Mv = 1``; their signs are arbitrary.
+    """
+
+    frequencies: Array
+    eigenvalues: Array
+    functions: list[fem.Function]
+
+
+def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vibrations:
+    """The lowest natural frequencies of small vibrations about the present equilibrium, with the present contact (collective).
+
+    Contactors that touch stay united to their targets, those that stick in all directions, those that slip along the normal alone, without
+    friction; the others are free. Forces of the contact and of the bodies stiffen or soften as in the tangent of Newton's method; damping
+    is left out.
+
+        frequencies = uem.modes(problem, 4, mass=uem.consistent_mass(V, rho)).frequencies
+
+    Args:
+        problem: in equilibrium.
+        n: number of modes.
+        mass: of the bodies; None takes that of the problem's dynamics.
+
+    Raises:
+        MissingBackendError: without slepc4py.
+        InputError, InputTypeError, SpaceError: if there is no mass, or it is of another space, for a displacement among other fields,
+            or for more modes than components with mass.
+        LinearSolveError: if SLEPc does not find them.
+    """
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    config, bodies, system = problem.config, problem.bodies, problem.system
+    with agreed(problem.comm):
+        n = given.count("n", n)
+        refuse_other_fields(config, "natural frequencies", "leave the other fields to a problem of their own")
+        if mass is None and problem.dynamics is None:
+            raise InputError("modes need a mass, and the problem has no dynamics: give mass=uem.consistent_mass(V, density)")
+        mass = problem.dynamics.mass if mass is None and problem.dynamics is not None else mass
+        given.kind("mass", mass, isinstance(mass, Mass), "a Mass, as consistent_mass returns it")
+        assert mass is not None
+        if mass.M.getSizes()[0] != bodies.tangent.K.getSizes()[0]:
+            raise SpaceError("the mass is of another space than the displacement: make it with the displacement's space")
+        if not isinstance(system, BodySystem):
+            raise InputError("modes need contact by elimination: the default method")
+    given.alike(problem.comm, "modes", n=n)
+    slepc = _slepc()
+    with nullcontext() if problem.dynamics is None else problem.dynamics.without_inertia():
+        bodies.assemble()
+        bodies.tangent.update()
+        # bodies that float are to be free
+        rows = make_rows(
+            system.over_constraints, system.pairs, lambda *_: bodies.free_rows, 0.0 * bodies.prescribed, system.linear
+        )
+        curvature = curvature_of(system.pairs, config.vector(), False, False) if system.consistent_tangent else None
+        P = rows.frictionless
+        with timed("united matrix"):
+            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, mass.M)
+    return _solve(slepc, P, A, B, n)
+
+
+def _slepc() -> Any:
+    try:
+        from slepc4py import SLEPc
+    except ImportError as error:
+        raise MissingBackendError(
+            f"modes need slepc4py ({error}): install python3-slepc4py-real on Debian, or pip install slepc4py"
+        ) from error
+    return SLEPc
+
+
+def _united(P: Restriction, A: PETSc.Mat) -> PETSc.Mat:
+    """``P'AP``, with zeros in idle columns (collective)."""
+    if not P.alone:
+        return A.PtAP(P.P)
+    A = A.copy()
+    P.cross_out(A)
+    return A
+
+
+def _solve(slepc: Any, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vibrations:
+    """Eigenvectors of lowest eigenvalues, as displacements (collective)."""
+    comm, used = P.comm, P.used.ravel()
+    stiffness, inertia = A.getDiagonal(), B.getDiagonal()
+    moving = int(reduced(comm, int((used & (inertia.array_r > 0.0)).sum())))
+    if moving < n:
+        raise InputError(f"n = {n}: expected no more than {moving} modes, the number of free components with mass")
+    largest = stiffness.norm() / inertia.norm()
+    # idle components vibrate infinitely fast
+    stiffness.array[~used] = stiffness.max()[1]
+    A.setDiagonal(stiffness)
+    eps = slepc.EPS().create(comm)
+    eps.setOperators(A, B)
+    eps.setProblemType(slepc.EPS.ProblemType.GHEP)
+    eps.setDimensions(n)
+    eps.setTolerances(EIGENVALUE)
+    eps.setWhichEigenpairs(slepc.EPS.Which.TARGET_MAGNITUDE)
+    eps.setTarget(-SHIFT * largest)
+    transform = eps.getST()
+    transform.setType("sinvert")
+    ksp = transform.getKSP()
+    ksp.setType("preonly")
+    ksp.getPC().setType("cholesky")
+    ksp.getPC().setFactorSolverType("mumps")
+    with timed("eigenvalues"):
+        eps.solve()
+    if eps.getConverged() < n:
+        raise LinearSolveError(
+            f"SLEPc found {eps.getConverged()} of {n} modes (reason {eps.getConvergedReason()}): ask for fewer, or check that the mass "
+            "is not negative and the stiffness symmetric"
+        )
+    found = []
+    for i in range(n):
+        q = A.createVecRight()
+        value = eps.getEigenpair(i, q).real
+        found.append((value, P.expand(P.space.vector(q.array_r))))
+    found.sort(key=lambda pair: pair[0])
+    values = np.array([value for value, _ in found])
+    eps.destroy()
+    functions = []
+    for i, (_, v) in enumerate(found):
+        function = fem.Function(P.space.V, name=f"mode_{i + 1}")
+        function.x.array[: len(v.array_r)] = v.array_r
+        function.x.scatter_forward()
+        functions.append(function)
+    return Vibrations(np.sign(values) * np.sqrt(np.abs(values)) / (2.0 * np.pi), values, functions)
