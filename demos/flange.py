@@ -3,7 +3,7 @@
 python3 demos/flange.py --plot flange.png
 
 Options:
-    n: cells in every direction on the first mesh, over those that the mesh file has
+    n: number of cells in every direction on the last mesh, as a multiple of those in the mesh file
     steps: load steps of the pull
     preload: force of a bolt in N
     pull: largest pull per bolt, over the preload
