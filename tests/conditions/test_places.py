@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, box, clamp, linear, refused, scene
+from helpers import at, blocks, box, clamp, linear, refused, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -35,6 +35,11 @@ def test_how_near_a_node_must_be(square):
             assert COMM.allreduce(len(nodes)) == 1 and np.allclose(config.X[nodes], (0.5, 0.5))
         else:
             refused(uem.InputError, ("no node is there", "(0.5, 0.5)"), lambda place=place: nodes_at(config, place, "the place"))
+    b = blocks(COMM, "triangle", 1, 1)
+    refused(uem.InputError, "several nodes are there", lambda: nodes_at(Configuration(b.u), (1.0, 0.0), "the place"))
+    left, right = ([b.scene.tag("side", body, at(0, end)) for body in (0, 1)] for end in (0.0, 1.0))
+    both = uem.periodic(right, left)
+    refused(uem.SurfaceError, "several partners", lambda: both.rows(Configuration(b.u), "equations[0]"))
     own = np.flatnonzero(np.isclose(config.X[: config.n_owned, 0], 1.0)).astype(np.int32)
     numbers, distance, following = partners(config, config.X[own] + [0.0, 1e-3], own)
     assert np.array_equal(numbers, config.to_global(own))

@@ -15,7 +15,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.conditions.places import NEAR, described, global_nodes, middle_of, nodes_at, partners
+from uem_dolfinx.conditions.places import COINCIDENT, NEAR, described, global_nodes, middle_of, nodes_at, partners
 from uem_dolfinx.errors import InputError, InputTypeError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.tags import Part, name_of
@@ -167,8 +167,13 @@ class Periodic:
         images = self._images(config, x, middle_of(config, leader) - middle_of(config, follower), role)
         self._check_sizes(config, len(follower), len(leader), role)
         there, distance, following = partners(config, images, leader)
-        error, bad = None, distance > NEAR * following
-        if bad.any():
+        error, bad, double = None, distance > NEAR * following, following <= COINCIDENT * config.size
+        if double.any():
+            error = SurfaceError(
+                f"{role}: the node at {config.describe(int(follower[np.argmax(double)]))} has several partners, as "
+                f"'{name_of(self._leader)}' has several nodes at one place: give the surfaces of each body by themselves"
+            )
+        elif bad.any():
             i = int(np.argmax(np.where(bad, distance, -1.0)))
             place = ", ".join(f"{v:.6g}" for v in images[i])
             error = SurfaceError(

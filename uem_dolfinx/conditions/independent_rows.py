@@ -19,13 +19,10 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.algebra.rings import DEPENDENT
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.conditions.places import COINCIDENT
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.parallel import reduced
-
-#: Coordinates that differ by less are the same where equations are put in order.
-#: [bound; the model's size; -]
-SAME_ROW = 1e-9
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,7 @@ def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, 
     mine = rows.value, item, known, np.bincount(rows.row, minlength=len(rows)), rows.node, rows.coefficients, size > 0, spared
     parts = comm.allgather(mine)
     value, declared, x, count, node, c, movable, last = (np.concatenate(arrays) for arrays in zip(*parts))
-    places = np.round(x / (SAME_ROW * config.size))
+    places = np.round(x / (COINCIDENT * config.size))
     order = np.lexsort([value, *places.T[::-1], declared])
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

@@ -20,6 +20,9 @@ from uem_dolfinx.parallel import gathered, reduced
 #: A node is where it is looked for if it is nearer than this part of the distance to the next one.
 #: [convention; distance to the next node; test_places.py::test_how_near_a_node_must_be]
 NEAR = 1e-3
+#: Places that differ by less are the same: no node can be told from another one there.
+#: [bound; the model's size; -]
+COINCIDENT = 1e-9
 
 
 def is_point(where: Any) -> bool:
@@ -63,6 +66,10 @@ def _node_at(config: Configuration, point: Array, role: str) -> Indices:
     offers[: len(nearest)] = np.column_stack([distance[nearest], config.X[nearest]])
     every = gathered(config.comm, offers).reshape(-1, 1 + config.gdim)
     first, second = np.argsort(every[:, 0], kind="stable")[:2]
+    if every[second, 0] <= COINCIDENT * config.size:
+        raise InputError(
+            f"{role} = {described(point)}: several nodes are there, of bodies that touch; give a tag of the point of one body"
+        )
     if not every[first, 0] <= NEAR * every[second, 0]:
         place = ", ".join(f"{x:.6g}" for x in every[first, 1:])
         raise InputError(
