@@ -12,6 +12,7 @@ from dolfinx import fem
 from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
 from ufl.algorithms.remove_complex_nodes import remove_complex_nodes
 from ufl.core.expr import Expr
+from ufl.differentiation import Derivative
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
@@ -94,3 +95,18 @@ def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
 
 def _mesh(domain: Any) -> str:
     return "one mesh" if domain is None else "the displacement's mesh"
+
+
+def takes_values(form: ufl.Form, u: Any) -> bool:
+    """Whether a form takes values of u, not of its derivatives alone, as springs do."""
+    seen: set[int] = set()
+    kept = ufl.algorithms.expand_derivatives(form)
+    todo = [integral.integrand() for integral in kept.integrals()]
+    while todo:
+        e = todo.pop()
+        if e is u:
+            return True
+        if id(e) not in seen and not isinstance(e, Derivative):
+            seen.add(id(e))
+            todo.extend(e.ufl_operands)
+    return False

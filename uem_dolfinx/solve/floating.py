@@ -18,6 +18,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
@@ -77,10 +78,13 @@ class FloatingBodies:
 
     def _floating(self, motions: RigidMotions) -> RigidMotions | None:
         """The motions, if neither conditions nor springs in the form hold all bodies; else None (collective)."""
+        bodies = self._bodies
         if not motions.any_open():
             return None
-        self._bodies.initial_stiffness()
-        motions.ask_stiffness(self._bodies.tangent.K)
+        if bodies.points is None and not takes_values(bodies.F, bodies.u):
+            return motions
+        bodies.initial_stiffness()
+        motions.ask_stiffness(bodies.tangent.K)
         return motions if motions.any_open() else None
 
     def begin_step(self, place: Callable[[], None]) -> None:
