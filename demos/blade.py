@@ -92,7 +92,7 @@ if args.output:
         writer.write(1.0)
 
 # %%
-# the generator's meshes of the two differ by rounding
+# some versions of Gmsh mesh the two alike but for a few cells
 assert error < 1e-7, error
 assert all(row["active"] == rows[0]["active"] for row in rows)
 assert rows[0]["lowest"] < 0.5 * one_piece[0] and rows[-1]["off_one_piece"] < 0.02
