@@ -60,7 +60,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """The number of cases of a parametrised test that are quick."""
-    parser.addoption("--cases", type=int, default=3, help="so many cases of each parametrised test are not marked slow (3)")
+    parser.addoption("--cases", type=int, default=2, help="so many cases of each parametrised test are not marked slow (2)")
 
 
 @pytest.hookimpl(tryfirst=True)
