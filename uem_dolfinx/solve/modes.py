@@ -23,9 +23,6 @@ from uem_dolfinx.solve.rows import make_rows
 from uem_dolfinx.solve.system import BodySystem
 from uem_dolfinx.solve.tangent import curvature_of, together
 
-#: Eigenvalues are looked for beside minus this part of about the largest one, so that bodies that float leave nothing singular.
-#: [heuristic; the largest eigenvalue; test_modes.py::test_a_periodic_column]
-SHIFT = 1e-9
 #: Relative error of the eigenvalues.
 #: [bound; the eigenvalue; -]
 EIGENVALUE = 1e-10
@@ -132,7 +129,8 @@ def _solve(slepc: Any, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vi
     eps.setDimensions(n)
     eps.setTolerances(EIGENVALUE)
     eps.setWhichEigenpairs(slepc.EPS.Which.TARGET_MAGNITUDE)
-    eps.setTarget(-SHIFT * largest)
+    # below zero, so that bodies that float leave nothing singular: half of all digits from rounding, half from the largest eigenvalue
+    eps.setTarget(-np.sqrt(np.finfo(float).eps) * largest)
     transform = eps.getST()
     transform.setType("sinvert")
     ksp = transform.getKSP()
