@@ -322,7 +322,7 @@ class Contact(WatchedContact):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, heat=None if self.heat is None else list(self.heat.parameters.values()),
+            wear=self._wear, heat=None if self.heat is None else [given.described(p) for p in self.heat.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)

@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.errors import FloatingBodyError
+from uem_dolfinx.forms import product
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import rotation_matrix
@@ -169,11 +170,11 @@ class RigidMotions:
         for k in range(self.n_modes):
             v = unknowns.vector()
             v.array[:size] = modes[:, k].ravel()
-            sides.append((K * v).array_r[:size].reshape(-1, config.gdim))
+            sides.append(product(K, v).array_r[:size].reshape(-1, config.gdim))
         work = np.einsum("nmg,kng->nmk", modes, np.array(sides))
         diagonal = np.abs(K.getDiagonal().array_r[:size].reshape(-1, config.gdim))
         parts = np.concatenate([work, np.einsum("nmg,ng->nm", modes**2, diagonal)[:, :, None]], axis=2)
-        sums = reduced(self.comm, sums_of_rows(own, parts.reshape(len(own), -1), self.count))
+        sums = reduced(self.comm, sums_of_rows(own, parts.reshape(len(own), self.n_modes * (self.n_modes + 1)), self.count))
         if not np.isfinite(sums).all():
             return
         G, D = np.split(sums.reshape(self.count, self.n_modes, -1), [self.n_modes], axis=2)
