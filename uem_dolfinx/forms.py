@@ -296,10 +296,15 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     return float(reduced(comm, sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
 
 
-def product(A: PETSc.Mat, x: PETSc.Vec) -> PETSc.Vec:
-    """``A x`` of a square matrix, in a vector made after ``x``: ranks agree on one made after ``A``, as ``A * x`` is (collective)."""
+def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec:
+    """``(A + G) x`` of square matrices, of which the second may be missing (collective).
+
+    The vector has the layout of ``x``; for ``A * x`` petsc4py makes a layout anew, which takes two more collective calls.
+    """
     y = x.duplicate()
     A.mult(x, y)
+    if G is not None:
+        y.axpy(1.0, product(G, x))
     return y
 
 

@@ -103,10 +103,7 @@ class _United:
     def mult(self, _: PETSc.Mat, q: PETSc.Vec, y: PETSc.Vec) -> None:
         """``y = P'(K + G)P q``."""
         du = self.P.expand(q)
-        forces = forms.product(self.K, du)
-        if self.G is not None:
-            forces.axpy(1.0, self.G * du)
-        self.P.transpose(forces).copy(y)
+        self.P.transpose(forms.product(self.K, du, self.G)).copy(y)
 
 
 class _Solves:

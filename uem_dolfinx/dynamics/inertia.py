@@ -16,7 +16,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat, given
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
@@ -365,10 +365,10 @@ class Dynamics:
 
     def momentum(self) -> Array:
         """Momentum ``(gdim,)``, of axisymmetric bodies that along the axis (collective)."""
-        p = self.mass.M * self._like(self.velocity.x.array[: self._n])
+        p = forms.product(self.mass.M, self._like(self.velocity.x.array[: self._n]))
         return self.config.of_circles(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2`` (collective)."""
         v = self._like(self.velocity.x.array[: self._n])
-        return 0.5 * float(v.dot(self.mass.M * v))
+        return 0.5 * float(v.dot(forms.product(self.mass.M, v)))

@@ -71,12 +71,14 @@ class Columns:
         return found
 
     def row(self) -> list[float]:
-        """The numbers of all columns now (collective).
+        """The numbers of all columns now (collective where there are any).
 
         Raises:
             InputError, InputTypeError: if a function returns no finite numbers, other ones on other ranks, or more or fewer than at first.
             UserFunctionError: if it raises an error.
         """
+        if not self._asked:
+            return []
         values = self._values()
         with agreed(self._comm):
             for name, value in values.items():

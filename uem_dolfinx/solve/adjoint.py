@@ -140,10 +140,7 @@ class Linearised:
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
         """``(K + G) du`` (collective)."""
-        forces = self.K * du
-        if self.G is not None:
-            forces.axpy(1.0, self.G * du)
-        return forces
+        return forms.product(self.K, du, self.G)
 
     def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
         """What moves with changes of controls (collective)."""
@@ -161,7 +158,7 @@ class Linearised:
             prescribed += self.prescribed_by(m, values)
         shape.x.scatter_forward()
         drawn = config.vector(shape.x.array[: config.n_owned * config.gdim])
-        forces.axpy(1.0, self.K * drawn)
+        forces.axpy(1.0, forms.product(self.K, drawn))
         held = ~self.problem.bodies.free[: config.n_owned]
         c = self.P.carried(prescribed + np.where(held, drawn.array_r.reshape(-1, config.gdim), 0.0))
         way = self.solve(forces - self.stiffness(c))
@@ -243,7 +240,7 @@ class Adjoint:
         held = ~at.problem.bodies.free[: config.n_owned]
         self.by_values = np.where(held, at.P.carried_back(drive - at.stiffness(along)), 0.0)
         #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
-        self._by_places = (at.K * left - of_u + drawn).array_r + self.by_values.ravel()
+        self._by_places = (forms.product(at.K, left) - of_u + drawn).array_r + self.by_values.ravel()
 
     def by(self, m: Control) -> Array | fem.Function:
         """Derivative by a control."""

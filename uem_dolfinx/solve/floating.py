@@ -8,6 +8,7 @@ statically determinate way, where the reaction is zero.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -76,12 +77,17 @@ class FloatingBodies:
         #: Likewise with those that friction alone resists, where all contactors slip.
         self._sliding: Array = np.zeros((0, 0))
 
+    @cached_property
+    def _has_springs(self) -> bool:
+        """Whether bodies may be held beside conditions: by springs at nodes, or by a form of displacements themselves."""
+        return self._bodies.points is not None or takes_values(self._bodies.F, self._bodies.u)
+
     def _floating(self, motions: RigidMotions) -> RigidMotions | None:
         """The motions, if neither conditions nor springs in the form hold all bodies; else None (collective)."""
         bodies = self._bodies
         if not motions.any_open():
             return None
-        if bodies.points is None and not takes_values(bodies.F, bodies.u):
+        if not self._has_springs:
             return motions
         bodies.initial_stiffness()
         motions.ask_stiffness(bodies.tangent.K)

@@ -54,10 +54,11 @@ def state_of(problem: Any) -> State:
         if problem.dynamics is not None:
             problem.dynamics.from_checkpoint(state.numbers)
             problem.step_control.from_checkpoint(state.numbers)
+        at = problem.progress.factor if problem.dynamics is None else problem.dynamics.time
         for contact in problem.contacts:
-            contact.take_load(problem.progress.factor if problem.dynamics is None else problem.dynamics.time, known=True)
+            contact.take_load(at, known=True)
         if problem.linear is not None:
-            problem.linear.take_load(problem.progress.factor if problem.dynamics is None else problem.dynamics.time)
+            problem.linear.take_load(at)
 
     state.collect.append(collect)
     state.restore.append(restore)
