@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.sliding import Sliding
+    from uem_dolfinx.contact.tie import Tie
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
@@ -327,11 +328,15 @@ class Contact(WatchedContact):
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
         thickness = np.inf if self.thickness is None else self.thickness
-        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding, "thickness": thickness}
+        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding}
         of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
-        self._pair, self._offsets = self._interface(nodes, discretisation, means, friction, **of), None
+        tie = self._tie(nodes, discretisation, means, **of) if self.tied else None
+        self._pair, self._offsets = Interface(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
+        if self.tied is True:
+            self._pair.project()
+            self._pair.unite()
         if self.adjust and self.tied is not True:
             self._offsets_of_pair().adjust(self.adjust)
         self._set_offset()
@@ -362,7 +367,7 @@ class Contact(WatchedContact):
         return self._pair
 
     def _discretised(self, nodes: Indices, target: Target, **how: Any) -> tuple[Discretisation, Mortar | None]:
-        """What unites contactors with the target, and the means that a tie takes, as of ``Tied`` (collective)."""
+        """What unites contactors with the target, and the means that a tie takes, as of ``Tie`` (collective)."""
         config = self.config
         # points have no facets to integrate over
         if self.coupling == "mortar" and self.contactor.dim > 0:
@@ -406,20 +411,13 @@ class Contact(WatchedContact):
             value_now=None if self._by_pairs is None else self._friction_now,
         )  # fmt: skip
 
-    def _interface(
-        self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any
-    ) -> Interface:
-        """The pair, tied if it is from the start; ``means`` as of ``Tied`` (collective)."""
-        between = self.config, nodes, discretisation, friction
-        if not self.tied:
-            return Interface(*between, **of)
-        from uem_dolfinx.contact.tied import Tied
+    def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie:
+        """What ties contactors; ``means`` as of ``Tie``."""
+        from uem_dolfinx.contact.tie import Tie
 
-        pair = Tied(*between, means=means, reach=None if isinstance(self.adjust, bool) else self.adjust, **of)
-        if self.tied is True:
-            pair.project()
-            pair.tie()
-        return pair
+        return Tie(
+            self.config, nodes, discretisation, means=means, reach=None if isinstance(self.adjust, bool) else self.adjust, **of
+        )
 
     def tie(self) -> None:
         """Unite what touches now with the target for good, where it is, from the next step on; what does not stays in contact.
@@ -432,12 +430,8 @@ class Contact(WatchedContact):
         """
         if self.tied != "after":
             raise InputError(f"contact '{self.name}': tie() is for contacts that are made with tied='after'")
-        from uem_dolfinx.contact.tied import Tied
-
-        pair = self.pair
-        assert isinstance(pair, Tied)
-        pair.tie(pair.committed.active)
-        pair.project()
+        self.pair.unite(self.pair.committed.active)
+        self.pair.project()
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         """Owned contactor nodes, and what they may touch (collective)."""

@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-
 import numpy as np
 import numpy.typing as npt
 
@@ -23,13 +21,13 @@ from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.contact.told import Told
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.heat import Heat
     from uem_dolfinx.contact.sliding import Sliding
+    from uem_dolfinx.contact.tie import Tie
 
 #: Contactors this part of the model's size from where they belong are there.
 #: [derived; the model's size; test_system.py::test_the_normal_return]
@@ -44,6 +42,7 @@ class Interface(Told):
         nodes: owned contactor nodes ``(n,)``.
         discretisation: what ties them to their target.
         friction: what it adds along the target; None without.
+        tie: what ties contactors for good, beside contact; None without.
         name: for messages.
         sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
         max_penetration: bound on the initial penetration, a length.
@@ -59,7 +58,6 @@ class Interface(Told):
         barred: contactors that came back into the target from past its end with a blow; they are left out until they are in front of it
             again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
-        tied: contactors that are united with the target in all components for good, beside contact ``(n,)``.
         heat: what passes through; None without.
     """
 
@@ -71,36 +69,23 @@ class Interface(Told):
         nodes: Indices,
         discretisation: Discretisation,
         friction: Sliding | None = None,
+        tie: Tie | None = None,
         *,
         name: str,
         sliding: str,
         max_penetration: float,
         thickness: float = np.inf,
     ):
-        self.config, self.nodes, self.discretisation, self.friction = config, nodes, discretisation, friction
+        self.config, self.nodes, self.discretisation, self.friction, self.tie = config, nodes, discretisation, friction, tie
         self.name, self.sliding, self.max_penetration, self.thickness = name, sliding, max_penetration, thickness
         n, g = len(nodes), config.gdim
         state = PairState.initial(n, g)
-        self.trial = self.committed = replace(state, friction=FrictionState.initial(n, g)) if friction else state
+        along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
+        self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.initial_overlap, self.mutual = 0.0, False
         self.heat: Heat | None = None
         none: Bools = np.zeros(n, dtype=bool)
-        self.redundant = self.reserved = self.barred = self.tied = none
-
-    @property
-    def frictional(self) -> bool:
-        """Whether there is friction."""
-        return self.friction is not None
-
-    @property
-    def target(self) -> Target:
-        """What the contactors may touch."""
-        return self.discretisation.target
-
-    @property
-    def points(self) -> Array:
-        """Current positions of the contactors ``(n, gdim)``."""
-        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+        self.redundant = self.reserved = self.barred = none
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -111,6 +96,8 @@ class Interface(Told):
         Raises:
             NotFiniteError: if the target's functions return what is not finite.
         """
+        if self.tie is not None and not self.tie.begin_placement():
+            return
         self.kinematics = self.discretisation.place(self.points, self.trial)
         p = self.projection
         bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
@@ -134,24 +121,13 @@ class Interface(Told):
                 self.friction.replace(kinematics)
 
     @property
-    def projection(self) -> Projection:
-        """Of the contactors, as last placed."""
-        return self.kinematics.projection
-
-    @property
-    def gap(self) -> Array:
-        """Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
-        return self.kinematics.gap
-
-    @property
     def off(self) -> Bools:
-        """Contactors that have slid past an end of the target, and are not taken back yet ``(n,)``."""
-        return self.kinematics.off(self.trial) | self.barred
+        """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""
+        return self._past_end if self.tie is None else self._past_end | self.tie.excluded
 
     @property
-    def movable(self) -> Bools:
-        """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
-        return self.kinematics.movable
+    def _past_end(self) -> Bools:
+        return self.kinematics.off(self.trial) | self.barred
 
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
@@ -160,21 +136,6 @@ class Interface(Told):
             correction = correction + self.friction.return_vectors(self.trial)
         correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
         return correction
-
-    @property
-    def pattern(self) -> Ints:
-        """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
-        told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
-        return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
-
-    def largest_gap_here(self) -> float:
-        """Largest gap of an active contactor of this rank, or distance from the anchor that it sticks to, a length."""
-        here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
-        return here if self.friction is None else max(here, self.friction.largest_distance(self.trial, self.redundant))
-
-    def largest_gap(self) -> float:
-        """``largest_gap_here`` over all ranks, a length (collective)."""
-        return float(reduced(self.config.comm, self.largest_gap_here(), op=MPI.MAX))
 
     # -- activation and release ------------------------------------------------------------------------------------------
 
@@ -331,7 +292,7 @@ class Interface(Told):
     # -- what the united system gets -------------------------------------------------------------------------------------
 
     def equations(self) -> Constraints:
-        """Uniting equations of the contactors that are or may become active (collective).
+        """Uniting equations of the contactors that are or may become active, then of those that are tied (collective).
 
         Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
         """
@@ -339,10 +300,15 @@ class Interface(Told):
         if lacks:
             self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
-        return own if self.friction is None else self.friction.equations(own, self.trial, self.kinematics)
+        if self.friction is not None:
+            own = self.friction.equations(own, self.trial, self.kinematics)
+        return own if self.tie is None else self.tie.join(own)
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
         """Take which of the equations ``(m,)`` depend on others and were left out."""
+        if self.tie is not None:
+            self.tie.set_redundant(equations, redundant)
+        equations, redundant = equations.contact, redundant[: len(equations.contact)]
         normal = (equations.kind == NORMAL) & (equations.tangent < 0)
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
         self.redundant[equations.contactor[normal]] = redundant[normal]
@@ -354,23 +320,28 @@ class Interface(Told):
 
         ``du (n_owned, gdim)`` is the increment that they are predicted with; None where the bodies are now.
         """
+        contact = equations.contact
+        of, trial, kinematics = multipliers[: len(contact)], self.trial, self.kinematics
         if self.friction is None:
-            return self.kinematics.forces(self.trial, equations, multipliers)
-        return self.friction.forces(equations, multipliers, self.trial, self.kinematics, du)
+            found = kinematics.forces(trial, contact, of)
+        else:
+            found = self.friction.forces(contact, of, trial, kinematics, du)
+        return found if self.tie is None else self.tie.with_forces(found, equations, multipliers)
 
     @property
     def traction(self) -> Traction:
         """Contact forces of the trial state."""
         t = self.trial
-        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau)
+        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The contact forces of a state at nodes of both bodies; see ``Kinematics.nodal_forces``."""
-        return self.kinematics.nodal_forces(state)
+        own = self.kinematics.nodal_forces
+        return own(state) if self.tie is None else self.tie.nodal_forces(state, own)
 
     def with_forces(self, found: Traction) -> PairState:
         """The trial state with contact forces that were read or predicted."""
-        state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force, heat=found.heat)
+        state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force, heat=found.heat, bond=found.bond)
         if state.friction is None or found.tau is None:
             return state
         return replace(state, friction=replace(state.friction, tau=found.tau))
@@ -387,7 +358,9 @@ class Interface(Told):
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
         parts = self.kinematics.curvature(self.trial)
-        return parts if self.friction is None else parts + self.friction.curvature(self.trial, self.kinematics)
+        if self.friction is not None:
+            parts = parts + self.friction.curvature(self.trial, self.kinematics)
+        return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:
         """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
@@ -399,6 +372,13 @@ class Interface(Told):
         return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
+
+    def unite(self, which: Bools | None = None) -> None:
+        """Tie contactors to the target for good, between two steps, as of ``Tie``; to be followed by ``project`` (collective)."""
+        assert self.tie is not None
+        self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
+        self.reserved = self.reserved & ~self.tied
+        self.restore()
 
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
@@ -422,6 +402,8 @@ class Interface(Told):
     def restore(self) -> None:
         """Go back to the committed state; to be followed by ``project``."""
         self.trial = self.committed
+        if self.tie is not None:
+            self.tie.lose()
 
     def memory(self) -> tuple[PairState, Bools, Bools, Bools]:
         """What the next step begins with, the displacement aside."""
@@ -430,18 +412,18 @@ class Interface(Told):
     def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
         """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
         self.committed, self.reserved, self.redundant, self.barred = memory
+        if self.tie is not None:
+            # what has been tied since then stays so
+            self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
         self.discretisation.commit()
         if self.friction is not None:
             self.friction.forget()
         self.restore()
         self._wear()
 
-    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
-        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
-        return kept | self.committed.to_checkpoint(self.target.keys_of)
-
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
+        if self.tie is not None:
+            self.tie.from_checkpoint(kept, self._past_end)
         reserved, redundant, barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
         self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant, barred))

@@ -81,6 +81,11 @@ class Constraints:
         """Which of the equations hold for good ``(m,)``."""
         return np.zeros(len(self), dtype=bool)
 
+    @property
+    def contact(self) -> Constraints:
+        """Those of contactors that touch, which come first."""
+        return self
+
     def across(self) -> Constraints:
         """The test rows across the target alone, without friction."""
         which = self.tangent < 0

@@ -16,7 +16,6 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation
 from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.preloaded import Preloaded
-from uem_dolfinx.contact.sliding import Sliding
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.configuration import Configuration
@@ -87,13 +86,13 @@ class Preload(Contact):
         Raises:
             InputError, InputTypeError: for what is no force.
         """
-        pair = self._section
+        section = self._section
         with agreed(self.config.comm):
             force = _given_force(force)
         given.alike(self.config.comm, self._words, force=force)
         self._force = force
         self._take_force()
-        pair.release()
+        section.release()
 
     def lock(self) -> None:
         """Keep the present opening from the next step on; nothing else changes, and a locked section stays as it is (collective)."""
@@ -113,14 +112,14 @@ class Preload(Contact):
     @property
     def carried(self) -> float:
         """Force that the section carries in the last step, positive in tension, whether it is locked or not (collective)."""
-        return self._section.carried
+        return self._section.carried(self.pair.committed)
 
     # -- in a problem ----------------------------------------------------------------------------------------------------
 
     @property
     def _section(self) -> Preloaded:
-        assert isinstance(self.pair, Preloaded)
-        return self.pair
+        assert isinstance(self.pair.tie, Preloaded)
+        return self.pair.tie
 
     @property
     def _words(self) -> str:
@@ -148,15 +147,10 @@ class Preload(Contact):
         self._take_force()
         return self.pair
 
-    def _interface(
-        self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, friction: Sliding | None, **of: Any
-    ) -> Interface:
-        pair = Preloaded(
-            self.config, nodes, discretisation, friction, axis=self._axis, free=self._free[nodes], means=means, reach=None, **of
+    def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Preloaded:
+        return Preloaded(
+            self.config, nodes, discretisation, axis=self._axis, free=self._free[nodes], means=means, reach=None, **of
         )
-        pair.project()
-        pair.tie()
-        return pair
 
     def begin(self) -> None:
         """As of ``Contact``; faces that are drawn past each other are inside the other part (collective)."""

@@ -1,4 +1,4 @@
-"""The interface of a preloaded section: two facing surfaces that are tied but for an opening along an axis, which all tied rows share.
+"""The tie of a preloaded section: two facing surfaces that are tied but for an opening along an axis, which all tied rows share.
 
 With the tied rows r, which vanish where nothing opens, the axis a and the opening d,
 
@@ -27,15 +27,17 @@ import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.tied import Tied
+from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.tie import Tie
 from uem_dolfinx.contact.tied_rows import TiedRows
 from uem_dolfinx.errors import InputError, SurfaceError
+from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, gathered, reduced
 
 
-class Preloaded(Tied):
-    """A section that opens along an axis, tied in all else; other arguments as those of ``Tied``.
+class Preloaded(Tie):
+    """A section that opens along an axis, tied in all else; other arguments as those of ``Tie``.
 
     Args:
         axis: direction of length one ``(gdim,)``; None is the mean normal of the target.
@@ -60,14 +62,14 @@ class Preloaded(Tied):
 
     # -- the axis and the leading row ------------------------------------------------------------------------------------
 
-    def tie(self, which: Bools | None = None) -> None:
-        """As of ``Tied`` (collective).
+    def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
+        """As of ``Tie`` (collective).
 
         Raises:
             InputError: if the axis lies in the section.
             SurfaceError: if conditions hold all of it along the axis.
         """
-        n = self.projection.normal[self._within_reach()].sum(axis=0)
+        n = projection.normal[self._within_reach(state)].sum(axis=0)
         n = np.asarray(reduced(self.config.comm, n))
         n = n / (np.linalg.norm(n) or 1.0)
         axis = n if self._given_axis is None else self._given_axis
@@ -77,17 +79,18 @@ class Preloaded(Tied):
             )
         axis = np.where(np.abs(axis) > NEGLIGIBLE, axis, 0.0) * (1.0 if axis @ n > 0 else -1.0)
         self.axis = axis / (np.linalg.norm(axis) or 1.0)
-        super().tie(which)
+        united = super().unite(state, projection, off, which)
         if loose := int(reduced(self.config.comm, int((~self.tied).sum()))):
             logger.warning("%s: %d contactors of the section lie beside the target, and stay loose", self.name, loose)
+        return united
 
-    def _within_reach(self) -> Bools:
-        """As of ``Tied``, and contactors at the rim: below them facets are continued past their sides (collective)."""
-        p = self.target.project(self.points)
+    def _within_reach(self, state: PairState) -> Bools:
+        """As of ``Tie``, and contactors at the rim: below them facets are continued past their sides (collective)."""
+        p = self.target.project(self._points)
         return np.maximum(np.abs(p.gap), p.way_beyond) <= p.facet_size
 
-    def _take_rows(self, rows: TiedRows) -> None:
-        super()._take_rows(rows)
+    def _take_rows(self, rows: TiedRows, off: Bools) -> None:
+        super()._take_rows(rows, off)
         self.whole = True
         i, c = np.nonzero(rows.has)
         self._along = rows.share[i, c] * self.axis[c]
@@ -122,8 +125,8 @@ class Preloaded(Tied):
     # -- rows ------------------------------------------------------------------------------------------------------------
 
     @property
-    def off(self) -> Bools:
-        """As of ``Interface``: all, as loose contactors of the section are in no contact either."""
+    def excluded(self) -> Bools:
+        """As of ``Tie``: all, as loose contactors of the section are in no contact either."""
         return np.ones(len(self.nodes), dtype=bool)
 
     @property
@@ -132,7 +135,7 @@ class Preloaded(Tied):
         return True
 
     def _equations(self) -> UnitingEquations:
-        """As of ``Tied``, gaps counted from the present opening, which is found where it is free (collective)."""
+        """As of ``Tie``, gaps counted from the present opening, which is found where it is free (collective)."""
         if self._here is None:
             here = super()._equations()
             if not self.locked:
@@ -142,7 +145,7 @@ class Preloaded(Tied):
         return self._here
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
-        """As of ``Tied``; while the opening is free, all rows but the leading one, which they follow (collective)."""
+        """As of ``Tie``; while the opening is free, all rows but the leading one, which they follow (collective)."""
         here, (i, c) = self._equations(), np.nonzero(self._has)
         if self.locked:
             return here, i, c
@@ -168,7 +171,7 @@ class Preloaded(Tied):
         return made.select(others), i[others], c[others]
 
     def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
-        """As of ``Tied``; the leading row bears what the given force leaves to it (collective)."""
+        """As of ``Tie``; the leading row bears what the given force leaves to it (collective)."""
         bond = super()._bond(contactor, kind, multipliers)
         return bond if self.locked else bond + self._by_lead(self.force - self._pull(bond))
 
@@ -203,10 +206,9 @@ class Preloaded(Tied):
 
     # -- what is told, and from step to step -----------------------------------------------------------------------------
 
-    @property
-    def carried(self) -> float:
-        """Force across the section in the committed state, positive in tension (collective)."""
-        return 0.0 if self.committed.bond is None else self._pull(self.committed.bond)
+    def carried(self, state: PairState) -> float:
+        """Force across the section in a state, positive in tension (collective)."""
+        return 0.0 if state.bond is None else self._pull(state.bond)
 
     def find_opening(self) -> float:
         """The opening where the bodies are (collective)."""
@@ -223,13 +225,13 @@ class Preloaded(Tied):
         self.locked, self._here = False, None
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """As of ``Interface``, with the opening, and whether it is locked (collective)."""
+        """As of ``Tie``, with the opening, and whether it is locked (collective)."""
         n, opening = len(self.nodes), self.find_opening()
         return super().to_checkpoint() | {"locked": np.full(n, self.locked), "opening": np.full(n, opening)}
 
-    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
-        """As of ``Interface`` (collective)."""
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]], off: Bools) -> None:
+        """As of ``Tie`` (collective)."""
         locked, opening = np.array(kept["locked"]), np.array(kept["opening"])
         self.locked = bool(reduced(self.config.comm, bool(locked.any()), op=MPI.LOR))
         self.opening = float(reduced(self.config.comm, float(opening.max(initial=-np.inf)), op=MPI.MAX))
-        super().from_checkpoint(kept)
+        super().from_checkpoint(kept, off)

@@ -1,15 +1,25 @@
-"""What an interface tells of its contactors, for results, checks and checkpoints; one whose contactors are tied tells of these, too."""
+"""What an interface tells of its contactors, those that are tied among them, for results, checks and checkpoints."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
 import numpy as np
+import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.sliding import Sliding
+    from uem_dolfinx.contact.tie import Tie
 
 
 class Told:
@@ -18,9 +28,66 @@ class Told:
     config: Configuration
     nodes: Indices
     trial: PairState
-    tied: Bools
+    friction: Sliding | None
+    tie: Tie | None
+    committed: PairState
+    reserved: Bools
+    redundant: Bools
+    barred: Bools
     kinematics: Kinematics
     discretisation: Discretisation
+
+    @property
+    def frictional(self) -> bool:
+        """Whether there is friction."""
+        return self.friction is not None
+
+    @property
+    def target(self) -> Target:
+        """What the contactors may touch."""
+        return self.discretisation.target
+
+    @property
+    def points(self) -> Array:
+        """Current positions of the contactors ``(n, gdim)``."""
+        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+
+    @property
+    def projection(self) -> Projection:
+        """Of the contactors, as last placed."""
+        return self.kinematics.projection
+
+    @property
+    def gap(self) -> Array:
+        """Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
+        return self.kinematics.gap
+
+    @property
+    def movable(self) -> Bools:
+        """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
+        return self.kinematics.movable
+
+    @property
+    def pattern(self) -> Ints:
+        """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
+        told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
+        return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
+
+    def largest_gap_here(self) -> float:
+        """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
+        here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
+        if self.friction is not None:
+            here = max(here, self.friction.largest_distance(self.trial, self.redundant))
+        return here if self.tie is None else max(here, self.tie.largest_gap_here())
+
+    def largest_gap(self) -> float:
+        """``largest_gap_here`` over all ranks, a length (collective)."""
+        return float(reduced(self.config.comm, self.largest_gap_here(), op=MPI.MAX))
+
+    @property
+    def tied(self) -> Bools:
+        """Contactors that are united with the target in all components for good ``(n,)``."""
+        return np.zeros(len(self.nodes), dtype=bool) if self.tie is None else self.tie.tied
 
     @property
     def united(self) -> Bools:
@@ -35,35 +102,43 @@ class Told:
     def pressing(self) -> tuple[Array, Array]:
         """Forces across ``(n,)`` and along ``(n, gdim)`` the target that belong to ``areas`` (collective)."""
         t = self.trial
-        return t.lam, 0.0 * t.force if t.friction is None else t.friction.tau
+        tau = 0.0 * t.force if t.friction is None else t.friction.tau
+        return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
 
     def areas(self, areas: Array, current: bool, reference: Array) -> Array:
         """As of ``Kinematics``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
-        return self.kinematics.areas(areas, current)
+        found = self.kinematics.areas(areas, current)
+        return found if self.tie is None else self.tie.areas(areas, reference, found)
 
     def kept_gaps(self) -> Array:
         """Heights over the target that tied contactors keep, of this rank ``(k,)``."""
-        return np.zeros(0)
+        return np.zeros(0) if self.tie is None else self.tie.kept_gaps()
 
     def torn(self) -> Array:
         """How far contactors are from where they are tied if their equations were left out ``(n,)``."""
-        return np.zeros(len(self.nodes))
+        return np.zeros(len(self.nodes)) if self.tie is None else self.tie.torn()
 
     @property
     def chained(self) -> bool:
         """Whether contactors may follow each other."""
-        return self.discretisation.chained
+        return self.discretisation.chained or (self.tie is not None and self.tie.chained)
 
     @property
     def works(self) -> bool:
         """Whether its forces do work by themselves, as where a rigid target moves."""
-        return self.discretisation.target.motion is not None
+        return self.discretisation.target.motion is not None or (self.tie is not None and self.tie.works)
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without any (collective)."""
-        return None
+        return None if self.tie is None else self.tie.applied_forces()
 
     @property
     def functions(self) -> dict[str, fem.Function]:
         """Further Functions that a run goes on from, by name; they are read before ``from_checkpoint`` is called."""
-        return {}
+        return {} if self.tie is None else {"displacement it was tied at": self.tie.at}
+
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
+        kept |= self.committed.to_checkpoint(self.target.keys_of)
+        return kept if self.tie is None else kept | self.tie.to_checkpoint()

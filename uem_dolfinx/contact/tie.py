@@ -1,4 +1,4 @@
-"""The interface of a contact whose contactors are tied to the target: from the start, or from a given step on.
+"""What ties contactors of an interface to the target for good: from the start, or from a given step on.
 
 What is tied has equations of ``tied_rows`` in all components, and no part in contact. What is not, because it was too far away or did
 not touch when the others were tied, goes on as contact does.
@@ -6,7 +6,7 @@ not touch when the others were tied, goes on as contact does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,15 +17,14 @@ from dolfinx import fem
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.bernstein import Bernstein
-from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Constraints, Discretisation, Traction
 from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.node_to_surface import past_end
-from uem_dolfinx.contact.sliding import Sliding
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.tied_rows import TiedRows, to_facets, to_means, to_surface
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import agree, reduced
 
@@ -35,15 +34,20 @@ class TiedConstraints(Constraints):
     """``Constraints`` of contactors that touch, and after them those of contactors that are tied.
 
     Attributes:
-        contact: those that come first.
+        first: those of contactors that touch.
     """
 
-    contact: Constraints
+    first: Constraints
+
+    @property
+    def contact(self) -> Constraints:
+        """As of ``Constraints``."""
+        return self.first
 
     @property
     def tied(self) -> Bools:
         """As of ``Constraints``."""
-        return np.arange(len(self)) >= len(self.contact)
+        return np.arange(len(self)) >= len(self.first)
 
     @classmethod
     def join(cls, contact: Constraints, tied: UnitingEquations, contactor: Ints, kind: Ints) -> TiedConstraints:
@@ -58,15 +62,22 @@ class TiedConstraints(Constraints):
         return cls(trial, test, frictionless, resisting, stopping, contactor, kind, tangent, contact)
 
 
-class Tied(Interface):
-    """Contactors that are tied to the target, besides what an interface is; other arguments as those of ``Interface``.
+class Tie:
+    """What ties contactors of one interface to the target.
 
     Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        discretisation: of the interface.
+        name: for messages.
+        sliding: as of ``Interface``.
+        max_penetration: likewise.
         means: discretisation by which means are found when contactors are tied, which serves nothing else; None ties nodes.
         reach: contactors that are tied at the start are no farther from the target, a length; None is a side of its facet.
 
     Attributes:
         rows: of what is tied; None before.
+        tied: contactors that are united with the target in all components ``(n,)``.
         whole: whether no contactor is left for contact, on any rank.
         at: displacement at which they were tied.
     """
@@ -76,38 +87,47 @@ class Tied(Interface):
         config: Configuration,
         nodes: Indices,
         discretisation: Discretisation,
-        friction: Sliding | None = None,
         *,
+        name: str,
+        sliding: str,
+        max_penetration: float,
         means: Mortar | None,
         reach: float | None,
-        **of: Any,
     ):
-        super().__init__(config, nodes, discretisation, friction, **of)
+        self.config, self.nodes, self.discretisation, self.target = config, nodes, discretisation, discretisation.target
+        self.name, self.sliding, self.max_penetration = name, sliding, max_penetration
         self._means, self._reach = means, reach
         self.rows: TiedRows | None = None
+        self.tied: Bools = np.zeros(len(nodes), dtype=bool)
         self.whole = False
         self.at = fem.Function(config.V, name="tied_at")
-        none = np.zeros((len(nodes), config.gdim))
-        self.trial = self.committed = replace(self.trial, bond=none)
         #: Components whose equations depend on others and were left out ``(n, gdim)``.
-        self._left_out: Bools = none > 0
+        self._left_out: Bools = np.zeros((len(nodes), config.gdim), dtype=bool)
         #: Equations where the bodies have been placed last, and whether a placement is to find contactors again that no contact needs.
         self._here: UnitingEquations | None = None
         self._lost = True
 
     # -- tying -----------------------------------------------------------------------------------------------------------
 
-    def tie(self, which: Bools | None = None) -> None:
-        """Tie contactors where they are now: those within reach, or ``which (n,)``; to be followed by ``project`` (collective).
+    def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
+        """Tie contactors where they are now: those within reach, or ``which (n,)`` (collective).
+
+        Args:
+            state: committed so far.
+            projection: of the contactors.
+            off: contactors that have slid past an end of the target ``(n,)``.
+            which: contactors to be tied ``(n,)``.
+
+        Returns:
+            The committed state, in which what is tied is in no contact and keeps its forces.
 
         Raises:
             SurfaceError: if there are none.
         """
-        state, f = self.committed, self.committed.friction
-        drag = 0.0 if f is None else f.tau
-        forces = state.lam[:, None] * self.projection.normal + drag if self._means else state.force
+        drag = 0.0 if state.friction is None else state.friction.tau
+        forces = state.lam[:, None] * projection.normal + drag if self._means else state.force
         self.at.x.array[:] = self.config.displacement.ravel()
-        self._make(self._within_reach() if which is None else which)
+        self._make(self._within_reach(state) if which is None else which, off)
         assert self.rows is not None
         error = None
         if not reduced(self.config.comm, int(self.tied.sum())):
@@ -116,41 +136,44 @@ class Tied(Interface):
                 f"{self.name}: no contactor {what} to be tied to it: bring the surfaces together, or give a larger adjust"
             )
         agree(self.config.comm, error)
-        self.reserved = self.reserved & ~self.tied
         bond = np.where(self.rows.has, forces / np.where(self.rows.share > 0, self.rows.share, 1.0), 0.0)
-        self.committed = self._untouched(replace(state, bond=bond))
-        self.restore()
+        return self.untouched(replace(state, bond=bond))
 
-    def _within_reach(self) -> Bools:
+    @property
+    def _points(self) -> Array:
+        """Current positions of the contactors ``(n, gdim)``."""
+        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+
+    def _within_reach(self, state: PairState) -> Bools:
         """Contactors near enough to the target to be tied ``(n,)`` (collective)."""
-        p = self.target.project(self.points)
+        p = self.target.project(self._points)
         reach = p.facet_size if self.target.n_nodes else self.max_penetration
         near = np.abs(p.gap) <= (reach if self._reach is None else self._reach)
-        return np.asarray(near if self._means else near & ~past_end(p, self.committed, np.inf))
+        return np.asarray(near if self._means else near & ~past_end(p, state, np.inf))
 
-    def _make(self, which: Bools) -> None:
+    def _make(self, which: Bools, off: Bools) -> None:
         """Rows of contactors ``which (n,)`` where they were at the displacement ``at``, or are on a rigid target (collective)."""
         config, nodes, kept = self.config, self.nodes, self.sliding != "finite"
         if not self.target.n_nodes:
-            self._take_rows(to_surface(config, nodes, self.target, which))
+            self._take_rows(to_surface(config, nodes, self.target, which), off)
             return
         with config.at(config.values_of(config.functions() | {"displacement": self.at})):
             if self._means is not None:
                 self._means.let_go()
-                found = self._means.place(self.points, PairState.initial(len(nodes), config.gdim))
+                found = self._means.place(self._points, PairState.initial(len(nodes), config.gdim))
                 rows = to_means(self._means, found.rows, which, kept)
                 self._means.let_go()
             else:
                 assert isinstance(self.target, MeshTarget)
-                rows = to_facets(config, nodes, self.target, self.target.project(self.points), which, kept)
-        self._take_rows(rows)
+                rows = to_facets(config, nodes, self.target, self.target.project(self._points), which, kept)
+        self._take_rows(rows, off)
 
-    def _take_rows(self, rows: TiedRows) -> None:
+    def _take_rows(self, rows: TiedRows, off: Bools) -> None:
+        """Take the rows; ``off (n,)`` as of ``unite`` (collective)."""
         self.rows, self.tied, self._here, self._lost = rows, np.asarray(rows.has.any(axis=1)), None, True
-        left = ~self.tied & ~super().off
-        self.whole = not reduced(self.config.comm, int(left.sum()))
+        self.whole = not reduced(self.config.comm, int((~self.tied & ~off).sum()))
 
-    def _untouched(self, state: PairState) -> PairState:
+    def untouched(self, state: PairState) -> PairState:
         """The state in which nothing that is tied is in contact."""
         tied, f = self.tied, state.friction
         if f is not None:
@@ -160,17 +183,20 @@ class Tied(Interface):
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
-    def project(self) -> None:
-        """As of ``Interface``; tied contactors need no search, but once a step for what is told of them (collective)."""
-        self._here = None
-        if self._lost or not self.whole:
-            super().project()
-            self._lost = False
+    def begin_placement(self) -> bool:
+        """The bodies have moved: whether contactors are to be projected; of tied ones that is done once a step, to be told."""
+        self._here, search = None, self._lost or not self.whole
+        self._lost = False
+        return search
+
+    def lose(self) -> None:
+        """Let the next placement project all contactors."""
+        self._lost = True
 
     @property
-    def off(self) -> Bools:
-        """As of ``Interface``, and all that are tied."""
-        return super().off | self.tied
+    def excluded(self) -> Bools:
+        """Contactors that take no part in contact ``(n,)``."""
+        return self.tied
 
     def _equations(self) -> UnitingEquations:
         """Of what is tied, where the bodies are now (collective)."""
@@ -180,12 +206,8 @@ class Tied(Interface):
         return self._here
 
     def largest_gap_here(self) -> float:
-        """As of ``Interface``, or the largest component of the way from where a contactor is tied."""
-        here = super().largest_gap_here()
-        if self.rows is None:
-            return here
-        apart = np.where(self._left_out, 0.0, self.apart())
-        return max(here, float(np.abs(apart).max(initial=0.0)))
+        """Largest component of the way from where a contactor of this rank is tied, a length."""
+        return float(np.abs(np.where(self._left_out, 0.0, self.apart())).max(initial=0.0))
 
     def apart(self) -> Array:
         """How far tied contactors are from where they are tied ``(n, gdim)``; known where the equations have been asked for."""
@@ -195,20 +217,19 @@ class Tied(Interface):
         return way
 
     def kept_gaps(self) -> Array:
-        """As of ``Interface``."""
+        """As of ``Told``."""
         spacers = None if self.rows is None else self.rows.spacers
         return np.zeros(0) if spacers is None else spacers.height
 
     def torn(self) -> Array:
-        """How far contactors are from where they are tied if their equations were left out ``(n,)``."""
+        """As of ``Told``."""
         return np.linalg.norm(np.where(self._left_out, self.apart(), 0.0), axis=1)
 
     # -- what the united system gets -------------------------------------------------------------------------------------
 
-    def equations(self) -> Constraints:
-        """As of ``Interface``, and after those of contact those of what is tied (collective)."""
-        own = super().equations()
-        return own if self.rows is None else TiedConstraints.join(own, *self._uniting())
+    def join(self, contact: Constraints) -> Constraints:
+        """Equations of contact, and after them those of what is tied (collective)."""
+        return contact if self.rows is None else TiedConstraints.join(contact, *self._uniting())
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
         """Equations that unite what is tied, their contactors and components ``(m,)`` (collective)."""
@@ -217,23 +238,18 @@ class Tied(Interface):
         return self._equations(), i, c
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
-        """As of ``Interface``."""
-        if not isinstance(equations, TiedConstraints):
-            super().set_redundant(equations, redundant)
-            return
+        """Take which of the equations ``(m,)`` depend on others and were left out."""
         k = len(equations.contact)
-        super().set_redundant(equations.contact, redundant[:k])
         self._left_out = np.zeros_like(self._left_out)
         self._left_out[equations.contactor[k:], equations.kind[k:]] = redundant[k:]
 
-    def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
-        """As of ``Interface``, with the multipliers of what is tied (collective)."""
-        if not isinstance(equations, TiedConstraints):
-            return super().forces(equations, multipliers, du)._replace(bond=np.zeros(self._left_out.shape))
+    def with_forces(self, contact: Traction, equations: Constraints, multipliers: Array) -> Traction:
+        """Forces of contact, and those of what is tied from the multipliers of all equations ``(m,)`` (collective)."""
+        if equations.contact is equations:
+            return contact._replace(bond=np.zeros(self._left_out.shape))
         k = len(equations.contact)
         bond = self._bond(equations.contactor[k:], equations.kind[k:], multipliers[k:])
-        found = super().forces(equations.contact, multipliers[:k], du)
-        return found._replace(force=found.force + self._on_contactors(bond), bond=bond)
+        return contact._replace(force=contact.force + self._on_contactors(bond), bond=bond)
 
     def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
         """Multipliers of all that is tied ``(n, gdim)``, from those of the equations of ``_uniting (m,)`` (collective)."""
@@ -246,45 +262,46 @@ class Tied(Interface):
         assert self.rows is not None
         return np.asarray(self.config.add_at_owners(*self.rows.handed_on(self._equations(), bond))[self.nodes])
 
-    @property
-    def traction(self) -> Traction:
-        """As of ``Interface``."""
-        return super().traction._replace(bond=self.trial.bond)
-
-    def with_forces(self, found: Traction) -> PairState:
-        """As of ``Interface``."""
-        return replace(super().with_forces(found), bond=found.bond)
-
-    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
-        """As of ``Interface`` (collective)."""
+    def nodal_forces(self, state: PairState, contact: Callable[[PairState], tuple[Ints, Array]]) -> tuple[Ints, Array]:
+        """Forces at nodes of both bodies as of ``Kinematics``, which is asked for those of ``contact`` (collective)."""
         if self.rows is None or state.bond is None:
-            return super().nodal_forces(state)
-        nodes, forces = super().nodal_forces(replace(state, force=state.force - self._on_contactors(state.bond)))
+            return contact(state)
+        nodes, forces = contact(replace(state, force=state.force - self._on_contactors(state.bond)))
         more = self.rows.handed_on(self._equations(), state.bond)
         return np.concatenate([nodes, more[0]]), np.concatenate([forces, more[1]])
 
-    def curvature(self) -> list[tuple[Ints, Array]]:
-        """As of ``Interface``, and of gaps that turn with the target (collective)."""
-        parts = super().curvature()
-        return parts if self.rows is None or self.trial.bond is None else parts + self.rows.curvature(self.trial.bond)
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """As of ``Interface``, of gaps that turn with the target (collective)."""
+        return [] if self.rows is None or state.bond is None else self.rows.curvature(state.bond)
+
+    @property
+    def chained(self) -> bool:
+        """As of ``Told``, because of what is tied."""
+        return False
+
+    @property
+    def works(self) -> bool:
+        """As of ``Told``, likewise."""
+        return False
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """As of ``Told``."""
+        return None
 
     # -- what is told ----------------------------------------------------------------------------------------------------
 
-    def pressing(self) -> tuple[Array, Array]:
-        """As of ``Interface``: tied contactors are pulled, too (collective)."""
-        lam, tau = super().pressing()
-        if self.rows is None or self.trial.bond is None:
+    def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
+        """As of ``Told``, from those of contact and normals ``(n, gdim)``: tied contactors are pulled, too (collective)."""
+        if self.rows is None or state.bond is None:
             return lam, tau
-        force = self.trial.bond * self.rows.share
+        force = state.bond * self.rows.share
         if isinstance(self.discretisation, Bernstein):
             force = np.column_stack([self.discretisation.family.spread(part) for part in force.T])
-        n = self.projection.normal
         along = np.einsum("ng,ng->n", force, n)
         return np.where(self.tied, along, lam), np.where(self.tied[:, None], force - along[:, None] * n, tau)
 
-    def areas(self, areas: Array, current: bool, reference: Array) -> Array:
-        """As of ``Interface`` (collective)."""
-        found = super().areas(areas, current, reference)
+    def areas(self, areas: Array, reference: Array, found: Array) -> Array:
+        """As of ``Told``, from those of contact ``found (n,)`` (collective)."""
         if self.rows is None:
             return found
         if isinstance(self.discretisation, Bernstein):
@@ -297,33 +314,16 @@ class Tied(Interface):
 
     # -- from step to step -----------------------------------------------------------------------------------------------
 
-    def restore(self) -> None:
-        """As of ``Interface``."""
-        super().restore()
-        self._lost = True
-
-    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
-        """As of ``Interface``; what has been tied since then stays so."""
-        super().remember(memory)
-        self.committed, self.reserved = self._untouched(self.committed), self.reserved & ~self.tied
-        self.restore()
-
-    @property
-    def functions(self) -> dict[str, fem.Function]:
-        """As of ``Interface``."""
-        return {"displacement it was tied at": self.at}
-
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """As of ``Interface``, with what is tied, and where on a rigid target (collective)."""
+        """What is tied, and where on a rigid target, as of ``Interface`` (collective)."""
         held = None if self.rows is None else self.rows.held
-        return super().to_checkpoint() | {"tied": self.tied, "held_at": np.zeros(self._left_out.shape) if held is None else held}
+        return {"tied": self.tied, "held_at": np.zeros(self._left_out.shape) if held is None else held}
 
-    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
-        """As of ``Interface``; ``at`` has been read before (collective)."""
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]], off: Bools) -> None:
+        """Go on from what ``to_checkpoint`` returned; ``at`` has been read before; ``off`` as of ``unite`` (collective)."""
         tied = np.array(kept["tied"])
         if reduced(self.config.comm, int(tied.sum())):
-            self._make(tied)
+            self._make(tied, off)
             assert self.rows is not None
             if self.rows.held is not None:
-                self._take_rows(replace(self.rows, held=np.array(kept["held_at"])))
-        super().from_checkpoint(kept)
+                self._take_rows(replace(self.rows, held=np.array(kept["held_at"])), off)
