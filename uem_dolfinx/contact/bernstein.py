@@ -216,6 +216,10 @@ class Bernstein(NodeToSurface):
         super().with_friction(mu)
         self.chained = True
 
+    def spread(self, values: Array) -> Array:
+        """Integrals with Bernstein's basis (collective)."""
+        return self.family.spread(values)
+
     def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
         """The kinematics with control gaps (collective)."""
         k, gap = kinematics, kinematics.projection.gap

@@ -255,12 +255,8 @@ class Heat:
         """The same per area ``(n,)`` (collective)."""
         if not self.law.perfect:
             return np.asarray(self.conductances() * self.jump())
-        from uem_dolfinx.contact.bernstein import Bernstein
-
-        power, areas = self.power(), self.passage.areas
-        if isinstance(self._pair.discretisation, Bernstein):
-            # shape functions of degree 2 have no integral at some nodes
-            power, areas = (self._pair.discretisation.family.spread(part) for part in (power, areas))
+        # shape functions of degree 2 have no integral at some nodes
+        power, areas = (self._pair.discretisation.spread(part) for part in (self.power(), self.passage.areas))
         return np.where(areas > 0, power / np.where(areas > 0, areas, 1.0), 0.0)
 
     def friction(self) -> Array:

@@ -208,6 +208,9 @@ class Kinematics(Protocol):
             current: which of the two.
         """
 
+    def heights(self) -> Array:
+        """Of the contactors over the target ``(n,)``, which have the gaps that decide, but for offsets (collective)."""
+
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Of a field at the contactors, and of what is opposite: places, global nodes and weights, which add up to one (collective)."""
 
@@ -276,6 +279,9 @@ class Discretisation(Protocol):
 
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+
+    def spread(self, values: Array) -> Array:
+        """Of integrals with the shape functions, those with functions that are nowhere negative ``(n,)`` (collective)."""
 
     def set_offset(self, offset: Array | None) -> None:
         """Take what gaps are less than heights ``(n,)``; contactors are to be placed again."""

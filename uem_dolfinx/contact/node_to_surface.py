@@ -337,6 +337,10 @@ class NodalKinematics:
         """A nodal force is the integral of the pressure over the node's shape function."""
         return areas
 
+    def heights(self) -> Array:
+        """Of the nodes."""
+        return self.projection.height
+
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """At the nodes themselves, and at their feet."""
         n = len(self.points)

@@ -11,8 +11,6 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.law import Field, asked_at
-from uem_dolfinx.contact.mortar import Mortar
-from uem_dolfinx.contact.weighted_gaps import MortarKinematics
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
@@ -61,21 +59,6 @@ class Offsets:
         """
         pair = self._pair
         pair.project()
-        p, d = pair.projection, pair.discretisation
-        height = heights_of(d, pair) if isinstance(d, Mortar) else p.height
+        p, height = pair.projection, pair.kinematics.heights()
         most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach
         self.adjusted = np.where((np.abs(height) <= most) & ~pair.off, height, 0.0)
-
-
-def heights_of(d: Mortar, pair: Interface) -> Array:
-    """Heights of contactors over the target whose means, weighted with dual functions, are those of the gaps ``(n,)`` (collective).
-
-    Functions of degree 2 have them in Bernstein's basis first, whose coefficients at the middles are made of those around.
-    """
-    assert isinstance(pair.kinematics, MortarKinematics)
-    config, dofs, rows = d.config, d.surface.dofs, pair.kinematics.rows
-    means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
-    at = config.from_owners(d.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
-    nodal = at @ np.linalg.inv(d.basis.T).T
-    total, count = (config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
-    return np.asarray(total[d.nodes] / count[d.nodes])

@@ -87,6 +87,10 @@ class OnTarget:
         offset = self.offset if which is None else self.offset[which]
         return replace(projection, gap=projection.height - offset, offset=offset)
 
+    def spread(self, values: Array) -> Array:
+        """The shape functions themselves."""
+        return values
+
     def set_offset(self, offset: Array | None) -> None:
         """Take other offsets ``(n,)``; contactors are to be placed again."""
         self.offset, self._projected = offset, None

@@ -16,7 +16,6 @@ from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.bernstein import Bernstein
 from uem_dolfinx.contact.kinematics import Constraints, Discretisation, Traction
 from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.node_to_surface import past_end
@@ -295,8 +294,7 @@ class Tie:
         if self.rows is None or state.bond is None:
             return lam, tau
         force = state.bond * self.rows.share
-        if isinstance(self.discretisation, Bernstein):
-            force = np.column_stack([self.discretisation.family.spread(part) for part in force.T])
+        force = np.column_stack([self.discretisation.spread(part) for part in force.T])
         along = np.einsum("ng,ng->n", force, n)
         return np.where(self.tied, along, lam), np.where(self.tied[:, None], force - along[:, None] * n, tau)
 
@@ -304,10 +302,8 @@ class Tie:
         """As of ``Told``, from those of contact ``found (n,)`` (collective)."""
         if self.rows is None:
             return found
-        if isinstance(self.discretisation, Bernstein):
-            own = self.discretisation.family.spread(areas)
-        elif self.rows.area is None:
-            own = areas
+        if self.rows.area is None:
+            own = self.discretisation.spread(areas)
         else:
             own = self.rows.area * np.where(reference > 0, areas / np.where(reference > 0, reference, 1.0), 1.0)
         return np.where(self.tied, own, found)

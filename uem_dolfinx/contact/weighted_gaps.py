@@ -283,6 +283,18 @@ class MortarKinematics:
             own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
         return np.where(rows.covered, own, areas)
 
+    def heights(self) -> Array:
+        """Nodal heights whose means, weighted with dual functions, are those of the gaps (collective).
+
+        Functions of degree 2 have them in Bernstein's basis first, whose coefficients at the middles are made of those around.
+        """
+        of, rows, dofs = self.of, self.rows, self.of.surface.dofs
+        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
+        at = of.config.from_owners(of.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
+        nodal = at @ np.linalg.inv(of.basis.T).T
+        total, count = (of.config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
+        return np.asarray(total[of.nodes] / count[of.nodes])
+
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """By the integrals of the dual functions over what is covered; others at their nodes (collective)."""
         of, rows, at = self.of, self.rows, self.rows.points
