@@ -101,6 +101,8 @@ class Dynamics:
         if self._attached:
             raise SpaceError("these dynamics belong to another problem: make new ones for every problem")
         self._attached, self.config, g = True, config, config.gdim
+        #: The mass and what it is among other fields.
+        self._in_rows: tuple[PETSc.Mat, PETSc.Mat] | None = None
         self._n, error = g * config.n_owned, None
         wanted = self._n, g * config.index_map.size_global
         if tuple(self.mass.M.getSizes()[0]) != wanted:
@@ -159,6 +161,18 @@ class Dynamics:
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
             raise NotFiniteError("the velocity at the start holds NaN or infinity")
 
+    @property
+    def _displacement(self) -> Array:
+        """Of the local nodes ``(n_local * gdim,)``."""
+        return self.config.displacement.ravel()
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """M, with the rows and columns of the united system (first time: collective)."""
+        if self._in_rows is None or self._in_rows[0] is not self.mass.M:
+            self._in_rows = self.mass.M, self.config.in_rows(self.mass.M)
+        return self._in_rows[1]
+
     def hold(self, held: Bools) -> None:
         """Take which owned components are prescribed ``(n_owned, gdim)``: their velocities are those of what is prescribed."""
         self._held = held.ravel()
@@ -213,7 +227,7 @@ class Dynamics:
         """
         i, dt, last = self._held, self.dt, self._last
         v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
-        w = (self.config.u.x.array - self._u)[: self._n][i] / dt
+        w = (self._displacement - self._u)[: self._n][i] / dt
         slope = 2.0 * (w - self.mean_velocity.x.array[: self._n][i]) / (dt + last)
         slope = np.where(slope * before > 0.0, np.where(np.abs(slope) < np.abs(before), slope, before), 0.0)
         end = w + 0.5 * dt * slope
@@ -226,7 +240,7 @@ class Dynamics:
         if self.damping is None or not self.moving:
             return
         i = np.flatnonzero(self._held)
-        self._past.x.array[i] = self._prescribed()[0] - self._v_rate * self.config.u.x.array[i]
+        self._past.x.array[i] = self._prescribed()[0] - self._v_rate * self._displacement[i]
         self._past.x.scatter_forward()
 
     def memory(self) -> tuple[float, float, float, Array, list[Array]]:
@@ -271,7 +285,7 @@ class Dynamics:
     def _inertia(self) -> PETSc.Vec:
         """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
         s, n = self.scheme, self._n
-        du = self.config.u.x.array - self._u
+        du = self._displacement - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
         a[:n][self._held] = self._prescribed()[2]
         inertia = self.mass.M * self._like(a[:n])
@@ -289,7 +303,7 @@ class Dynamics:
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
-        M = self.mass.M.copy() if restriction.alone else self.mass.M.PtAP(restriction.P)
+        M = self.matrix.copy() if restriction.alone else self.matrix.PtAP(restriction.P)
         if restriction.alone:
             restriction.cross_out(M)
         rhs = restriction.transpose(F)
@@ -310,7 +324,7 @@ class Dynamics:
                 f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
             )
         a = restriction.expand(q)
-        self.acceleration.x.array[: self._n] = a.array_r * self.massy.ravel()
+        self.acceleration.x.array[: self._n] = a.array_r[: self._n] * self.massy.ravel()
         self.acceleration.x.scatter_forward()
         self._acceleration = np.array(self.acceleration.x.array)
         self.forces.x.array[: self._n] = (self.mass.M * self._like(self._acceleration[: self._n])).array_r
@@ -322,7 +336,7 @@ class Dynamics:
         if self.moving:
             n, dt, held = self._n, self.dt, self._held
             end, mean, _ = self._prescribed()
-            du, massy = (self.config.u.x.array - self._u)[:n], self.massy.ravel()
+            du, massy = (self._displacement - self._u)[:n], self.massy.ravel()
             self.forces.x.array[:n] = self._inertia().array_r
             a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
             a[held], v[held] = mean, end
@@ -340,7 +354,7 @@ class Dynamics:
 
     def _copy_committed(self) -> None:
         """Displacement, velocity and acceleration as they are are those at the start of the next step."""
-        self._u = np.array(self.config.u.x.array)
+        self._u = np.array(self._displacement)
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
 
     def to_checkpoint(self) -> dict[str, Any]:

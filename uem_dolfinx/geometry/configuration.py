@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
+from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import AnyArray, Array
@@ -71,6 +72,14 @@ class Configuration(Nodes):
     def from_rows(self, rows: Array) -> Array:
         """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
         return rows
+
+    def add_to(self, values: AnyArray, of_nodes: Array) -> None:
+        """Add what the owned nodes of the displacement have ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
+        values += of_nodes
+
+    def in_rows(self, matrix: PETSc.Mat) -> PETSc.Mat:
+        """A matrix of the displacement with the rows and columns that vectors have, zero in those of other fields (collective)."""
+        return matrix
 
     def place_of(self, unknown: int) -> str:
         """Which component of which node a local unknown is, for error messages."""

@@ -83,6 +83,24 @@ class ConfigurationAmongFields(Configuration):
         """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
         return rows[self._unknowns.place]
 
+    def add_to(self, values: AnyArray, of_nodes: Array) -> None:
+        """Add what the owned nodes of the displacement have ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
+        values[self.dofs[: self.n_owned].ravel()] += of_nodes
+
+    def in_rows(self, matrix: PETSc.Mat) -> PETSc.Mat:
+        """A matrix of the displacement with the rows and columns that vectors have, zero in those of other fields (collective)."""
+        (start, columns, values), g, rows = matrix.getValuesCSR(), self.gdim, self._unknowns
+        ends = np.asarray(matrix.getOwnershipRanges(), dtype=np.int64)
+        rank = np.searchsorted(ends, columns, side="right") - 1
+        columns = columns - ends[rank] + g * rows._first_nodes[rank]
+        # with a diagonal everywhere, as solvers want it
+        more = np.arange(g * self.n_owned, g * rows.n_owned)
+        start = np.append(start, start[-1] + 1 + np.arange(len(more)))
+        columns, values = np.append(columns, g * rows.first + more), np.append(values, np.zeros(len(more)))
+        size = (g * rows.n_owned, g * rows.n_global)
+        csr = start.astype(PETSc.IntType), columns.astype(PETSc.IntType), values
+        return PETSc.Mat().createAIJ((size, size), bsize=g, csr=csr, comm=self.comm)
+
     def place_of(self, unknown: int) -> str:
         """Which component of which node a local unknown is, or of which other part of the space, for error messages."""
         node, component = np.nonzero(self.dofs == unknown)

@@ -85,7 +85,7 @@ class EnergyBook(Closing):
         self.problem, self.dynamics = problem, problem.dynamics
         with agreed(problem.comm):
             if external is not None:
-                check_linear("external", external, problem.config.V)
+                check_linear("external", external, problem.u.function_space)
             if stored is not None:
                 check_functional("stored", stored, problem.config.mesh)
             if stored is not None and problem.u not in stored.coefficients():
@@ -126,11 +126,12 @@ class EnergyBook(Closing):
     def _read_forces(self) -> None:
         """Read the forces and the displacement of this instant (collective)."""
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
-        self._u, self._time, self._driven = np.array(problem.u.x.array[:n]), self.dynamics.time, self.dynamics.driven
+        u = np.array(problem.config.displacement[: problem.config.n_owned].ravel())
+        self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
         contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
         problem.bodies.assemble()
         # the work of supports on mass, where velocities jump, is what the mass has got
-        driving = problem.bodies.residual.array_r - self.dynamics.forces.x.array[:n]
+        driving = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
         reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external) + linear
@@ -143,7 +144,10 @@ class EnergyBook(Closing):
     def _assembled(self, form: Any) -> Array:
         """Nodal forces of a compiled linear form at the owned components, zero without one."""
         config = self.problem.config
-        return np.zeros(config.n_owned * config.gdim) if form is None else forms.assemble_array(config.V, form)
+        if form is None:
+            return np.zeros(config.n_owned * config.gdim)
+        own = forms.assemble_array(self.problem.u.function_space, form)
+        return np.asarray(config.rows(own)[: config.n_owned].ravel())
 
     def _energies(self) -> tuple[float, float, float]:
         """Energies kinetic, stored and dissipated (collective)."""

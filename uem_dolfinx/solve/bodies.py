@@ -121,7 +121,7 @@ class Bodies:
             if self.points is not None:
                 self.points.add_forces(self._b.array)
             if self.dynamics is not None:
-                self._b.array[:] += self.dynamics.load().array_r
+                self.config.add_to(self._b.array, self.dynamics.load().array_r)
         return bool(np.isfinite(self._b.norm()))
 
     @property

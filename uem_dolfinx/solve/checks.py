@@ -81,14 +81,10 @@ def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
         )
 
 
-def check_fields(config: Configuration, materials: Sequence[HistoryMaterial], dynamics: Any) -> None:
-    """Refuse what a displacement among other fields cannot have: laws with history, and inertia."""
+def check_fields(config: Configuration, materials: Sequence[HistoryMaterial]) -> None:
+    """Refuse what a displacement among other fields cannot have: laws with history."""
     if materials:
         refuse_other_fields(config, "materials with history", "write the stress in UFL of the mixed Function")
-    if dynamics is not None:
-        refuse_other_fields(
-            config, "time steps with inertia", "leave dynamics out, or leave the other fields to a problem of their own"
-        )
 
 
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:

@@ -142,7 +142,7 @@ class UnitedProblem:
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
-            check_fields(self.config, self.materials, dynamics)
+            check_fields(self.config, self.materials)
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)

@@ -85,7 +85,7 @@ class Tangent:
             if self._points is not None:
                 self._points.add_stiffness(self.K)
             if self._dynamics is not None and factor:
-                self.K.axpy(factor, self._dynamics.mass.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+                self.K.axpy(factor, self._dynamics.matrix, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
             self._unknowns.complete(self.K, self.free)
         self._values, self._factor = values, factor
         self.number += 1

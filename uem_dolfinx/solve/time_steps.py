@@ -228,8 +228,8 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     control = problem.step_control
     if not (forces := before + _contact_forces(problem)):
         return
-    n = problem.config.gdim * problem.config.n_owned
-    way = problem.u.x.array[:n] - problem.committed[:n]
+    config = problem.config
+    way = config.of(problem.u.x.array - problem.committed)[: config.n_owned].ravel()
     given = reduced(problem.comm, 0.5 * float(sum(f @ way for f in forces)))
     if given <= MOST_GIVEN * control.largest_energy:
         return

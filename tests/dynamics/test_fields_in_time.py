@@ -1,0 +1,119 @@
+"""Inertia of a displacement among other fields: a pressure of its own changes nothing of a fall, an impact and a slide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from block_scenes import blocks
+from helpers import at, box, highest, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx.algebra.restriction import Restriction
+
+COMM = MPI.COMM_WORLD
+E, NU, SPEED = 1000.0, 0.3, 1.0
+
+
+@dataclass
+class Fall:
+    """A block that is thrown onto a rough floor: alone, or with its pressure in every cell as an unknown, which comes first or last."""
+
+    pressure: int | None
+
+    def __post_init__(self):
+        s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 2.0], [3, 6])])
+        V, (mu, lam) = uem.function_space(s.mesh, 1, (2,)), (E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU)))
+        if self.pressure is None:
+            w = u = fem.Function(V)
+            v = ufl.TestFunction(V)
+            volumetric, among = lam * ufl.div(u) * ufl.div(v) * ufl.dx(metadata={"quadrature_degree": 0}), {}
+        else:
+            parts, which = [("Lagrange", 1, (2,)), ("DG", 0)], 1 - self.pressure
+            W = uem.function_space(s.mesh, parts if which == 0 else parts[::-1])
+            w = fem.Function(W)
+            (u, p), (v, q) = ((f[which], f[self.pressure]) for f in (ufl.split(w), ufl.TestFunctions(W)))
+            volumetric, among = -p * ufl.div(v) * ufl.dx - q * (ufl.div(u) + p / lam) * ufl.dx, {"displacement": which}
+        F = 2 * mu * ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) * ufl.dx + volumetric
+        floor = uem.RigidPlane((0.0, -0.015), (0.0, 1.0))
+        self.contact = uem.Contact(s.tag("bottom", 0, at(1, 0.0)), floor, friction=0.2)
+        self.dynamics = uem.Dynamics(
+            uem.consistent_mass(V, 1.0), velocity=(0.3, -SPEED), gravity=(0.0, -1.0), scheme=uem.generalised_alpha(0.8),
+            damping=lambda rate: 0.01 * ufl.inner(ufl.grad(rate), ufl.grad(v)) * ufl.dx,
+        )  # fmt: skip
+        self.problem = uem.UnitedProblem(F, w, contacts=[self.contact], dynamics=self.dynamics, **among)
+        self.book = uem.EnergyBook(self.problem)
+
+    def go(self, end: float, **kept) -> np.ndarray:
+        """Times, forces, energies and momenta of the steps to an end."""
+        rows = []
+        for step in uem.time_steps(self.problem, 0.01, end, **kept):
+            book = self.book.write(step)
+            works = (book.kinetic, book.damped, book.contact, book.friction)
+            rows.append([step.time, *self.contact.resultant().force, *works, *self.book.momenta[-1], len(step.iterations)])
+        return np.array(rows)
+
+
+@pytest.mark.parametrize("pressure", [0, 1])
+def test_a_pressure_that_changes_nothing(pressure):
+    """Forces of an impact with friction, works and momenta are those of the same block without it, in as many iterations."""
+    alone, beside = Fall(None), Fall(pressure)
+    a, b = alone.go(0.05), beside.go(0.05)
+    assert a.shape == b.shape and a[:, 2].max() > 1.0 and a[-1, 1] != 0.0
+    assert np.abs(a - b).max() < 1e-11 * np.abs(a).max()
+    there, own = beside.problem.config.displacement, alone.problem.config.displacement
+    assert highest(COMM, np.abs(np.linalg.norm(there, axis=1).sum() - np.linalg.norm(own, axis=1).sum())) < 1e-12
+
+
+def test_going_on_in_time(folder):
+    """Read from a checkpoint amid the impact, the run goes on to the last bit."""
+    whole, first, last = Fall(1), Fall(1), Fall(1)
+    rows = whole.go(0.04)
+    first.go(0.02)
+    uem.write_checkpoint(folder / "run", first.problem.state())
+    uem.read_checkpoint(folder / "run", last.problem.state())
+    rest = last.go(0.04)
+    assert len(rest) == 2 and np.array_equal(rest[:, :4], rows[2:, :4])
+    assert np.array_equal(last.problem.u.x.array, whole.problem.u.x.array)
+
+
+def test_the_mass_among_other_fields():
+    """In the rows of the united system it is the mass of the displacement, and nothing in those of the pressure."""
+    fall = Fall(1)
+    M, own = fall.dynamics.matrix, fall.dynamics.mass.M
+    rows, n = fall.problem.config.unknowns, fall.problem.config.n_owned
+    ones, there = np.zeros((rows.n_owned, 2)), own.createVecRight()
+    ones[:n], there.array[:] = (1.0, -2.0), np.tile((1.0, -2.0), n)
+    product = (M * rows.vector(ones)).array_r
+    assert np.array_equal(product[: 2 * n], (own * there).array_r) and not product[2 * n :].any()
+    assert isinstance(fall.problem.system.restriction(), Restriction) and M.getSizes() == fall.problem.bodies.tangent.K.getSizes()
+
+
+def test_heat_that_passes_in_time():
+    """Through a conductance that grows with the pressure: between bodies of next to no mass as in statics, and what one loses the other gets."""
+
+    def temperatures(in_time: bool) -> np.ndarray:
+        b, dt = blocks(COMM, "triangle", 2, 2), 0.05
+        W = uem.function_space(b.scene.mesh, [("Lagrange", 1, (2,)), ("Lagrange", 1)])
+        w, old = fem.Function(W), fem.Function(W)
+        (u, T), (v, q) = ufl.split(w), ufl.TestFunctions(W)
+        F = 100.0 * ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) * ufl.dx
+        F += ((T - old[2]) / dt * q + ufl.dot(ufl.grad(T), ufl.grad(q))) * ufl.dx
+        bcs = [uem.dirichlet(W.sub(0), tag, c, -0.01 * c * k) for k, tag in enumerate((b.bottom, b.top)) for c in (0, 1)]
+        bcs.append(uem.dirichlet(W.sub(1), b.top, value=1.0))
+        contact = uem.Contact(b.high, b.low, heat=uem.Conductance(lambda p, g: 1.0 + p, field=1))
+        mass = uem.lumped_mass(b.V, 1e-9)
+        moves = uem.Dynamics(mass, contactors="massy", scheme=uem.generalised_alpha(0.0)) if in_time else None
+        problem = uem.UnitedProblem(F, w, displacement=0, bcs=bcs, contacts=[contact], dynamics=moves)
+        for _ in uem.time_steps(problem, dt, 3 * dt) if in_time else (problem.solve() for _ in range(3)):
+            old.x.array[:] = w.x.array
+            assert contact.heat_balance() < 1e-13
+        return problem.config.functions()["field_1"].x.array
+
+    a, b = temperatures(True), temperatures(False)
+    assert highest(COMM, np.abs(a - b)) < 1e-9 and highest(COMM, b) == 1.0
