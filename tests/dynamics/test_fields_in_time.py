@@ -9,8 +9,8 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
 from block_scenes import blocks
+from dolfinx import fem
 from helpers import at, box, highest, scene
 
 import uem_dolfinx as uem
@@ -95,7 +95,7 @@ def test_the_mass_among_other_fields():
 
 
 def test_heat_that_passes_in_time():
-    """Through a conductance that grows with the pressure: between bodies of next to no mass as in statics, and what one loses the other gets."""
+    """Through a conductance that grows with the pressure, between bodies of next to no mass: as in statics, and in balance."""
 
     def temperatures(in_time: bool) -> np.ndarray:
         b, dt = blocks(COMM, "triangle", 2, 2), 0.05
