@@ -71,7 +71,7 @@ class LinearEquations(Protocol):
     def rows(self, config: Configuration, role: str) -> GivenRows:
         """The equations (collective)."""
 
-    def n_values(self, gdim: int) -> int:
+    def n_values(self, block: int) -> int:
         """How many different right-hand sides there are."""
 
 
@@ -105,7 +105,7 @@ class Equation:
         self._terms = [(where, given.vector(f"the vector of terms[{i}]", c)) for i, (where, c) in enumerate(terms)]
         self.b = checked_value("b", b, 1)
 
-    def n_values(self, gdim: int) -> int:
+    def n_values(self, block: int) -> int:
         """As of ``LinearEquations``."""
         return 1
 
@@ -114,7 +114,7 @@ class Equation:
         found, many = [], []
         for i, (where, c) in enumerate(self._terms):
             with agreed(config.comm):
-                given.vector(f"the vector of terms[{i}] of {role}", c, config.gdim)
+                given.vector(f"the vector of terms[{i}] of {role}", c, config.block)
             nodes = nodes_at(config, where, f"the place of terms[{i}] of {role}")
             found.append(nodes)
             if reduced(config.comm, len(nodes)) > 1:
@@ -128,7 +128,7 @@ class Equation:
         own = own[~np.isin(own, np.concatenate([np.zeros(0, np.int64), *single.values()]))] if many else own
         order = [family, *single]
         node = np.column_stack([own, *(np.full(len(own), single[i][0]) for i in single)])
-        c = np.broadcast_to([self._terms[i][1] for i in order], (len(own), len(order), config.gdim))
+        c = np.broadcast_to([self._terms[i][1] for i in order], (len(own), len(order), config.block))
         return _of_terms(np.zeros(len(own), dtype=np.int64), node, c)
 
 
@@ -150,17 +150,18 @@ class Periodic:
         self._turn = None if turn is None else _rotation(turn)
         self.b = checked_value("jump", jump, None)
 
-    def n_values(self, gdim: int) -> int:
+    def n_values(self, block: int) -> int:
         """As of ``LinearEquations``."""
-        return gdim
+        return block
 
     def rows(self, config: Configuration, role: str) -> GivenRows:
         """As of ``LinearEquations``."""
-        g = config.gdim
-        R = np.eye(g) if self._turn is None else self._turn
+        g, turn = config.block, self._turn
         with agreed(config.comm):
-            if R.shape != (g, g):
-                raise InputError(f"{role}: turn has the shape {R.shape}: expected ({g}, {g})")
+            if turn is not None and len(turn) != config.gdim:
+                raise InputError(f"{role}: turn has the shape {turn.shape}: expected ({config.gdim}, {config.gdim})")
+        # components turn with places where they are those of a vector
+        R = np.eye(g) if turn is None or not config.moves else turn
         follower = nodes_at(config, self._follower, f"the follower of {role}")
         leader = nodes_at(config, self._leader, f"the leader of {role}")
         x = config.X[follower]

@@ -72,7 +72,7 @@ def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) 
         size: as of ``sizes``; a row without any takes no part.
         spared: terms of nodes that are eliminated only where nothing else can be ``(k,)``.
     """
-    g, counted = config.gdim, (size > 0).astype(float)
+    g, counted = config.block, (size > 0).astype(float)
     counts, halo = config.add_at_owners(rows.node, counted), Halo(config, rows.node)
     chosen = np.full(len(rows), -1)
     row = np.repeat(rows.row, g)
@@ -119,7 +119,7 @@ def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, 
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    comm, g = config.comm, config.gdim
+    comm, g = config.comm, config.block
     first = np.searchsorted(rows.row, np.arange(len(rows)))
     known = config.ask_owners(rows.node[first], config.X[: config.n_owned])
     mine = rows.value, item, known, np.bincount(rows.row, minlength=len(rows)), rows.node, rows.coefficients, size > 0, spared
@@ -181,7 +181,7 @@ def _owned(config: Configuration, made: list[tuple[Ints, Array, Ints, Array, Int
     lists: list[list[Any]] = [[numbers], [numbers], [numbers], [none], [numbers], [numbers], [none]]
     count = 0
     for pivot, R, columns, T, values in made:
-        own = config.owner_of(pivot // config.gdim) == config.comm.rank
+        own = config.owner_of(pivot // config.block) == config.comm.rank
         pivot, R, T = pivot[own], R[own], T[own]
         R = np.where(columns == pivot[:, None], 0.0, R)
         i, j = np.nonzero(np.abs(R) > np.finfo(float).eps)

@@ -54,7 +54,7 @@ class UnitedRows:
         at: float = 0.0,
     ):
         self._config, self._declared = config, list(declared)
-        counts = [one.n_values(config.gdim) for one in self._declared]
+        counts = [one.n_values(config.block) for one in self._declared]
         self._n_values = sum(counts)
         self._asked: list[Any] = [None] * len(counts)
         ramped = [_grows(one.b, loaded) for one in self._declared]
@@ -86,7 +86,7 @@ class UnitedRows:
         alone, shared = chosen >= 0, able & (chosen < 0)
         # terms of those alone are renumbered
         place = np.cumsum(alone[rows.row]) - 1
-        g = config.gdim
+        g = config.block
         own = chosen[alone]
         solved = [self._sent(divided(rows.select(alone), place[own // g] * g + own % g))]
         follows = np.zeros(len(rows), dtype=bool)
@@ -111,7 +111,7 @@ class UnitedRows:
     def _sent(self, rows: Solved) -> Solved:
         """Rows with one weight each, on the ranks that own the nodes that they eliminate (collective)."""
         comm, order = self._config.comm, np.argsort(rows.row, kind="stable")
-        rank = self._config.owner_of(rows.pivot // self._config.gdim)
+        rank = self._config.owner_of(rows.pivot // self._config.block)
         counts = np.bincount(rows.row, minlength=len(rows.pivot))
         pivot, n_terms, value, weight = Exchange.to(comm, rank).send(rows.pivot, counts, rows.weight_value, rows.weight)
         column, entry = Exchange.to(comm, rank[rows.row[order]]).send(rows.column[order], rows.entry[order])
@@ -122,7 +122,7 @@ class UnitedRows:
         """Make uniting equations of independent rows whose nodes this rank owns."""
         from scipy.sparse import csr_matrix
 
-        config, g = self._config, self._config.gdim
+        config, g = self._config, self._config.block
         first = np.cumsum([0, *(len(s.pivot) for s in solved)])
         pivot, column, entry, value, weight = (
             np.concatenate([getattr(s, name) for s in solved]) for name in ("pivot", "column", "entry", "weight_value", "weight")
@@ -154,7 +154,7 @@ class UnitedRows:
         """Right-hand sides as they are now ``(n_values,)`` (collective)."""
         with agreed(self._config.comm):
             found = [
-                values_of(f"the value of equations[{i}]", one.b if asked is None else asked, one.n_values(self._config.gdim))
+                values_of(f"the value of equations[{i}]", one.b if asked is None else asked, one.n_values(self._config.block))
                 for i, (one, asked) in enumerate(zip(self._declared, self._asked))
             ]
         return np.concatenate(found)

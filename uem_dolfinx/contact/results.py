@@ -70,18 +70,25 @@ class ContactResults:
         contactor: facets whose nodes are the contactors, or points.
         measure: what pressures and tractions are forces per area of: ``"reference"`` or ``"current"``.
         config: configuration of the displacement, once the contact belongs to a problem.
+        taken: whether it does.
     """
 
     name: str
     contactor: Part
     measure: str
     config: Configuration
+    taken: bool
     _pair: Interface | None
     _fields: dict[str, fem.Function]
 
     @property
     def pair(self) -> Interface:
         """The pair behind this contact."""
+        if self._pair is None and self.taken:
+            raise SurfaceError(
+                f"contact '{self.name}' ties a scalar field, and has no contact forces: what passes through it is the "
+                "reaction of the conditions on either side"
+            )
         if self._pair is None:
             raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
         return self._pair

@@ -21,11 +21,9 @@ class WatchedContact(ContactResults):
     """A contact of a problem, whose ends, corners and wear are looked at after every step.
 
     Attributes:
-        taken: whether a problem has been made of it.
         adjust: whether gaps at the start have been closed, and how far.
     """
 
-    taken: bool
     adjust: float | bool
 
     def begin(self) -> None:

@@ -29,6 +29,9 @@ class Configuration(Nodes):
         SpaceError: if ``u`` is not in a blocked Lagrange space of degree 1 or 2 with one component per coordinate.
     """
 
+    #: Whether nodes are where the unknowns take them; a scalar field takes them nowhere.
+    moves = True
+
     def __init__(self, u: fem.Function):
         #: The Function with all unknowns, and the displacement in UFL; one and the same unless there are other fields.
         self.whole: fem.Function = u
@@ -63,11 +66,11 @@ class Configuration(Nodes):
 
     def of(self, values: AnyArray) -> Any:
         """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)`` (a view)."""
-        return values.reshape(-1, self.gdim)
+        return values.reshape(-1, self.block)
 
     def rows(self, values: AnyArray) -> Any:
         """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)`` (a view)."""
-        return values.reshape(-1, self.gdim)
+        return values.reshape(-1, self.block)
 
     def from_rows(self, rows: Array) -> Array:
         """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""

@@ -58,7 +58,8 @@ class Drawing:
                 self.view = given.direction("view", toward, 3)  # type: ignore[arg-type]
         if gdim == 3:
             pictures3d.require(problem.comm)
-        self.label = label or ("|u|" if field is None else "contact pressure" if pressed else "")
+        size = "|u|" if problem.config.moves else problem.u.name
+        self.label = label or (size if field is None else "contact pressure" if pressed else "")
         self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap
         self.comm = problem.comm
         gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface)

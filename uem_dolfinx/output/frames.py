@@ -96,10 +96,12 @@ def vertex_values(problem: UnitedProblem, field: Any) -> Array:
 
     Args:
         problem: the scene.
-        field: None for the size of the displacement; a contact or several for their pressure; a scalar Lagrange Function; or any other
-            scalar UFL expression, which is averaged over the cells around a vertex.
+        field: None for the size of the displacement, or a scalar u itself; a contact or several for their pressure; a scalar Lagrange
+            Function; or any other scalar UFL expression, which is averaged over the cells around a vertex.
     """
     mesh = problem.config.mesh
+    if field is None and not problem.config.moves:
+        field = problem.u
     if field is None:
         moved = vertex_positions(problem, 1.0) - vertex_positions(problem, 0.0)
         return np.asarray(np.linalg.norm(moved, axis=1))
@@ -134,8 +136,9 @@ def vertex_positions(problem: UnitedProblem, scale: float) -> Array:
     """Displaced positions of the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, gdim)``."""
     config = problem.config
     u = fem.Function(compat.function_space(config.mesh, 1, (config.gdim,)))
-    u.interpolate(config.functions()["displacement"])
-    u.x.scatter_forward()
+    if config.moves:
+        u.interpolate(config.functions()["displacement"])
+        u.x.scatter_forward()
     moved = u.x.array.reshape(-1, config.gdim)
     return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
 

@@ -92,7 +92,7 @@ class Bodies:
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
         check = not self.tangent.linear if check_inversion is None else check_inversion
-        self._inversions = Inversions(config) if check else None
+        self._inversions = Inversions(config) if check and config.moves else None
         self._fields: Any = None
         if self.unknowns.mixed:
             from uem_dolfinx.solve.field_scales import FieldScales
@@ -160,7 +160,7 @@ class Bodies:
     def _diagonal(self) -> Array:
         diagonal = self.unknowns.vector()
         self.tangent.K.getDiagonal(diagonal)
-        return np.array(diagonal.array_r).reshape(-1, self.config.gdim)[: self.config.n_owned]
+        return np.array(diagonal.array_r).reshape(-1, self.config.block)[: self.config.n_owned]
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
         """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).
@@ -173,7 +173,8 @@ class Bodies:
         if self.stiffness is None:
             return 0.0
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
-        np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
+        if self.config.moves:
+            np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
         of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
         return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
 
@@ -209,7 +210,7 @@ class Bodies:
 
     def strain_rounding(self) -> Any:
         """Norm of the forces that rounding of ``1 + grad(u)`` can make, nothing in other fields (collective)."""
-        if self.stiffness is None:
+        if self.stiffness is None or not self.config.moves:
             return 0.0
         size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
         return size if self._fields is None else self._first(size)
@@ -273,14 +274,19 @@ class Bodies:
 
     def from_checkpoint(self, u: fem.Function | None) -> None:
         """Go on from a diagonal of K that was kept, None if none was known."""
-        n = self.config.n_owned * self.config.gdim
-        self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.gdim)
+        n = self.config.n_owned * self.config.block
+        self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.block)
 
 
 def configured(u: fem.Function, displacement: int | None) -> Configuration:
-    """Nodes of a displacement, which is u, or the part of u with this number (collective)."""
+    """Nodes of a displacement, which is u, or the part of u with this number, or of a scalar field (collective)."""
     if displacement is None:
-        return Configuration(u)
+        V = u.function_space
+        if V.dofmap.index_map_bs > 1 or compat.is_mixed(V):
+            return Configuration(u)
+        from uem_dolfinx.geometry.scalar import ScalarConfiguration
+
+        return ScalarConfiguration(u)
     from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 
     return ConfigurationAmongFields(u, displacement)

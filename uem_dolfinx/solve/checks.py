@@ -75,6 +75,8 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function) -> list[Histor
 
 def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
     """Raise an InputError of what a displacement among other fields cannot have, with a remedy."""
+    if not config.moves:
+        raise InputError(f"{what} are of a displacement, and u is a scalar field: expected a vector Lagrange space")
     if config.unknowns.mixed:
         raise InputError(
             f"{what} are not there for a displacement among other fields: expected a problem of a displacement; {remedy}"

@@ -63,7 +63,7 @@ class FloatingBodies:
         self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
-        if pairs or linear is not None:
+        if config.moves and (pairs or linear is not None):
             free, finite = bodies.free[: config.n_owned], not bodies.tangent.linear
             self.rigid = RigidMotions(config, free, finite)
             self._at_rest = self._floating(self.rigid)

@@ -62,6 +62,7 @@ class UnitedProblem:
         F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
             forces are added by ``dynamics``. On a mesh declared ``axisymmetric`` it is integrated over whole circles.
         u: displacement, a Function of a vector Lagrange space; holds the solution. With ``displacement`` a Function of a mixed space.
+            Or a scalar field, as a temperature, whose contacts are ties of two meshes, and which ``equations`` are of then.
         displacement: number of the part of the mixed space that is the displacement, as of a pressure or a temperature beside it; the
             other parts are solved for as well, and contact leaves them alone.
         bcs: Dirichlet conditions.
@@ -139,6 +140,10 @@ class UnitedProblem:
             points = given.items(
                 "points", points, lambda one: hasattr(one, "force_and_stiffness"), "a PointLoad or a PointSpring"
             )
+            if not self.config.moves:
+                from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
+
+                check_ties(contacts, materials=materials, dynamics=dynamics, points=points)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -160,7 +165,9 @@ class UnitedProblem:
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
         #: Contacts as they were declared, and all that they consist of: a general one is several.
+        ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
         self.declared: list[Contact | GeneralContact] = contacts
+        self._ties = [tie.name for tie in ties]
         self.contacts: list[Contact] = parts_of(contacts, self.config)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
@@ -193,10 +200,13 @@ class UnitedProblem:
         options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
         #: Linear equations of users; None without any.
         self.linear: UnitedRows | None = None
+        if ties:
+            ties = [ScalarTie(self.config, tie, free) for tie in ties]
+            equations = [*ties, *equations]
         if equations:
             from uem_dolfinx.conditions.united_rows import unite
 
-            nodes = [pair.nodes for pair in pairs]
+            nodes = [pair.nodes for pair in pairs] + [tie.followed for tie in ties]
             self.linear = options["linear"] = unite(self.config, equations, free, nodes, self.load, clock.get("at", 0.0))
         self.system = method(self.bodies, pairs, self.solver, **options)
         #: Length of time steps, and what is known of those before.
@@ -229,7 +239,7 @@ class UnitedProblem:
         dofmap = self.u.function_space.dofmap
         size = f"{dofmap.index_map_bs * dofmap.index_map.size_global} unknowns in {config.gdim}D"
         kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
-        names = ", ".join(repr(contact.name) for contact in self.contacts) or "none"
+        names = ", ".join(map(repr, self._ties + [contact.name for contact in self.contacts])) or "none"
         return f"UnitedProblem({size}, {kind}, contacts: {names}, steps committed: {self.progress.steps})"
 
     # -- one step ----------------------------------------------------------------------------------------------------

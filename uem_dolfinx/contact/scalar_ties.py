@@ -1,0 +1,100 @@
+"""Ties of a scalar field, as a temperature, between meshes that do not match: linear equations by the weights that tie displacements.
+
+    u_i = sum_a w_a u_a        for every contactor i that is within reach of the target
+
+The weights are those of ``tied_rows`` where the surfaces are: shape functions at the foot, or means over segments by dual functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
+
+
+def check_ties(contacts: Sequence[Any], **others: Any) -> None:
+    """Refuse what a scalar field cannot have: contacts that are no ties of two meshes, and what is of displacements.
+
+    Args:
+        contacts: of the problem.
+        others: what else it was handed by name; None, or nothing in it, will do.
+
+    Raises:
+        SpaceError, InputError: naming it.
+    """
+    for contact in contacts:
+        if getattr(contact, "tied", False) is not True or hasattr(contact.target, "project"):
+            raise SpaceError(
+                f"contact '{contact.name}': the displacement has 1 component(s): use a vector Lagrange space; of a scalar u, as a "
+                "temperature, only ties of two meshes are there: give Contact(..., tied=True) with facets of a mesh as its target"
+            )
+        if contact.heat is not None:
+            raise InputError(
+                f"contact '{contact.name}': heat goes through a tie of temperatures without resistance: leave it out"
+            )
+    for name, what in others.items():
+        if what:
+            raise InputError(f"{name} is for displacements, and u is a scalar field: leave it out")
+
+
+class ScalarTie:
+    """One tie, as ``LinearEquations`` of the scalar field (collective).
+
+    Args:
+        config: nodes of the scalar field.
+        contact: the tie, which is taken by the problem.
+        free: which nodes have no Dirichlet condition ``(n_owned, 1)``.
+
+    Attributes:
+        followed: owned nodes of the target, to be eliminated only where no contactor can be.
+    """
+
+    firm = False
+    b = 0.0
+
+    def __init__(self, config: Configuration, contact: Contact, free: Bools):
+        # surfaces and segments are those of a displacement that is zero, whose nodes are at the same places with other numbers
+        still = Configuration(fem.Function(compat.function_space(config.mesh, config.degree, (config.gdim,))))
+        place = np.zeros(still.n_local, dtype=np.int64)
+        place[compat.cell_dofs(still.V)] = compat.cell_dofs(config.V)
+        number = config.to_global(place)
+        movable = config.ask_owners(number[: still.n_owned], free.astype(float)) > 0
+        pair = copy(contact).attach(still, np.repeat(movable, config.gdim, axis=1))
+        assert pair.tie is not None and pair.tie.rows is not None
+        tie = pair.tie.rows
+        contact.taken = True
+        tied, (row, node, weight) = np.flatnonzero(tie.has[:, 0]), tie.terms
+        equation = np.full(len(pair.nodes), -1)
+        equation[tied] = np.arange(len(tied))
+        kept = equation[row] >= 0
+        own: Ints = number[pair.nodes[tied]]
+        theirs: Ints = still.ask_owners(node[kept], number[: still.n_owned, None].astype(float))[:, 0].astype(np.int64)
+        rows = np.concatenate([np.arange(len(tied)), equation[row[kept]]])
+        order = np.argsort(rows, kind="stable")
+        weights: Array = np.concatenate([np.ones(len(tied)), -weight[kept, 0]])
+        self._rows = GivenRows(
+            np.zeros(len(tied), np.int64), rows[order], np.concatenate([own, theirs])[order], weights[order, None]
+        )
+        followed = np.zeros(config.n_owned, dtype=bool)
+        followed[Halo(config, theirs).asked] = True
+        followed[Halo(config, own).asked] = False
+        self.followed: Indices = np.flatnonzero(followed).astype(np.int32)
+
+    def n_values(self, block: int) -> int:
+        """As of ``LinearEquations``."""
+        return 1
+
+    def rows(self, config: Configuration, role: str) -> GivenRows:
+        """As of ``LinearEquations``."""
+        return self._rows
