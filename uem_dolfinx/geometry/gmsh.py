@@ -294,7 +294,7 @@ def _extract(model: Any, gdim: int | None, label: str) -> RawMesh:
         names = ", ".join(model.mesh.getElementProperties(kind)[0] for kind in sorted(kinds)) or "none"
         raise MeshError(
             f"the cells of {label} are {names}: they must all be one kind of triangle, quadrilateral, tetrahedron or "
-            "hexahedron, of order 1 or 2"
+            "hexahedron, of order 1 or 2; those of a .msh file are divided by uem.read_mesh(path, comm, cells='simplices')"
         )
     kind = kinds.pop()
     cell, degree = CELLS[kind]

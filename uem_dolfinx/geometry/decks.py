@@ -1,0 +1,262 @@
+"""The mesh in an input file of Abaqus or CalculiX: nodes, elements, and sets of nodes, of elements and of their sides.
+
+Of all keywords ``*NODE``, ``*ELEMENT``, ``*NSET``, ``*ELSET``, ``*SURFACE`` and ``*INCLUDE`` are read, as often as they stand there; data
+of others are passed over, and those that would make nodes or elements are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from uem_dolfinx.arrays import Ints
+from uem_dolfinx.errors import MeshError
+from uem_dolfinx.geometry.found import KINDS, Block, Found
+from uem_dolfinx.log import logger
+
+#: Families of element types, and the kind that the digit after the name tells: solids; bodies in the plane, shells and membranes; lines.
+FAMILIES = (
+    (r"(?:C3D|DC3D|AC3D)(\d+)[A-Z]*", {
+        4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15", 20: "hexahedron20",
+    }),
+    (r"(?:CPS|CPE|CPEG|CAX|CGAX|DC2D|DCAX|AC2D|ACAX|M3D|SFM3D|S|STRI|R3D|DS)(\d)[A-Z0-9]*", {
+        3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9",
+    }),
+    (r"(?:T2D|T3D|DC1D|R2D|RAX)(\d)[A-Z]*", {2: "line", 3: "line3"}),
+    (r"(?:B2|B3|PIPE2|PIPE3|SAX|MAX)(\d)[A-Z]*", {1: "line", 2: "line3", 3: "line"}),
+)  # fmt: skip
+#: Types that are no part of a body.
+BESIDE = r"(?:SPRING|DASHPOT|MASS|ROTARYI|HEATCAP|GAP|CONN|DCOUP|FRAME|JOINT|ITT|ISL|DRAG|US?\d).*|D"
+#: Keywords that would make or move nodes and elements.
+MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL")
+NODES_OF = {"line": 2, "line3": 3} | {
+    name: int(digits or KINDS[name.rstrip("0123456789")].vertices)
+    for _, kinds in FAMILIES[:2]
+    for name in kinds.values()
+    for digits in [re.sub(r"\D", "", name)]
+}
+
+
+@dataclass
+class Deck:
+    """What has been read, by the numbers and names of the file; sets are found without regard to capitals.
+
+    Attributes:
+        nodes: places.
+        elements: kinds, and numbers of nodes.
+        nsets: names and numbers of nodes, by the name in capitals; ``elsets`` likewise of elements.
+        surfaces: names, whether of elements, and pairs of a member and a side.
+        left_out: how many elements of each type are no part of a body.
+    """
+
+    nodes: dict[int, list[float]] = field(default_factory=dict)
+    elements: dict[int, tuple[str, list[int]]] = field(default_factory=dict)
+    nsets: dict[str, tuple[str, list[int]]] = field(default_factory=dict)
+    elsets: dict[str, tuple[str, list[int]]] = field(default_factory=dict)
+    surfaces: dict[str, tuple[bool, list[list[str]]]] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
+
+
+def read_deck(path: Path) -> Found:
+    """Read the mesh of an input file.
+
+    Raises:
+        MeshError: for what cannot be read.
+    """
+    deck = Deck()
+    for keyword, options, rows in _keywords(path):
+        try:
+            _take(deck, keyword, options, rows)
+        except (ValueError, KeyError, IndexError) as error:
+            raise MeshError(
+                f"{path}: cannot read *{keyword} {', '.join(f'{k}={v}' for k, v in options.items())}: {error}"
+            ) from error
+    if not deck.elements:
+        raise MeshError(f"{path} has no *ELEMENT that is a part of a body: expected an input file of Abaqus or CalculiX")
+    if deck.left_out:
+        what = ", ".join(f"{n} of type {name}" for name, n in deck.left_out.items())
+        logger.info("%s: elements that are no part of a body are left out: %s", path, what)
+    try:
+        return _found(deck)
+    except (KeyError, ValueError) as error:
+        raise MeshError(f"{path}: {error.args[0] if error.args else error}") from error
+
+
+def _keywords(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
+    """Keywords in capitals, their options likewise, and rows of what stands under them; files that are included in their place."""
+    keyword, options, rows = "", dict[str, str](), list[list[str]]()
+    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    for line in lines:
+        text = line.strip()
+        if not text or text.startswith("**"):
+            continue
+        if not text.startswith("*"):
+            rows.append([part.strip() for part in text.split(",")])
+            continue
+        while text.endswith(","):
+            text += next(lines, "").strip() or " "
+        yield keyword, options, rows
+        parts = [part.partition("=") for part in text[1:].split(",")]
+        keyword, rows = parts[0][0].strip().upper(), []
+        options = {name.strip().upper(): value.strip().strip('"') for name, _, value in parts[1:]}
+        if keyword == "INCLUDE":
+            yield from _keywords(_beside(path, options.get("INPUT", "")))
+    yield keyword, options, rows
+
+
+def _beside(path: Path, name: str) -> Path:
+    """A file that another one includes."""
+    found = path.parent / name
+    if not found.is_file():
+        raise MeshError(f"{path} includes '{name}', which is not beside it")
+    return found
+
+
+def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str]]) -> None:
+    """Take in what stands under a keyword."""
+    if keyword in ("PART", "INSTANCE"):
+        raise ValueError("parts and instances number their nodes anew: write the model as one flat input file")
+    if keyword in MAKING:
+        raise ValueError("it makes or moves nodes or elements: write them out")
+    if keyword == "NODE":
+        of_block = [int(row[0]) for row in rows]
+        for row in rows:
+            x = [float(value.lower().replace("d", "e") or 0.0) for value in row[1:4]]
+            deck.nodes[int(row[0])] = x + [0.0] * (3 - len(x))
+        if "NSET" in options:
+            _named(deck.nsets, options["NSET"]).extend(of_block)
+    elif keyword == "ELEMENT":
+        _elements(deck, options, rows)
+    elif keyword in ("NSET", "ELSET"):
+        sets = deck.nsets if keyword == "NSET" else deck.elsets
+        members = _named(sets, options[keyword])
+        for row in rows:
+            values = [value for value in row if value]
+            if "GENERATE" in options:
+                first, last, step = (*map(int, values), 1)[:3]
+                members.extend(range(first, last + 1, step))
+            else:
+                members.extend(number for value in values for number in _members(sets, value))
+    elif keyword == "SURFACE":
+        of_elements = options.get("TYPE", "ELEMENT").upper() == "ELEMENT"
+        deck.surfaces[options["NAME"]] = (of_elements, [[*row, ""][:2] for row in rows])
+
+
+def _named(sets: dict[str, tuple[str, list[int]]], name: str) -> list[int]:
+    """Members of a set, which is made if there is none."""
+    return sets.setdefault(name.upper(), (name, []))[1]
+
+
+def _members(sets: dict[str, tuple[str, list[int]]], value: str) -> list[int]:
+    """A number, or the numbers of a set."""
+    if value.lstrip("+-").isdigit():
+        return [int(value)]
+    if value.upper() not in sets:
+        raise ValueError(f"there is no set '{value}' before it")
+    return sets[value.upper()][1]
+
+
+def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> None:
+    """Take in elements of one type."""
+    name = options["TYPE"].upper()
+    for pattern, kinds in FAMILIES:
+        match = re.fullmatch(pattern, name)
+        kind = None if match is None else kinds.get(int(match[1]))
+        if kind is not None:
+            break
+    else:
+        if re.fullmatch(BESIDE, name) is None:
+            raise ValueError(f"the element type {name} is not known")
+        deck.left_out[name] = deck.left_out.get(name, 0) + len(lines)
+        return
+    width, numbers = NODES_OF[kind] + 1, [int(value) for line in lines for value in line if value]
+    if len(numbers) % width:
+        raise ValueError(f"{len(numbers)} numbers are no whole number of elements with {width - 1} nodes")
+    rows = np.array(numbers, dtype=np.int64).reshape(-1, width)
+    deck.elements.update({row[0]: (kind, row[1:]) for row in rows.tolist()})
+    if "ELSET" in options:
+        _named(deck.elsets, options["ELSET"]).extend(rows[:, 0].tolist())
+
+
+# ---------------------------------------------------------------------------------------------- from numbers to places
+
+
+def _found(deck: Deck) -> Found:
+    """Nodes, blocks of cells and sets of a deck, without its numbers."""
+    numbers = np.array(sorted(deck.nodes), dtype=np.int64)
+    kinds = list(dict.fromkeys(kind for kind, _ in deck.elements.values()))
+    of_kind = {kind: np.array([n for n, (k, _) in deck.elements.items() if k == kind], dtype=np.int64) for kind in kinds}
+    cells = [
+        Block(kind, _places(numbers, np.array([deck.elements[n][1] for n in own.tolist()]), "node"))
+        for kind, own in of_kind.items()
+    ]
+    cell_sets = {
+        name: [np.flatnonzero(np.isin(own, members)) for own in of_kind.values()] for name, members in deck.elsets.values()
+    }
+    point_sets = {name: _places(numbers, np.unique(members), "node") for name, members in deck.nsets.values()}
+    found = Found(np.array([deck.nodes[n] for n in numbers.tolist()]), cells, cell_sets, point_sets)
+    sides = _Sides(found, of_kind)
+    for name, (of_elements, rows) in deck.surfaces.items():
+        if of_elements:
+            found.sides[name] = sides.of(
+                name, [(np.array(_members(deck.elsets, who), dtype=np.int64), side.upper()) for who, side in rows]
+            )
+        else:
+            nodes = [number for who, _ in rows for number in _members(deck.nsets, who)]
+            point_sets[name] = _places(numbers, np.unique(nodes), "node")
+    return found
+
+
+def _places(numbers: Ints, wanted: Ints, what: str) -> Ints:
+    """Places of numbers of the file among those that there are, ascending."""
+    place = np.minimum(np.searchsorted(numbers, wanted), max(len(numbers) - 1, 0))
+    missing = wanted[numbers[place] != wanted] if len(numbers) else wanted
+    if missing.size:
+        raise ValueError(f"there is no {what} {missing.ravel()[0]}")
+    return place
+
+
+class _Sides:
+    """Sides of elements by their names; ``numbers`` of the elements of every block."""
+
+    def __init__(self, found: Found, numbers: dict[str, Ints]):
+        self._found, self._numbers = found, numbers
+
+    def of(self, surface: str, members: list[tuple[Ints, str]]) -> list[Ints]:
+        """Vertices of the sides of a surface, one array for each number of them, from elements ``(n,)`` and the name of their side."""
+        rows: dict[int, list[Ints]] = {}
+        for elements, side in members:
+            for block, own in zip(self._found.cells, self._numbers.values()):
+                which = np.flatnonzero(np.isin(own, elements))
+                if not len(which) or block.dim == 1:
+                    continue
+                for found in self._free(block, which) if not side else [self._named(surface, block, which, side)]:
+                    rows.setdefault(found.shape[1], []).append(found)
+        return [np.concatenate(parts) for parts in rows.values()]
+
+    def _named(self, surface: str, block: Block, which: Ints, side: str) -> Ints:
+        """Vertices of one side of some cells ``(n, k)``."""
+        sides = KINDS[block.base].sides
+        if block.dim < self._found.dim and side in ("SPOS", "SNEG"):
+            return block.data[which, : KINDS[block.base].vertices]
+        if not re.fullmatch(r"S\d", side) or not 1 <= int(side[1]) <= len(sides):
+            raise ValueError(f"the surface '{surface}' has the side {side} of {block.type}: expected S1 to S{len(sides)}")
+        return block.data[which[:, None], list(sides[int(side[1]) - 1])]
+
+    def _free(self, block: Block, which: Ints) -> list[Ints]:
+        """Vertices of those sides of some cells that no other cell has."""
+        if block.dim < self._found.dim:
+            return [block.data[which, : KINDS[block.base].vertices]]
+        every = [np.sort(b.data[:, list(s)], axis=1) for b in self._found.bodies for s in KINDS[b.base].sides]
+        found = []
+        for side in KINDS[block.base].sides:
+            rows = block.data[which[:, None], list(side)]
+            alike = np.concatenate([rows for rows in every if rows.shape[1] == len(side)])
+            known, count = np.unique(alike, axis=0, return_counts=True)
+            once = {tuple(row) for row in known[count == 1].tolist()}
+            found.append(rows[[tuple(row) in once for row in np.sort(rows, axis=1).tolist()]])
+        return found

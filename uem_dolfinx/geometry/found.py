@@ -1,0 +1,156 @@
+"""What is found in a mesh file of another program, before anything is made of it: nodes, cells of all kinds, sets and surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of cells by its vertices, in VTK's order, after which come nodes of edges, of quadrilaterals, and one in the middle.
+
+    Attributes:
+        vertices: how many.
+        edges: pairs of vertices.
+        faces: vertices of the sides of cells in space, around each, seen from outside; none in the plane, whose sides are edges.
+        quads: vertices of quadrilaterals that have a node in the middle where the cell is complete.
+        centre: whether there is one in the middle, too.
+    """
+
+    vertices: int
+    edges: Sequence[tuple[int, ...]]
+    faces: Sequence[tuple[int, ...]] = ()
+    quads: Sequence[tuple[int, ...]] = ()
+    centre: bool = False
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the cells."""
+        return 3 if self.faces else 2
+
+    @property
+    def sides(self) -> Sequence[tuple[int, ...]]:
+        """Vertices of the facets."""
+        return self.faces or self.edges
+
+    @property
+    def complete(self) -> int:
+        """Number of nodes of a cell of degree 2."""
+        return self.vertices + len(self.edges) + len(self.quads) + self.centre
+
+
+_HEXAHEDRON = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+_TETRAHEDRON = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
+#: Kinds of cells by meshio's name of those of degree 1; sides in Abaqus' order.
+KINDS = {
+    "triangle": Kind(3, ((0, 1), (1, 2), (2, 0))),
+    "quad": Kind(4, ((0, 1), (1, 2), (2, 3), (3, 0)), quads=((0, 1, 2, 3),)),
+    "tetra": Kind(4, _TETRAHEDRON, ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))),
+    "pyramid": Kind(
+        5,
+        ((0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)),
+        ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+        ((0, 1, 2, 3),),
+    ),
+    "wedge": Kind(
+        6,
+        ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
+        ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
+        ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
+    ),
+    "hexahedron": Kind(
+        8,
+        _HEXAHEDRON,
+        ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
+        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7)),
+        True,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Block:
+    """Cells of one kind.
+
+    Attributes:
+        type: meshio's name, as ``"hexahedron20"``.
+        data: nodes of each, in VTK's order ``(n, k)``.
+    """
+
+    type: str
+    data: Ints
+
+    @property
+    def base(self) -> str:
+        """Name of the kind that has vertices alone."""
+        return self.type.rstrip("0123456789")
+
+    @property
+    def dim(self) -> int:
+        """Dimension."""
+        known = {"vertex": 0, "line": 1, "polyhedron": 3}
+        return KINDS[self.base].dim if self.base in KINDS else known.get(self.base, 2)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A mesh as it stands in a file.
+
+    Attributes:
+        points: all nodes, also those of no cell ``(n, 2 or 3)``.
+        cells: blocks of cells of any dimension.
+        cell_sets: members of each set in every block, by name.
+        point_sets: nodes of each set, by name.
+        sides: vertices of the facets of each surface, one array for each number of vertices, by name.
+        cell_data: whole numbers that cells share, in every block, by name.
+    """
+
+    points: Array
+    cells: list[Block]
+    cell_sets: dict[str, list[Ints]] = field(default_factory=dict)
+    point_sets: dict[str, Ints] = field(default_factory=dict)
+    sides: dict[str, list[Ints]] = field(default_factory=dict)
+    cell_data: dict[str, list[Ints]] = field(default_factory=dict)
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the bodies."""
+        return max((block.dim for block in self.cells), default=0)
+
+    @property
+    def bodies(self) -> list[Block]:
+        """Blocks of cells of the bodies."""
+        return [block for block in self.cells if block.dim == self.dim]
+
+    def with_cells(self, points: Array, cells: list[Block], **others: Any) -> Found:
+        """The same with more nodes, and other cells in its blocks."""
+        return replace(self, points=points, cells=cells, **others)
+
+
+def from_meshio(found: Any) -> Found:
+    """A mesh that meshio has read."""
+    numbers = {}
+    for name, values in found.cell_data.items():
+        if all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
+            every = [np.asarray(v, dtype=np.int64) for v in values]
+            # as many values as cells are numbers of cells
+            if len(np.unique(np.concatenate(every))) < sum(map(len, every)):
+                numbers[name] = every
+    none = np.zeros(0, np.int64)
+    sets = {
+        name: [none if some is None else np.asarray(some, dtype=np.int64) for some in members]
+        for name, members in found.cell_sets.items()
+    }
+    return Found(
+        np.asarray(found.points, dtype=float),
+        [Block(block.type, np.asarray(block.data, dtype=np.int64)) for block in found.cells],
+        sets,
+        {name: np.asarray(nodes, dtype=np.int64) for name, nodes in found.point_sets.items()},
+        cell_data=numbers,
+    )

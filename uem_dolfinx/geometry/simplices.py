@@ -1,0 +1,146 @@
+"""Cells of several kinds divided into simplices of the same order, so that all of a mesh are of one kind and fit each other.
+
+Every cell is divided from its vertex with the smallest number: triangles or tetrahedra stand there on the sides that it is not on,
+and quadrilaterals of these are divided from their own smallest vertex. So cells that share a quadrilateral divide it by the same diagonal,
+[Dompierre, Labbé, Vallet and Camarero, How to subdivide pyramids, prisms and hexahedra into tetrahedra, 1999]. No node is added:
+diagonals of cells of order 2 have theirs in the middle of the quadrilateral or hexahedron.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.errors import MeshError
+from uem_dolfinx.geometry.found import KINDS, Block, Found, Kind
+
+#: Simplices by the dimension of their cells, and the number of nodes of those of order 2.
+SIMPLICES = {2: ("triangle", "triangle6"), 3: ("tetra", "tetra10")}
+
+
+def divided(found: Found, label: str) -> tuple[Found, dict[str, int]]:
+    """The mesh with simplices alone, and how many cells of each kind that was divided there were; sets and surfaces are kept.
+
+    Args:
+        found: with complete cells.
+        label: of the mesh, for messages.
+
+    Raises:
+        MeshError: for cells of other kinds, of several orders, or so distorted that their simplices overlap.
+    """
+    before: dict[str, int] = {}
+    cells, origin, orders = [], [], set()
+    for block in found.cells:
+        if block.dim < 2:
+            cells.append(block)
+            origin.append(np.arange(len(block.data)))
+            continue
+        order = _order(block, label)
+        if block.dim == found.dim:
+            orders.add(order)
+        if block.base not in ("triangle", "tetra"):
+            before[block.base] = before.get(block.base, 0) + len(block.data)
+        data, of = _simplices(block, order)
+        if block.dim == found.dim and len(data) > len(block.data):
+            _check(found.points, data, of, found.dim, label)
+        cells.append(Block(SIMPLICES[block.dim][order - 1], data))
+        origin.append(of)
+    if len(orders) > 1:
+        raise MeshError(
+            f"the cells of {label} are of order 1 and of order 2: expected one, which the program that made them can give"
+        )
+
+    def members(which: Sequence[Ints]) -> list[Ints]:
+        return [np.flatnonzero(np.isin(of, some)) for of, some in zip(origin, which)]
+
+    sets = {name: members(which) for name, which in found.cell_sets.items()}
+    numbers = {name: [values[of] for values, of in zip(every, origin)] for name, every in found.cell_data.items()}
+    sides = {
+        name: [np.concatenate([_triangles(rows) for rows in parts])] if found.dim == 3 and parts else parts
+        for name, parts in found.sides.items()
+    }
+    return replace(found, cells=cells, cell_sets=sets, cell_data=numbers, sides=sides), before
+
+
+def _order(block: Block, label: str) -> int:
+    """Order of cells, 1 or 2."""
+    kind, n = KINDS.get(block.base), block.data.shape[1]
+    if kind is None or n not in (kind.vertices, kind.complete):
+        raise MeshError(f"{label} has cells {block.type}, which cannot be divided: expected {', '.join(KINDS)}, of order 1 or 2")
+    return 1 if n == kind.vertices else 2
+
+
+def _simplices(block: Block, order: int) -> tuple[Ints, Ints]:
+    """Nodes of the simplices of all cells, and the cell that each is of."""
+    kind = KINDS[block.base]
+    lowest = block.data[:, : kind.vertices].argmin(axis=1)
+    parts, of = [], []
+    for apex in range(kind.vertices):
+        which = np.flatnonzero(lowest == apex)
+        for side in kind.sides:
+            if apex in side or not len(which):
+                continue
+            for rows, local in _divisions(block.data[which], side):
+                parts.append(_nodes(kind, block.data[which[rows]], (*local, apex), order))
+                of.append(which[rows])
+    data, cell = np.concatenate(parts), np.concatenate(of)
+    # collapsed cells name a vertex twice
+    corners = np.sort(data[:, : block.dim + 1], axis=1)
+    whole = (np.diff(corners, axis=1) > 0).all(axis=1)
+    order_of = np.argsort(cell[whole], kind="stable")
+    return data[whole][order_of], cell[whole][order_of]
+
+
+def _divisions(data: Ints, side: tuple[int, ...]) -> Iterator[tuple[Ints, tuple[int, ...]]]:
+    """Simplices of one side of cells: rows of cells, and local vertices; quadrilaterals are divided from their smallest vertex."""
+    if len(side) < 4:
+        yield np.arange(len(data)), side
+        return
+    lowest = data[:, side].argmin(axis=1)
+    for k in range(4):
+        rows = np.flatnonzero(lowest == k)
+        a, b, c, d = (side[(k + i) % 4] for i in range(4))
+        yield rows, (a, b, c)
+        yield rows, (a, c, d)
+
+
+def _nodes(kind: Kind, data: Ints, local: tuple[int, ...], order: int) -> Ints:
+    """Nodes of simplices with these local vertices, in VTK's order."""
+    if order == 1:
+        return data[:, local]
+    ends = KINDS["tetra" if len(local) == 4 else "triangle"].edges
+    return data[:, [*local, *(_middle(kind, {local[i], local[j]}) for i, j in ends)]]
+
+
+def _middle(kind: Kind, ends: set[int]) -> int:
+    """Local node between two vertices: of an edge, of a quadrilateral whose diagonal it is, or of the whole cell."""
+    for k, edge in enumerate(kind.edges):
+        if ends == set(edge):
+            return kind.vertices + k
+    for k, quad in enumerate(kind.quads):
+        if ends <= set(quad):
+            return kind.vertices + len(kind.edges) + k
+    return kind.complete - 1
+
+
+def _triangles(rows: Ints) -> Ints:
+    """Facets by their vertices, quadrilaterals divided as cells divide them."""
+    if rows.shape[1] == 3:
+        return rows
+    return np.concatenate([rows[which][:, local] for which, local in _divisions(rows, (0, 1, 2, 3))])
+
+
+def _check(points: Array, data: Ints, cell: Ints, dim: int, label: str) -> None:
+    """Refuse simplices ``data`` that are inside out, by their volumes and those of the cells that they are of."""
+    x = points[data[:, : dim + 1], :dim]
+    volume = np.linalg.det(x[:, 1:] - x[:, :1])
+    bad = np.flatnonzero(volume * np.bincount(cell, volume)[cell] <= 0.0)
+    if len(bad):
+        place = ", ".join(f"{v:.6g}" for v in x[bad[0]].mean(axis=0))
+        raise MeshError(
+            f"{len(bad)} of the simplices that cells of {label} are divided into are inside out, the first at ({place}): the cells there "
+            "are too distorted"
+        )
