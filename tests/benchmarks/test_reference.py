@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
-from benchmarks.reference import compare
-
-DEMOS = Path(compare.HERE).parent.parent
+from benchmarks.reference import compare, decks
 
 
 def test_every_scene_is_said_on_the_page():
     page = (compare.HERE / "README.md").read_text(encoding="utf-8")
-    assert len(compare.SCENES) == 12
+    assert len(compare.SCENES) == 16
     for scene in compare.SCENES:
-        source = (DEMOS / f"{scene['demo']}.py").read_text(encoding="utf-8")
-        assert f"[{scene['name']}](../../{scene['demo']}.py)" in page and scene["source"]
+        script = "decks.py" if "deck" in scene else f"../../{scene['demo']}.py"
+        source = (compare.HERE / script).read_text(encoding="utf-8")
+        assert f"[{scene['name']}]({script})" in page and scene["source"]
         for quantity in scene["quantities"]:
             assert f"| {scene['name']} | {quantity['what']} |" in page
             key = next(k for k in reversed(quantity["path"]) if isinstance(k, str))
-            assert f'"{key}"' in source
+            assert f'"{key}"' in source or f'"{key[:-1]}{{i}}"' in source
 
 
 def test_figures_are_found_where_they_are():
@@ -30,6 +29,29 @@ def test_figures_are_found_where_they_are():
     assert compare.at({"a": {"x": 1e-3, "y": 2e-3}}, ["a"]) == 2e-3
     with pytest.raises(SystemExit, match="no scene Herz: known are patch test"):
         compare.main(["Herz"])
+
+
+@pytest.mark.slow
+def test_a_deck_of_ones_own(folder):
+    """A tube like that of the deck, of cells of our own, twice as many: Lamé's displacements to 1e-4."""
+    radii = np.linspace(50.0, 100.0, 9)
+    nodes = [(r, z) for z in (0.0, 5.0, 10.0) for r in radii]
+    lines = ["*NODE"] + [f"{n}, {r}, {z}" for n, (r, z) in enumerate(nodes, 1)] + ["*ELEMENT, TYPE=CAX8R, ELSET=all"]
+    for k in range(4):
+        a = 2 * k + 1
+        lines.append(f"{k + 1}, " + ", ".join(str(a + i) for i in (0, 2, 20, 18, 1, 11, 19, 9)))
+    lines += ["*NSET, NSET=Nz0, GENERATE", "1, 9", "*NSET, NSET=Nz1, GENERATE", "19, 27"]
+    path = folder / "08_lame_cax8.inp"
+    if MPI.COMM_WORLD.rank == 0:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    MPI.COMM_WORLD.barrier()
+    found = decks.SCENES[path.name](path)
+    assert found == pytest.approx({"u_inside": 4.5396825397e-3, "u_outside": 2.8888888889e-3}, rel=1e-4)
+
+
+def test_decks_that_are_not_there(tmp_path):
+    with pytest.raises(SystemExit, match="tube of CAX8 needs the file 08_lame_cax8.inp"):
+        compare.main(["tube of CAX8"], tmp_path)
 
 
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="it starts a process of its own")

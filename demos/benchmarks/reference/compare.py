@@ -1,8 +1,10 @@
 """Run scenes of the set, all or those named, and compare their figures with the references.
 
 python3 demos/benchmarks/reference/compare.py "press fit" belt
+python3 demos/benchmarks/reference/compare.py --decks FOLDER
 """
 
+import argparse
 import json
 import os
 import subprocess
@@ -15,12 +17,16 @@ HERE = Path(__file__).resolve().parent
 SCENES: list[dict[str, Any]] = json.loads((HERE / "scenes.json").read_text(encoding="utf-8"))
 
 
-def figures(demo: str, options: str) -> Any:
-    """What a demo writes to its JSON file, in a process of its own."""
+def figures(scene: dict[str, Any], decks: Path | None = None) -> Any:
+    """What a scene's script writes to its JSON file, in a process of its own; None of a deck that is not in the folder ``decks``."""
+    script, options = HERE.parent.parent / f"{scene.get('demo')}.py", scene.get("options", "").split()
+    if "deck" in scene:
+        if decks is None or not (decks / scene["deck"]).is_file():
+            return None
+        script, options = HERE / "decks.py", ["--deck", decks / scene["deck"]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "figures.json"
-        script = HERE.parent.parent / f"{demo}.py"
-        subprocess.run([sys.executable, script, *options.split(), "--json", path], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run([sys.executable, script, *options, "--json", path], check=True, stdout=subprocess.DEVNULL)
         return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -31,15 +37,19 @@ def at(found: Any, path: list[Any]) -> float:
     return float(max(found.values()) if isinstance(found, dict) else found)
 
 
-def main(names: list[str]) -> None:
-    """Print a line for each quantity."""
+def main(names: list[str], decks: Path | None = None) -> None:
+    """Print a line for each quantity; decks of other programs are run where they are in a folder."""
     unknown = set(names) - {scene["name"] for scene in SCENES}
     if unknown:
         sys.exit(f"no scene {', '.join(sorted(unknown))}: known are {', '.join(scene['name'] for scene in SCENES)}")
     for scene in SCENES:
         if names and scene["name"] not in names:
             continue
-        found = figures(scene["demo"], scene["options"])
+        found = figures(scene, decks)
+        if found is None:
+            if names:
+                sys.exit(f"{scene['name']} needs the file {scene['deck']} of {scene['source']}: give its folder by --decks")
+            continue
         for quantity in scene["quantities"]:
             value = at(found, quantity["path"])
             print(f"| {scene['name']} | {quantity['what']} | {quantity['reference']:.6g} | {value:.6g} |", flush=True)
@@ -47,4 +57,8 @@ def main(names: list[str]) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("names", nargs="*", help="scenes; without any, all")
+    parser.add_argument("--decks", metavar="FOLDER", type=Path, help="where the files of other programs' decks are")
+    args = parser.parse_args()
+    main(args.names, args.decks)
