@@ -78,6 +78,22 @@ def test_nonlinear_conduction(contactor):
     assert [problem.reaction(tag)[0] for tag in ends] == pytest.approx([-0.75, 0.75], rel=1e-10)
 
 
+@pytest.mark.slow
+def test_conditions_on_both_sides():
+    """A harmonic field on the outside, which the meshes do not have alike, is found inside, better by four on a mesh twice as fine."""
+    errors = []
+    for n in (3, 6):
+        domain, tags = two_blocks(3, n, n + 1, quads=1)
+        V = uem.function_space(domain, 1)
+        u, exact = fem.Function(V), fem.Function(V)
+        exact.interpolate(lambda x: np.sin(2.0 * x[0]) * np.exp(2.0 * x[2] - 4.0) + x[1])
+        outside = [tags[name] for name in ("bottom_1", "top_2", "sides_x", "sides_y")]
+        tie = uem.Contact(tags["bottom_2"], tags["top_1"], coupling="mortar", tied=True)
+        uem.UnitedProblem(conduction(u), u, bcs=[uem.dirichlet(V, outside, value=exact)], contacts=[tie]).solve()
+        errors.append(reduced(COMM, np.abs(u.x.array - exact.x.array).max(initial=0.0), op=MPI.MAX))
+    assert 3.0 < errors[0] / errors[1] < 6.0 and errors[1] < 2e-3
+
+
 def test_linear_equations_of_a_scalar():
     """Periodic with a jump, and held at a corner, the field is linear."""
     square = mesh.create_unit_square(COMM, 3, 3)
@@ -109,3 +125,4 @@ def test_refused():
     problem(tie)()
     refused(uem.SurfaceError, "ties a scalar field", lambda: tie.resultant())
     refused(uem.SpaceError, "belongs to another problem", problem(tie))
+    refused(uem.InputTypeError, "a general contact ties nothing", lambda: uem.GeneralContact(tied=True))

@@ -96,6 +96,35 @@ def test_curved_cells_keep_their_places(folder, gdim, recombine):
     assert volume(mesh) == pytest.approx(volume(expected), rel=1e-12) == pytest.approx(0.75 * np.pi, rel=1e-3)
 
 
+@pytest.mark.slow
+def test_several_kinds_of_gmsh(folder):
+    """Hexahedra and prisms of degree 2 in a file of Gmsh: refused, and divided with their groups."""
+    pytest.importorskip("meshio")
+    if COMM.rank == 0:
+        import gmsh
+
+        gmsh.initialize(["gmsh"], False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        squares = [gmsh.model.occ.addRectangle(x, 0.0, 0.0, 1.0, 1.0) for x in (0.0, 1.0)]
+        gmsh.model.occ.fragment([(2, squares[0])], [(2, squares[1])])
+        gmsh.model.occ.extrude([(2, s) for s in squares], 0.0, 0.0, 1.0, [1], recombine=True)
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.setRecombine(2, squares[0])
+        for number, name in enumerate(("left", "right"), 1):
+            gmsh.model.setPhysicalName(3, gmsh.model.addPhysicalGroup(3, [number], number), name)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.5)
+        gmsh.option.setNumber("Mesh.ElementOrder", 2)
+        gmsh.model.mesh.generate(3)
+        gmsh.write(str(folder / "two.msh"))
+        gmsh.finalize()
+    COMM.barrier()
+    with pytest.raises(uem.MeshError, match="Prism.*cells='simplices'"):
+        uem.read_mesh(folder / "two.msh", COMM)
+    mesh, tags = uem.read_mesh(folder / "two.msh", COMM, cells="simplices")
+    assert volume(mesh, ufl.ds(domain=mesh)) == pytest.approx(10.0, rel=1e-12)
+    assert [volume(mesh, uem.dx(tags[name])) for name in ("left", "right")] == pytest.approx([1.0, 1.0], rel=1e-12)
+
+
 def test_values_of_cells_are_tags(folder):
     """Whole numbers that cells share tell them apart; numbers of cells do not."""
     meshio = pytest.importorskip("meshio")

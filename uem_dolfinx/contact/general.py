@@ -153,6 +153,7 @@ class GeneralContact:
         measure: str = "reference",
         name: str = "general contact",
         heat: None = None,
+        tied: None = None,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
             rigid = [rigid] if hasattr(rigid, "project") else rigid
@@ -169,13 +170,12 @@ class GeneralContact:
             if max_penetration is not None:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
-            given.kind("heat", heat, heat is None, "None: a general contact lets no heat through", "declare a Contact for it")
+            for what, value, does in (("heat", heat, "lets no heat through"), ("tied", tied, "ties nothing")):
+                given.kind(what, value, value is None, f"None: a general contact {does}", "declare a Contact for it")
         self.surfaces, self.bodies, self.friction = surfaces, dict(bodies or {}), friction
         self.max_penetration, self.name, self.self_contact = max_penetration, name, self_contact
-        #: Whether a problem has been made of it.
-        self.taken = False
-        self._parts: list[Contact] = []
-        self._fields: dict[str, fem.Function] = {}
+        self.taken = False  # whether a problem has been made of it
+        self._parts, self._fields = list[Contact](), dict[str, fem.Function]()
 
     def _friction_of_pairs(self, friction: Any) -> FrictionOfPairs | None:
         """Friction that is given by pairs; None if it is one for all."""

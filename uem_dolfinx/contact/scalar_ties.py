@@ -17,6 +17,7 @@ from dolfinx import fem
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.conditions.independent_rows import sizes
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -83,9 +84,11 @@ class ScalarTie:
         rows = np.concatenate([np.arange(len(tied)), equation[row[kept]]])
         order = np.argsort(rows, kind="stable")
         weights: Array = np.concatenate([np.ones(len(tied)), -weight[kept, 0]])
-        self._rows = GivenRows(
-            np.zeros(len(tied), np.int64), rows[order], np.concatenate([own, theirs])[order], weights[order, None]
-        )
+        found = GivenRows(np.zeros(len(tied), np.int64), rows[order], np.concatenate([own, theirs])[order], weights[order, None])
+        # where conditions prescribe both sides, they differ by what the meshes make of the values, and there is nothing to tie
+        able = np.zeros(len(tied), dtype=bool)
+        able[found.row[(sizes(config, found, free) > 0).any(axis=1)]] = True
+        self._rows = found.select(able)
         followed = np.zeros(config.n_owned, dtype=bool)
         followed[Halo(config, theirs).asked] = True
         followed[Halo(config, own).asked] = False

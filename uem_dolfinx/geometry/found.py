@@ -133,11 +133,20 @@ class Found:
         return replace(self, points=points, cells=cells, **others)
 
 
-def from_meshio(found: Any) -> Found:
-    """A mesh that meshio has read."""
+#: What meshio tells of files of Gmsh that is not of the mesh.
+BESIDE = ("gmsh:geometrical", "gmsh:bounding_entities")
+#: Nodes of cells as meshio takes them from files of Gmsh without putting them into VTK's order.
+OF_GMSH = {
+    "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
+    "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
+}
+
+
+def from_meshio(found: Any, of_gmsh: bool = False) -> Found:
+    """A mesh that meshio has read, perhaps from a file of Gmsh."""
     numbers = {}
     for name, values in found.cell_data.items():
-        if all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
+        if name not in BESIDE and all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
             every = [np.asarray(v, dtype=np.int64) for v in values]
             # as many values as cells are numbers of cells
             if len(np.unique(np.concatenate(every))) < sum(map(len, every)):
@@ -146,11 +155,18 @@ def from_meshio(found: Any) -> Found:
     sets = {
         name: [none if some is None else np.asarray(some, dtype=np.int64) for some in members]
         for name, members in found.cell_sets.items()
+        if name not in BESIDE
     }
     return Found(
         np.asarray(found.points, dtype=float),
-        [Block(block.type, np.asarray(block.data, dtype=np.int64)) for block in found.cells],
+        [Block(block.type, _in_order(block, of_gmsh)) for block in found.cells],
         sets,
         {name: np.asarray(nodes, dtype=np.int64) for name, nodes in found.point_sets.items()},
         cell_data=numbers,
     )
+
+
+def _in_order(block: Any, of_gmsh: bool) -> Ints:
+    """Nodes of meshio's cells in VTK's order."""
+    data = np.asarray(block.data, dtype=np.int64)
+    return data[:, OF_GMSH[block.type]] if of_gmsh and block.type in OF_GMSH else data

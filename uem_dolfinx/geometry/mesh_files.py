@@ -127,7 +127,7 @@ def _found(path: Path) -> Found:
     said = StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
-            return from_meshio(meshio.read(path))
+            return from_meshio(meshio.read(path), path.suffix == ".msh")
     # meshio raises whatever a file that it does not understand leads to, and leaves the process where it knows no reader
     except (Exception, SystemExit) as error:
         told = " ".join(said.getvalue().split()) or str(error)

@@ -134,12 +134,20 @@ def _triangles(rows: Ints) -> Ints:
 
 
 def _check(points: Array, data: Ints, cell: Ints, dim: int, label: str) -> None:
-    """Refuse simplices ``data`` that are inside out, by their volumes and those of the cells that they are of."""
-    x = points[data[:, : dim + 1], :dim]
-    volume = np.linalg.det(x[:, 1:] - x[:, :1])
-    bad = np.flatnonzero(volume * np.bincount(cell, volume)[cell] <= 0.0)
+    """Refuse simplices ``data`` that are inside out, as a whole or at a vertex, by the volumes of the cells that they are of."""
+    x = points[data, :dim]
+    volume = np.linalg.det(x[:, 1 : dim + 1] - x[:, :1])
+    wrong = volume * np.bincount(cell, volume)[cell] <= 0.0
+    ends = [set(edge) for edge in KINDS["tetra" if dim == 3 else "triangle"].edges]
+    for k in range(dim + 1) if data.shape[1] > dim + 1 else ():
+        # tangents of the edges from a vertex, whose nodes in the middle bend them
+        others = [j for j in range(dim + 1) if j != k]
+        middle = [dim + 1 + ends.index({j, k}) for j in others]
+        corner = np.linalg.det(4.0 * x[:, middle] - 3.0 * x[:, k, None] - x[:, others])
+        wrong |= corner * volume * (-1.0) ** k < 0.0
+    bad = np.flatnonzero(wrong)
     if len(bad):
-        place = ", ".join(f"{v:.6g}" for v in x[bad[0]].mean(axis=0))
+        place = ", ".join(f"{v:.6g}" for v in x[bad[0], : dim + 1].mean(axis=0))
         raise MeshError(
             f"{len(bad)} of the simplices that cells of {label} are divided into are inside out, the first at ({place}): the cells there "
             "are too distorted"
