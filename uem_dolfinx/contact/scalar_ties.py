@@ -24,22 +24,26 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
 
 
-def check_ties(contacts: Sequence[Any], **others: Any) -> None:
+def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **others: Any) -> None:
     """Refuse what a scalar field cannot have: contacts that are no ties of two meshes, and what is of displacements.
 
     Args:
+        gdim: dimension of the mesh.
         contacts: of the problem.
+        equations: likewise; a scalar field with neither is taken for a displacement by mistake.
         others: what else it was handed by name; None, or nothing in it, will do.
 
     Raises:
         SpaceError, InputError: naming it.
     """
+    others_than_ties = [one for one in contacts if getattr(one, "tied", False) is not True or hasattr(one.target, "project")]
+    if others_than_ties or not (contacts or equations):
+        which = f"contact '{others_than_ties[0].name}': " if others_than_ties else ""
+        raise SpaceError(
+            f"{which}the displacement has 1 component(s) in {gdim}D: use a vector Lagrange space of size {gdim}; a scalar u, as a "
+            "temperature, has ties of two meshes or linear equations: give Contact(..., tied=True) with facets of a mesh as its target"
+        )
     for contact in contacts:
-        if getattr(contact, "tied", False) is not True or hasattr(contact.target, "project"):
-            raise SpaceError(
-                f"contact '{contact.name}': the displacement has 1 component(s): use a vector Lagrange space; of a scalar u, as a "
-                "temperature, only ties of two meshes are there: give Contact(..., tied=True) with facets of a mesh as its target"
-            )
         if contact.heat is not None:
             raise InputError(
                 f"contact '{contact.name}': heat goes through a tie of temperatures without resistance: leave it out"

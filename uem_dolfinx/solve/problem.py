@@ -143,7 +143,7 @@ class UnitedProblem:
             if not self.config.moves:
                 from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
 
-                check_ties(contacts, materials=materials, dynamics=dynamics, points=points)
+                check_ties(self.config.gdim, contacts, equations, materials=materials, dynamics=dynamics, points=points)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
