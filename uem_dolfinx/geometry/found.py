@@ -134,7 +134,7 @@ class Found:
 
 
 #: What meshio tells of files of Gmsh that is not of the mesh.
-BESIDE = ("gmsh:geometrical", "gmsh:bounding_entities")
+NOT_OF_MESH = ("gmsh:geometrical", "gmsh:bounding_entities")
 #: Nodes of cells as meshio takes them from files of Gmsh without putting them into VTK's order.
 OF_GMSH = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
@@ -146,7 +146,7 @@ def from_meshio(found: Any, of_gmsh: bool = False) -> Found:
     """A mesh that meshio has read, perhaps from a file of Gmsh."""
     numbers = {}
     for name, values in found.cell_data.items():
-        if name not in BESIDE and all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
+        if name not in NOT_OF_MESH and all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
             every = [np.asarray(v, dtype=np.int64) for v in values]
             # as many values as cells are numbers of cells
             if len(np.unique(np.concatenate(every))) < sum(map(len, every)):
@@ -155,7 +155,7 @@ def from_meshio(found: Any, of_gmsh: bool = False) -> Found:
     sets = {
         name: [none if some is None else np.asarray(some, dtype=np.int64) for some in members]
         for name, members in found.cell_sets.items()
-        if name not in BESIDE
+        if name not in NOT_OF_MESH
     }
     return Found(
         np.asarray(found.points, dtype=float),

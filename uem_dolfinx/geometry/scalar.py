@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
@@ -35,6 +39,18 @@ class ScalarConfiguration(Configuration):
     def place_of(self, unknown: int) -> str:
         """Where the node of a local unknown is, for error messages."""
         return f"the value at {self.describe(unknown)}"
+
+    def functions(self) -> dict[str, fem.Function]:
+        """The field alone."""
+        return {"field": self.whole}
+
+    def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
+        """As of ``Configuration``."""
+        functions["field"].x.array[:] = values
+
+    def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
+        """As of ``Configuration``."""
+        return np.array(functions["field"].x.array)
 
     @property
     def x(self) -> Array:

@@ -53,7 +53,7 @@ def load_steps(
     with agreed(problem.comm):
         steps, arc_length = given.count("steps", steps), given.flag("arc_length", arc_length)
     given.alike(problem.comm, "load_steps", steps=steps, arc_length=arc_length)
-    begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
+    begin_checkpoint(checkpoint, problem.state, next(iter(problem.config.functions().values())))
     way: ByLoad | AlongArc = ByLoad(problem)
     if arc_length:
         from uem_dolfinx.solve.arc_length import AlongArc
