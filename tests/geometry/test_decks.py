@@ -235,14 +235,17 @@ def test_refused(folder):
         ("*SURFACE, NAME=a\n10, S5\n", ("surface 'a'", "S1 to S4")),
         ("*ELSET, ELSET=a\nnobody\n", ("ELSET", "no set 'nobody'")),
         ("*NSET, NSET=a\n999\n", "no node 999"),
+        ("*NODE\n10, 5.0, 5.0\n", "two nodes 10"),
         ("*NGEN\n1, 2\n", ("NGEN", "write them out")),
-        ("*PART, NAME=a\n", "one flat input file"),
+        ("*PART, NAME=a\n*PART, NAME=b\n", "one flat input file"),
+        ("*INSTANCE, NAME=a-1, PART=a\n1.0, 0.0, 0.0\n", "one flat input file"),
         ("*INCLUDE, INPUT=nowhere.inp\n", "nowhere.inp"),
     ):
         refused(uem.MeshError, words, lambda text=text: uem.read_mesh(deck(folder, "bad.inp", points, quad, text), COMM))
     crooked = deck(folder, "crooked.inp", points[[1, 4, 3, 0]], {"quad": [[3, 0, 1, 2]]})
     refused(uem.MeshError, ("inside out", "too distorted"), lambda: uem.read_mesh(crooked, COMM, cells="simplices"))
     refused(uem.InputError, "simplices", lambda: uem.read_mesh(crooked, COMM, cells="tetrahedra"))
-    beside = deck(folder, "beside.inp", points, quad, "*ELEMENT, TYPE=SPRINGA, ELSET=s\n90, 10, 20\n")
+    text = "*ELEMENT, TYPE=SPRINGA, ELSET=s\n90, 10, 20\n*PART, NAME=a\n*INSTANCE, NAME=a-1, PART=a\n*END INSTANCE\n"
+    beside = deck(folder, "beside.inp", points, quad, text)
     mesh, _ = uem.read_mesh(beside, COMM)
     assert reduced(COMM, mesh.topology.index_map(2).size_local) == 1

@@ -9,7 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +53,7 @@ class Deck:
         nsets: names and numbers of nodes, by the name in capitals; ``elsets`` likewise of elements.
         surfaces: names, whether of elements, and pairs of a member and a side.
         left_out: how many elements of each type are no part of a body.
+        parts: how many parts there are, and instances of them.
     """
 
     nodes: dict[int, list[float]] = field(default_factory=dict)
@@ -59,6 +62,7 @@ class Deck:
     elsets: dict[str, tuple[str, list[int]]] = field(default_factory=dict)
     surfaces: dict[str, tuple[bool, list[list[str]]]] = field(default_factory=dict)
     left_out: dict[str, int] = field(default_factory=dict)
+    parts: dict[str, int] = field(default_factory=dict)
 
 
 def read_deck(path: Path) -> Found:
@@ -119,14 +123,19 @@ def _beside(path: Path, name: str) -> Path:
 def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str]]) -> None:
     """Take in what stands under a keyword."""
     if keyword in ("PART", "INSTANCE"):
-        raise ValueError("parts and instances number their nodes anew: write the model as one flat input file")
+        # one part, where it is drawn, is the model
+        deck.parts[keyword] = deck.parts.get(keyword, 0) + 1
+        if deck.parts[keyword] > 1 or (keyword == "INSTANCE" and rows):
+            raise ValueError(
+                "several parts, or one that is moved, number their nodes anew: write the model as one flat input file"
+            )
     if keyword in MAKING:
         raise ValueError("it makes or moves nodes or elements: write them out")
     if keyword == "NODE":
         of_block = [int(row[0]) for row in rows]
         for row in rows:
             x = [float(value.lower().replace("d", "e") or 0.0) for value in row[1:4]]
-            deck.nodes[int(row[0])] = x + [0.0] * (3 - len(x))
+            _once(deck.nodes, "node", int(row[0]), x + [0.0] * (3 - len(x)))
         if "NSET" in options:
             _named(deck.nsets, options["NSET"]).extend(of_block)
     elif keyword == "ELEMENT":
@@ -144,6 +153,12 @@ def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str
     elif keyword == "SURFACE":
         of_elements = options.get("TYPE", "ELEMENT").upper() == "ELEMENT"
         deck.surfaces[options["NAME"]] = (of_elements, [[*row, ""][:2] for row in rows])
+
+
+def _once(known: dict[int, Any], what: str, number: int, value: Any) -> None:
+    """Take in a node or an element, which has its number for itself."""
+    if known.setdefault(number, value) != value:
+        raise ValueError(f"there are two {what}s {number}, as in an assembly: write the model as one flat input file")
 
 
 def _named(sets: dict[str, tuple[str, list[int]]], name: str) -> list[int]:
@@ -177,7 +192,8 @@ def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> No
     if len(numbers) % width:
         raise ValueError(f"{len(numbers)} numbers are no whole number of elements with {width - 1} nodes")
     rows = np.array(numbers, dtype=np.int64).reshape(-1, width)
-    deck.elements.update({row[0]: (kind, row[1:]) for row in rows.tolist()})
+    for row in rows.tolist():
+        _once(deck.elements, "element", row[0], (kind, row[1:]))
     if "ELSET" in options:
         _named(deck.elsets, options["ELSET"]).extend(rows[:, 0].tolist())
 
@@ -247,16 +263,25 @@ class _Sides:
             raise ValueError(f"the surface '{surface}' has the side {side} of {block.type}: expected S1 to S{len(sides)}")
         return block.data[which[:, None], list(sides[int(side[1]) - 1])]
 
+    @cached_property
+    def _single(self) -> dict[int, set[tuple[int, ...]]]:
+        """Vertices of the sides that one cell alone has, ascending, by their number."""
+        rows: dict[int, list[Ints]] = {}
+        for block in self._found.bodies:
+            for side in KINDS[block.base].sides:
+                rows.setdefault(len(side), []).append(np.sort(block.data[:, list(side)], axis=1))
+        found = {}
+        for width, parts in rows.items():
+            known, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
+            found[width] = set(map(tuple, known[count == 1].tolist()))
+        return found
+
     def _free(self, block: Block, which: Ints) -> list[Ints]:
         """Vertices of those sides of some cells that no other cell has."""
         if block.dim < self._found.dim:
             return [block.data[which, : KINDS[block.base].vertices]]
-        every = [np.sort(b.data[:, list(s)], axis=1) for b in self._found.bodies for s in KINDS[b.base].sides]
         found = []
         for side in KINDS[block.base].sides:
-            rows = block.data[which[:, None], list(side)]
-            alike = np.concatenate([rows for rows in every if rows.shape[1] == len(side)])
-            known, count = np.unique(alike, axis=0, return_counts=True)
-            once = {tuple(row) for row in known[count == 1].tolist()}
-            found.append(rows[[tuple(row) in once for row in np.sort(rows, axis=1).tolist()]])
+            rows, single = block.data[which[:, None], list(side)], self._single[len(side)]
+            found.append(rows[[tuple(row) in single for row in np.sort(rows, axis=1).tolist()]])
         return found

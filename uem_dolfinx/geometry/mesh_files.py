@@ -116,7 +116,7 @@ def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
 
 def _found(path: Path) -> Found:
     """What is in the file."""
-    if path.suffix == ".inp":
+    if path.suffix.lower() == ".inp":
         from uem_dolfinx.geometry.decks import read_deck
 
         return read_deck(path)
