@@ -41,11 +41,11 @@ __all__ = [
     "GeneralContact", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError",
     "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
     "OrientationError", "OutputError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant",
-    "ResultsWriter", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError",
-    "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError",
-    "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass",
-    "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
-    "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
+    "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme",
+    "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
+    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric",
+    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha",
+    "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
     "periodic", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test", "time_steps",
     "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
@@ -119,6 +119,7 @@ from uem_dolfinx.solve.time_steps import TimeStep, time_steps
 if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.preload import Preload
@@ -137,6 +138,7 @@ _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
+    "RigidCoupling": "conditions.rigid_coupling",
     "Preload": "contact.preload",
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",

@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray, Array
 from uem_dolfinx.conditions.places import nodes_at
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, reduced
@@ -89,10 +90,13 @@ class AtPoints:
     Args:
         config: configuration of the displacement.
         declared: as users declared them.
+        couplings: whose force and moment act at nodes, too; attached.
     """
 
-    def __init__(self, config: Configuration, declared: Sequence[PointLoad | PointSpring]):
-        self._config = config
+    def __init__(
+        self, config: Configuration, declared: Sequence[PointLoad | PointSpring], couplings: Sequence[RigidCoupling] = ()
+    ):
+        self._config, self._couplings = config, list(couplings)
         self._parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
         with agreed(config.comm):
             for one, _ in self._parts:
@@ -102,17 +106,21 @@ class AtPoints:
         self._unknowns = config.of(np.arange(n))
 
     def add_forces(self, b: AnyArray) -> None:
-        """Add what a residual, internal minus external forces, lacks at the owned unknowns ``(n,)``."""
+        """Add what a residual, internal minus external forces, lacks at the owned unknowns ``(n,)`` (collective)."""
         config = self._config
         for one, nodes in self._parts:
             force, k = one.force_and_stiffness(config.gdim)
             np.subtract.at(b, self._unknowns[nodes], force if k is None else -config.displacement[nodes] @ k)
+        for coupling in self._couplings:
+            b[self._unknowns[coupling.nodes.nodes]] -= coupling.nodal_forces()
 
     def loads(self) -> Array:
-        """Forces but those of springs, at the owned nodes ``(n_owned, gdim)``."""
+        """Forces but those of springs, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         found = np.zeros((self._config.n_owned, self._config.gdim))
         for one, nodes in self._parts:
             np.add.at(found, nodes, one.force_and_stiffness(self._config.gdim)[0])
+        for coupling in self._couplings:
+            found[coupling.nodes.nodes] += coupling.nodal_forces()
         return found
 
     def energy(self) -> float:

@@ -39,10 +39,13 @@ class UnitedRows:
     Attributes:
         equations: of this rank, with the gaps of the last call of ``at_present``.
         multipliers: forces of the equations along what they eliminate ``(m,)``, as last taken.
+        turning: they do not depend on where the bodies are.
 
     Raises:
         ConflictError: for equations that leave nothing to eliminate, or follow from others or contradict them.
     """
+
+    turning = False
 
     def __init__(
         self,
@@ -178,6 +181,13 @@ class UnitedRows:
 
     def _targets(self, b: Array, start: Array, ramped: Bools) -> Array:
         return np.where(ramped, start + self._fraction * (b - start), b) if self._fraction < 1.0 else b
+
+    def place(self) -> None:
+        """Nothing: they are linear."""
+
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """Nothing, likewise."""
+        return []
 
     def at_present(self) -> UnitingEquations:
         """The equations with the gaps of the present displacement (collective)."""

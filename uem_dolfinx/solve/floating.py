@@ -26,7 +26,7 @@ from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.united_rows import UnitedRows
+    from uem_dolfinx.conditions.user_rows import UserRows
 
 #: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]
@@ -57,7 +57,7 @@ class FloatingBodies:
         motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
-    def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UnitedRows | None = None):
+    def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._bodies, self._pairs, self._linear = bodies, pairs, linear
         config, dynamics = bodies.config, bodies.dynamics
         self.rigid: RigidMotions | None = None

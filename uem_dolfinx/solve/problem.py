@@ -46,7 +46,8 @@ from uem_dolfinx.solve.system import BodySystem
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, Periodic
-    from uem_dolfinx.conditions.united_rows import UnitedRows
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+    from uem_dolfinx.conditions.user_rows import UserRows
 
 ACCURACY = given.between(0.0, 1.0)
 
@@ -68,6 +69,7 @@ class UnitedProblem:
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
         equations: linear equations between displacements of nodes: of ``Equation`` and ``periodic``.
+        couplings: parts that move rigidly with a point, or share what acts there: of ``RigidCoupling``.
         points: forces and springs at nodes, as ``PointLoad`` and ``PointSpring``, which are no terms of F.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
@@ -108,6 +110,7 @@ class UnitedProblem:
         bcs: Sequence[fem.DirichletBC] = (),
         contacts: Sequence[Contact | GeneralContact] = (),
         equations: Sequence[Equation | Periodic] = (),
+        couplings: Sequence[RigidCoupling] = (),
         points: Sequence[PointLoad | PointSpring] = (),
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
@@ -137,13 +140,14 @@ class UnitedProblem:
             equations = given.items(
                 "equations", equations, lambda one: hasattr(one, "n_values"), "an Equation, or what periodic returns"
             )
+            couplings = given.items("couplings", couplings, lambda one: hasattr(one, "nodal_forces"), "a RigidCoupling")
             points = given.items(
                 "points", points, lambda one: hasattr(one, "force_and_stiffness"), "a PointLoad or a PointSpring"
             )
             if not self.config.moves:
                 from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
 
-                check_ties(self.config.gdim, contacts, equations, materials=materials, dynamics=dynamics, points=points)
+                check_ties(self.config.gdim, contacts, equations, materials=materials, dynamics=dynamics, points=points, couplings=couplings)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -161,6 +165,7 @@ class UnitedProblem:
         given.alike(
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
+            couplings=[one.name for one in couplings],
             newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
@@ -173,10 +178,10 @@ class UnitedProblem:
         if damping is not None:
             check_residual(damping, u, "the damping form")
         F, at_points = revolved(F), None
-        if points:
+        if points or couplings:
             from uem_dolfinx.conditions.at_points import AtPoints
 
-            at_points = AtPoints(self.config, points)
+            at_points = AtPoints(self.config, points, couplings)
         #: What the bodies do without contact.
         self.bodies = Bodies(
             self.config,
@@ -187,6 +192,8 @@ class UnitedProblem:
             points=at_points,
             check_inversion=check_inversion,
         )
+        for one in couplings:
+            one.attach(self.config, not self.bodies.tangent.linear)
         self.solver = UnitedSolver(self.config.unknowns, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
@@ -198,16 +205,17 @@ class UnitedProblem:
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
         #: Bodies and contact as the Newton loop sees them.
         options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
-        #: Linear equations of users; None without any.
-        self.linear: UnitedRows | None = None
+        #: Equations of users; None without any.
+        self.linear: UserRows | None = None
         if ties:
             ties = [ScalarTie(self.config, tie, free) for tie in ties]
             equations = [*ties, *equations]
-        if equations:
-            from uem_dolfinx.conditions.united_rows import unite
+        if equations or couplings:
+            from uem_dolfinx.conditions.user_rows import rows_of_users
 
             nodes = [pair.nodes for pair in pairs] + [tie.followed for tie in ties]
-            self.linear = options["linear"] = unite(self.config, equations, free, nodes, self.load, clock.get("at", 0.0))
+            own = equations, couplings, free, nodes, self.load, clock.get("at", 0.0)
+            self.linear = options["linear"] = rows_of_users(self.config, *own)
         self.system = method(self.bodies, pairs, self.solver, **options)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
@@ -229,7 +237,7 @@ class UnitedProblem:
         from uem_dolfinx.solve.settings import Settings
 
         #: What the run is made with, for checkpoints.
-        beside = {"equations": equations, "points": points}
+        beside = {"equations": equations, "couplings": couplings, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
 

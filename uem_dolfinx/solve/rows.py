@@ -25,7 +25,7 @@ from uem_dolfinx.parallel import agree, reduced
 from uem_dolfinx.solve.newton import IterationState
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.united_rows import UnitedRows
+    from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.contact.heat import HeatEquations
 
 
@@ -44,7 +44,7 @@ class OverConstraints:
         contestable: whether equations can conflict that follow each other in no ring.
     """
 
-    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UnitedRows | None = None):
+    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._unknowns = config.unknowns
         follows = [followed_nodes(config, pair.discretisation.followed) for pair in pairs]
         meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
@@ -143,7 +143,7 @@ def make_rows(
     pairs: Sequence[Interface],
     hold: Callable[[UnitingEquations, UnitingEquations], Bools],
     prescribed: Array,
-    linear: UnitedRows | None = None,
+    linear: UserRows | None = None,
 ) -> Rows:
     """Equations of all pairs in their present states, and Q (collective).
 

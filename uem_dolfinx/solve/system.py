@@ -35,7 +35,7 @@ from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, 
 from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.united_rows import UnitedRows
+    from uem_dolfinx.conditions.user_rows import UserRows
 
 #: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_predicts]
@@ -65,7 +65,7 @@ class BodySystem:
         *,
         newton: str = "full",
         consistent_tangent: bool = True,
-        linear: UnitedRows | None = None,
+        linear: UserRows | None = None,
     ):
         self.bodies, self.pairs, self.solver, self.linear = bodies, list(pairs), solver, linear
         self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
@@ -100,6 +100,9 @@ class BodySystem:
 
     def place(self) -> None:
         """Project the contactors where bodies and targets are now."""
+        if self.linear is not None:
+            self.linear.place()
+            self._here = None
         if not self.pairs:
             return
         self._here = None
@@ -175,7 +178,7 @@ class BodySystem:
         4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
         5. Take the equations that follow, Q'F with them, and which contactors break the conditions of contact.
         """
-        bodies, pairs = self.bodies, self.pairs
+        bodies, pairs, turning = self.bodies, self.pairs, self.linear is not None and self.linear.turning
         if bodies.stiffness is None and pairs:
             # what tells tension from rounding
             bodies.update_tangent()
@@ -185,7 +188,7 @@ class BodySystem:
             y = rows.test.pass_on(F)
             residual = rows.test.reduce(y)
             at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
-            if at_rest:
+            if at_rest or (turning and not pairs):
                 self._take(self._read_forces(rows, y))
                 if any(heat.lags for heat in self._heats):
                     residual = rows.test.transpose(F := self.residual())
@@ -383,7 +386,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.bodies.update_tangent()
         with timed("contact curvature"):
-            how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex
+            how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex, self.linear
             self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
@@ -398,7 +401,7 @@ class BodySystem:
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
         self.solver.begin_at(c := P.c)
-        linear, iterative = self.bodies.linear, self.solver.inexact
+        linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
         # momentum is kept exactly where solves can be
         passing = not linear or (self._curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(

@@ -26,6 +26,7 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import AtPoints
+    from uem_dolfinx.conditions.user_rows import UserRows
 
 
 class Tangent:
@@ -136,16 +137,20 @@ def convex_part(blocks: Array) -> Array:
     return out
 
 
-def curvature_of(pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool) -> PETSc.Mat | None:
-    """``-sum lambda grad^2 g`` of all pairs, or None if no pair has any (collective).
+def curvature_of(
+    pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool, linear: UserRows | None = None
+) -> PETSc.Mat | None:
+    """``-sum lambda grad^2 g`` of all pairs, and likewise of rigid couplings, or None if there is none (collective).
 
     Args:
         pairs: of all contacts.
         du: a vector with the displacement's layout.
         apart: whether P differs from Q; else the symmetric part counts.
         convex: whether what could make the tangent indefinite is left out.
+        linear: equations of users; None for none.
     """
     parts = [part for pair in pairs if pair.sliding == "finite" for part in pair.curvature()]
+    parts += [] if linear is None else linear.curvature()
     if convex:
         parts = [(nodes, convex_part(blocks)) for nodes, blocks in parts]
     if not apart:

@@ -1,0 +1,205 @@
+"""Surfaces and bodies that move rigidly with a point, and loads that are spread.
+
+Two tests to read first: ``test_large_turns``, exact rigidity and quadratic convergence, and ``test_a_mean_motion_works_with_its_load``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from helpers import at, box, clamp, highest, linear, refused, scene, slow, st_venant
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.conditions.rigid_set import RigidSet, moments, turned
+from uem_dolfinx.geometry.rigid import rotation_matrix
+
+COMM = MPI.COMM_WORLD
+
+
+class Bar:
+    """A bar of length 2 with its ends, in the plane or in space."""
+
+    def __init__(self, cell="quadrilateral", degree=1):
+        g = 2 if cell in ("quadrilateral", "triangle") else 3
+        self.g, self.k = g, 1 if g == 2 else 3
+        self.scene = scene(COMM, cell, [box(cell, [0.0] * g, [2.0, *[1.0] * (g - 1)], [4, *[2] * (g - 1)])])
+        self.V = compat.function_space(self.scene.mesh, degree, (g,))
+        self.u = fem.Function(self.V, name="u")
+        self.left, self.right = self.scene.tag("left", 0, at(0, 0.0)), self.scene.tag("right", 0, at(0, 2.0))
+        self.point = np.array([2.7, 0.4, 0.1])[:g]
+
+    def problem(self, *couplings, law=linear, bcs=None, **how):
+        bcs = clamp(self.V, self.left) if bcs is None else bcs
+        return uem.UnitedProblem(law(self.u, 1.0), self.u, bcs=bcs, couplings=list(couplings), **how)
+
+    def nodes(self, problem, x=2.0):
+        return np.flatnonzero(np.isclose(problem.config.X[: problem.config.n_owned, 0], x))
+
+    def moment_of_left(self, problem):
+        """Moment of the support about the coupling's point as it is drawn (collective)."""
+        config, m = problem.config, self.nodes(problem, 0.0)
+        problem.bodies.assemble()
+        return COMM.allreduce(moments(config.X[m] - self.point, problem.bodies.forces[m]).sum(axis=0))
+
+
+def rigid_part(coupling, X, point):
+    """Displacement of places that go with a small motion of the coupling."""
+    return coupling.displacement + turned(np.atleast_1d(coupling.rotation), X - point)
+
+
+@pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 2), slow("tetrahedron", 1)])
+def test_loads_and_motions_are_conjugate(cell, degree):
+    """The support balances force and moment; prescribed, in part or all of it, the motion found takes them as reactions."""
+    b = Bar(cell, degree)
+    force, moment = np.array([0.01, 0.02, -0.01])[: b.g], np.array([0.03, 0.01, -0.02])[: b.k]
+    loaded = uem.RigidCoupling(b.right, b.point, force=force, moment=moment)
+    problem = b.problem(loaded)
+    problem.solve()
+    assert np.allclose(problem.reaction(b.left), -force, rtol=1e-11)
+    assert np.allclose(b.moment_of_left(problem), -moment, rtol=1e-10)
+    config, m = problem.config, b.nodes(problem)
+    assert highest(COMM, np.abs(config.displacement[m] - rigid_part(loaded, config.X[m], b.point))) <= 1e-13
+    found, u = np.append(loaded.displacement, loaded.rotation), np.array(b.u.x.array)
+    for held in (range(len(found)), (0, len(found) - 1)):
+        b.u.x.array[:] = 0.0
+        rest = np.where(np.isin(range(len(found)), list(held)), 0.0, np.append(force, moment))
+        motion = [found[i] if i in held else None for i in range(len(found))]
+        led = uem.RigidCoupling(b.right, b.point, motion=motion, force=rest[: b.g], moment=rest[b.g :])
+        for step in uem.load_steps(b.problem(led), 2):
+            assert np.allclose(np.append(led.displacement, led.rotation)[list(held)], step.factor * found[list(held)], rtol=1e-12)
+        assert np.abs(b.u.x.array - u).max(initial=0.0) <= 1e-10 * np.abs(found).max()
+        assert np.allclose(np.append(*led.reaction) + rest, np.append(force, moment), rtol=1e-9)
+
+
+def test_conditions_among_rigid_nodes():
+    """Dirichlet values on a rigid part guide it, as far as a rigid motion can follow them."""
+    b = Bar()
+    top = b.scene.tag("top", 0, lambda x: np.isclose(x[:, 1], 1.0))
+    roof = clamp(b.V, top, 1, value=0.0)
+    guided = uem.RigidCoupling(b.right, b.point, force=(0.01, 0.02))
+    problem = b.problem(guided, bcs=[*clamp(b.V, b.left), *roof])
+    problem.solve()
+    assert abs(guided.displacement[1] + guided.rotation * (2.0 - b.point[0])) <= 1e-14 and guided.displacement[0] > 0
+    bent = fem.Function(b.V)
+    bent.interpolate(lambda x: np.stack([0.0 * x[0], 0.1 * x[1] ** 2]))
+    end = fem.dirichletbc(bent, fem.locate_dofs_geometrical(b.V, lambda x: np.isclose(x[0], 2.0)))
+    problem = b.problem(uem.RigidCoupling(b.right, b.point), bcs=[end])
+    refused(uem.ConflictError, ("RigidCoupling of 'right'", "no rigid motion"), problem.solve)
+
+
+# -- large turns -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", slow("hexahedron")])
+def test_large_turns(cell):
+    """A bar of finite strain is bent far: its end stays rigid to the last digits, and Newton's method is quadratic."""
+    b = Bar(cell)
+    turn = 0.8 if b.g == 2 else np.array([0.4, 0.3, 0.7])
+    free = [None] * b.g
+    coupling = uem.RigidCoupling(b.right, b.point, force=np.full(b.g, 0.002), motion=[*free, *np.atleast_1d(turn)])
+    problem = b.problem(coupling, law=st_venant, rtol=1e-13)
+    steps = list(uem.load_steps(problem, 2))
+    config, m = problem.config, b.nodes(problem)
+    R = rotation_matrix(np.atleast_1d(turn))
+    where = (config.X[m] - b.point) @ R.T + b.point + coupling.displacement
+    assert highest(COMM, np.abs(config.x[m] - where)) <= 1e-13
+    assert np.allclose(coupling.rotation, turn, rtol=1e-13)
+    r = [i.residual for i in steps[-1].iterations]
+    assert any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-13 for a, after in zip(r, r[1:]))
+    assert np.allclose(problem.reaction(b.left), -0.002, rtol=1e-8)
+
+
+def test_a_load_that_turns_freely():
+    """A moment turns an end far: the tangent has what turning forces add, and Newton's method is quadratic."""
+    b = Bar()
+    coupling = uem.RigidCoupling(b.right, b.point, moment=lambda factor: 0.04 * factor)
+    problem = b.problem(coupling, law=st_venant, rtol=1e-13)
+    steps = list(uem.load_steps(problem, 2))
+    assert coupling.rotation > 0.75 and all(s.newton_iterations <= 8 for s in steps)
+    r = [i.residual for i in steps[-1].iterations]
+    assert any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-12 for a, after in zip(r, r[1:]))
+
+
+def test_several_turns_are_counted():
+    """A body that is led around three times is where it was, and knows how far it has turned."""
+    b = Bar()
+    coupling = uem.RigidCoupling(b.scene.tag("all", 0, lambda x: x[:, 0] >= 0.0), (1.0, 0.5), motion=(0.1, 0.0, 6.0 * np.pi))
+    problem = b.problem(coupling, bcs=(), law=st_venant)
+    for step in uem.load_steps(problem, 4):
+        assert coupling.rotation == pytest.approx(6.0 * np.pi * step.factor, rel=1e-13)
+    assert np.abs(b.u.x.array.reshape(-1, 2) - (0.1, 0.0)).max(initial=0.0) <= 1e-13
+
+
+def test_when_components_are_chosen_anew():
+    """Turned by 45 degrees the components at hand still tell the motion, by 70 degrees others do better."""
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+    from uem_dolfinx.conditions.rigid_rows import RigidRows
+    from uem_dolfinx.geometry.configuration import Configuration
+
+    b = Bar()
+    config, coupling = Configuration(b.u), RigidCoupling(b.right, b.point, rotations="large")
+    coupling.attach(config, False)
+    rows = RigidRows(config, coupling, np.ones((config.n_owned, 2), bool), np.zeros(config.n_owned, bool), [])
+    first = rows._basis
+    for degrees, same in ((45.0, True), (70.0, False)):
+        R = rotation_matrix(np.array([np.radians(degrees)]))
+        b.u.x.array[:] = (config.X @ R.T - config.X).ravel()
+        rows.at_present()
+        assert (rows._basis is first) == same
+        assert highest(COMM, np.abs(rows.equations.gap)) <= 1e-14
+
+
+# -- spread loads ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_mean_motion_works_with_its_load(cell):
+    """In any displacement the nodal forces do the work of force and moment in the mean motion, and have their sum and moment."""
+    b, rng = Bar(cell), np.random.default_rng(3)
+    config = uem.UnitedProblem(linear(b.u, 1.0), b.u).config
+    m = np.flatnonzero(np.isclose(config.X[: config.n_owned, 0], 2.0)).astype(np.int32)
+    group = RigidSet(config, m, b.point, large=False)
+    force, moment = rng.normal(size=b.g), rng.normal(size=b.k)
+    u = np.sin(3.0 * config.X[: config.n_owned] + np.arange(b.g)) * np.prod(config.X[: config.n_owned] + 0.3, axis=1)[:, None]
+    f = group.spread(u, force, moment)
+    assert np.allclose(COMM.allreduce(f.sum(axis=0)), force, rtol=1e-12)
+    assert np.allclose(COMM.allreduce(moments(config.X[m] - b.point, f).sum(axis=0)), moment, rtol=1e-12)
+    place = group.placement(u)
+    work = force @ place.displacement(b.point[None])[0] + moment @ place.turn
+    assert COMM.allreduce((f * u[m]).sum()) == pytest.approx(work, rel=1e-12)
+
+
+def test_a_spread_load_stiffens_nothing():
+    """It bends a bar as a load on its nodes does, in small strain and in finite."""
+    b = Bar()
+    for law in (linear, st_venant):
+        coupling = uem.RigidCoupling(b.right, (2.0, 0.5), force=(0.0, 0.006), distribute=True)
+        b.u.x.array[:] = 0.0
+        b.problem(coupling, law=law).solve()
+        u = np.array(b.u.x.array)
+        b.u.x.array[:] = 0.0
+        loads = [uem.PointLoad((2.0, y), (0.0, 0.002)) for y in (0.0, 0.5, 1.0)]
+        uem.UnitedProblem(law(b.u, 1.0), b.u, bcs=clamp(b.V, b.left), points=loads).solve()
+        assert highest(COMM, np.abs(b.u.x.array - u)) <= 1e-10 * highest(COMM, np.abs(u))
+
+
+# -- what is refused -------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_refused():
+    b = Bar()
+    shared = [uem.RigidCoupling(b.right, b.point), uem.RigidCoupling(b.right, b.point)]
+    refused(uem.ConflictError, "in another one", lambda: b.problem(*shared))
+    refused(uem.InputError, "mean motion", lambda: uem.RigidCoupling(b.right, b.point, motion=(0.0, 0.0, 0.0), distribute=True))
+    refused(uem.InputError, "3 items", lambda: uem.RigidCoupling(b.right, b.point, motion=(0.0, 0.0)))
+    refused(uem.InputError, "the point", lambda: b.problem(uem.RigidCoupling(b.right, (0.0, 0.0, 0.0))))
+    one = uem.RigidCoupling(b.right, b.point)
+    refused(uem.SpaceError, "in no problem yet", lambda: one.displacement)
+    b.problem(one)
+    refused(uem.SpaceError, "another problem", lambda: b.problem(one))
+    s = Bar("tetrahedron")
+    refused(uem.SurfaceError, "on a line", lambda: s.problem(uem.RigidCoupling((2.0, 1.0, 1.0), s.point)))

@@ -1,0 +1,225 @@
+"""A surface or a body that moves rigidly with a point, or a load at a point that is spread over a surface, as users declare them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx import given
+from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.equation import Value, checked_value, values_of
+from uem_dolfinx.conditions.places import is_point, nodes_at
+from uem_dolfinx.conditions.rigid_set import RigidSet, moments
+from uem_dolfinx.errors import InputError, SpaceError, SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.tags import Part, name_of
+from uem_dolfinx.parallel import agreed, ask_together, reduced
+
+
+class RigidCoupling:
+    """Nodes of a surface or a body that move with a point as one rigid body, or that share what acts at the point.
+
+        uem.RigidCoupling(tags["end"], (10.0, 0.5), force=(0.0, -3.0), moment=12.0)
+        uem.RigidCoupling(tags["wheel"], (0.0, 0.0), motion=(0.0, 0.0, None))               # on a bearing, free to turn
+        uem.RigidCoupling(tags["pad"], (0.0, 0.0, 2.0), force=(0.0, 0.0, -5.0), distribute=True)
+
+    It is handed to ``UnitedProblem(..., couplings=[...])``. The 3 unknowns in the plane and 6 in space are components of nodes of the
+    part; all its other components are eliminated, without multipliers.
+
+    Args:
+        where: tag of facets, of cells or of anything with nodes that are not on one line.
+        point: in the drawing ``(gdim,)``; no node need be there.
+        force: at the point ``(gdim,)``; numbers, a ``fem.Constant`` or a function of the load factor or time.
+        moment: about the point, a number in the plane, ``(3,)`` in space; likewise.
+        motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
+            None where it is free: ``(u_x, u_y, angle)`` in the plane, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in space, with r the rotation
+            vector in radians. Numbers are approached along with the Dirichlet values. None leaves all free.
+        distribute: the force and the moment are shared by the nodes and nothing is stiffened; the point has their mean motion.
+        rotations: ``"large"``, ``"small"``, or None for small ones where the residual is linear in the displacement.
+
+    Attributes:
+        name: that of the part.
+
+    Raises:
+        InputError, InputTypeError: for values of another form, or a motion of what is distributed. When the problem is made also a
+            TagError for parts that are none, and a SurfaceError for nodes on one line.
+    """
+
+    def __init__(
+        self,
+        where: Part,
+        point: npt.ArrayLike,
+        *,
+        force: Value = 0.0,
+        moment: Value = 0.0,
+        motion: Sequence[Value | None] | None = None,
+        distribute: bool = False,
+        rotations: str | None = None,
+    ):
+        self.where, self.name = where, "a point" if is_point(where) else name_of(where)
+        self._point = given.vector("point", point)
+        g = len(self._point)
+        self._sizes = g, 1 if g == 2 else 3
+        self._loads = checked_value("force", force, g), checked_value("moment", moment, self._sizes[1])
+        self.distribute = given.flag("distribute", distribute)
+        self._rotations = rotations if rotations is None else given.word("rotations", rotations, ("large", "small"))
+        n, words = sum(self._sizes), "None where it is free and a value elsewhere"
+        motion = [None] * n if motion is None else motion
+        given.kind(
+            "motion", motion, isinstance(motion, Sequence) and not isinstance(motion, str), f"a list of {n} items, {words}"
+        )
+        if len(motion) != n:
+            raise InputError(given.sentence("motion", motion, f"{n} items, {words}"))
+        #: Values of the prescribed components by their number.
+        self.prescribed = {i: checked_value(f"motion[{i}]", v, 1) for i, v in enumerate(motion) if v is not None}
+        if self.distribute and self.prescribed:
+            raise InputError(
+                "motion of a RigidCoupling with distribute=True: the mean motion of a part that deforms cannot be prescribed; leave "
+                "distribute out, or prescribe displacements"
+            )
+        self._set: RigidSet | None = None
+        self._asked: dict[Any, Any] = {}
+
+    # -- in a problem ------------------------------------------------------------------------------------------------------
+
+    def attach(self, config: Configuration, finite: bool) -> RigidSet:
+        """Take the nodes of a problem, whose residual may be nonlinear (``finite``) (collective)."""
+        if self._set is not None:
+            raise SpaceError(f"the RigidCoupling of '{self.name}' belongs to another problem: make a new one for every problem")
+        with agreed(config.comm):
+            given.vector("the point of a RigidCoupling", self._point, config.gdim)
+            if config.axisymmetric:
+                raise InputError(f"the RigidCoupling of '{self.name}': there are none on axisymmetric meshes; use Equation")
+        nodes = nodes_at(config, self.where, f"the part of the RigidCoupling of '{self.name}'")
+        large = finite if self._rotations is None else self._rotations == "large"
+        self._set = RigidSet(config, nodes, self._point, large)
+        arms = self._set.X - self._set.middle
+        spread = reduced(config.comm, arms.T @ arms)
+        sizes = np.linalg.eigvalsh(spread)
+        if not sizes[-1] > 0 or (config.gdim == 3 and np.sqrt(max(sizes[-2], 0.0) / sizes[-1]) < DEPENDENT**2):
+            raise SurfaceError(
+                f"the RigidCoupling of '{self.name}': its {self._set.count} nodes lie on a line or in one place, and do not tell how it "
+                "turns: expected at least two nodes in the plane, three that are not on a line in space"
+            )
+        #: Rotation that was known last, which tells the number of turns ``(n_turns,)``.
+        self.turns: Array = np.zeros(self._sizes[1])
+        #: Force and moment that the prescribed motion needs, as read last.
+        self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
+        return self._set
+
+    @property
+    def nodes(self) -> RigidSet:
+        """The nodes of the problem it belongs to; a SpaceError if it belongs to none."""
+        if self._set is None:
+            raise SpaceError(
+                f"the RigidCoupling of '{self.name}' is in no problem yet: hand it to UnitedProblem(..., couplings=[...])"
+            )
+        return self._set
+
+    def take_load(self, at: float) -> None:
+        """Ask functions for the values of a load factor or time; a UserFunctionError if one raises (collective)."""
+        comm = self.nodes.config.comm
+        for key, value in (("force", self._loads[0]), ("moment", self._loads[1]), *self.prescribed.items()):
+            if callable(value) and not isinstance(value, fem.Constant):
+                what = (
+                    f"the {key if isinstance(key, str) else f'motion[{key}]'} of the RigidCoupling of '{self.name}' at {at:.6g}"
+                )
+                self._asked[key] = ask_together(comm, what, value, at)
+
+    def loads(self) -> tuple[Array, Array]:
+        """Force ``(gdim,)`` and moment ``(n_turns,)`` at the point as they are now (collective)."""
+        with agreed(self.nodes.config.comm):
+            force, moment = (
+                values_of(f"the {key} of the RigidCoupling of '{self.name}'", self._asked.get(key, value), size)
+                for key, value, size in zip(("force", "moment"), self._loads, self._sizes)
+            )
+        return force, moment
+
+    def nodal_forces(self) -> Array:
+        """What these are at the owned nodes of the part ``(n, gdim)`` (collective)."""
+        config = self.nodes.config
+        return self.nodes.spread(config.displacement[: config.n_owned], *self.loads())
+
+    def wanted(self) -> Array:
+        """Values of the prescribed components as they are now ``(k,)``, in their order (collective)."""
+        with agreed(self.nodes.config.comm):
+            found = [
+                values_of(f"motion[{i}] of the RigidCoupling of '{self.name}'", self._asked.get(i, v), 1)[0]
+                for i, v in self.prescribed.items()
+            ]
+        return np.array(found, dtype=float)
+
+    def ramped(self, loaded: Sequence[fem.Constant]) -> npt.NDArray[np.bool_]:
+        """Which prescribed components are approached along with the Dirichlet values ``(k,)``; ``loaded`` Constants are not."""
+        return np.array(
+            [
+                not any(v is c for c in loaded) if isinstance(v, fem.Constant) else not callable(v)
+                for v in self.prescribed.values()
+            ],
+            dtype=bool,
+        )
+
+    def motion_of(self, u: Array) -> Array:
+        """Displacement of the point and rotation that a displacement ``(n_owned, gdim)`` makes ``(gdim + n_turns,)`` (collective)."""
+        at = self.nodes.placement(u)
+        shift = at.displacement(self._point[None])[0]
+        return np.append(shift, at.turn if at.small is not None else nearest_turn(at.turn, self.turns))
+
+    # -- what users read ---------------------------------------------------------------------------------------------------
+
+    @property
+    def _motion(self) -> Array:
+        config = self.nodes.config
+        return self.motion_of(config.displacement[: config.n_owned])
+
+    @property
+    def displacement(self) -> Array:
+        """Displacement of the point ``(gdim,)`` (collective)."""
+        return self._motion[: self._sizes[0]]
+
+    @property
+    def rotation(self) -> Any:
+        """Angle in the plane, rotation vector ``(3,)`` in space, in radians; several turns are counted (collective)."""
+        turn = self._motion[self._sizes[0] :]
+        return float(turn[0]) if len(turn) == 1 else turn
+
+    @property
+    def reaction(self) -> tuple[Array, Any]:
+        """Force ``(gdim,)`` and moment about the point with which the prescribed motion acts on the part; zero where it is free."""
+        force, moment = self.reactions
+        return force, float(moment[0]) if len(moment) == 1 else moment
+
+    def read_reactions(self, forces: Array) -> None:
+        """Take the forces of the coupling at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        config, own = self.nodes.config, forces[self.nodes.nodes]
+        at = self.nodes.placement(config.displacement[: config.n_owned])
+        if self.nodes.large:
+            arms = self.nodes.X + config.displacement[self.nodes.nodes] - self._point - at.displacement(self._point[None])
+        else:
+            arms = self.nodes.X - self._point
+        sums = reduced(config.comm, np.append(own.sum(axis=0), moments(arms, own).sum(axis=0)))
+        held = np.isin(np.arange(len(sums)), list(self.prescribed))
+        sums = np.where(held, sums, 0.0)
+        self.reactions = sums[: self._sizes[0]], sums[self._sizes[0] :]
+
+
+def nearest_turn(turn: Array, known: Array) -> Array:
+    """The rotation by ``turn (n_turns,)`` and whole turns that is nearest to a known one."""
+    angle = float(np.linalg.norm(turn)) if len(turn) == 3 else float(turn[0])
+    if len(turn) == 1:
+        return turn + 2.0 * np.pi * np.round((known[0] - angle) / (2.0 * np.pi))
+    if angle == 0.0:
+        axis = known / size if (size := np.linalg.norm(known)) > 0 else known
+        return np.asarray(axis * 2.0 * np.pi * np.round(known @ axis / (2.0 * np.pi)))
+    axis = turn / angle
+    return np.asarray(axis * (angle + 2.0 * np.pi * np.round((known @ axis - angle) / (2.0 * np.pi))))
+
+
+def constants_of(load: Any) -> list[fem.Constant]:
+    """Constants that a problem's ``load`` sets."""
+    return list(load) if isinstance(load, Mapping) else [load] if isinstance(load, fem.Constant) else []

@@ -1,0 +1,292 @@
+"""Rigid motion of a set of nodes as uniting equations, linearised where the set is now.
+
+A motion z of shift and turn takes node i to ``u_i = u*_i + A_i z`` from the nearest rigid place u*. As many components q of nodes of the
+set as z has, less those that are prescribed, are left; with B the rows of A that they are, and C those of the prescribed motion,
+
+    z = (B; C)^-1 (q - u*_q; h - h*)
+
+and every other component follows them. Components with Dirichlet conditions are among q before others, which are far from each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.conditions.places import COINCIDENT, NEAR
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, nearest_turn
+from uem_dolfinx.conditions.rigid_set import Placement, turned, velocities
+from uem_dolfinx.conditions.united_rows import CONTRADICTING
+from uem_dolfinx.errors import ConflictError, SurfaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
+from uem_dolfinx.parallel import agree, gathered, reduced
+
+#: Components of a set are chosen anew when they tell its motion worse than this part of what they did when they were chosen.
+#: [convention; least singular value of their rows; test_rigid_coupling.py::test_when_components_are_chosen_anew]
+TOLD_WORSE = 0.5
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Components that are left of a set, known to all ranks.
+
+    Attributes:
+        node: global nodes ``(k,)``.
+        component: of each ``(k,)``.
+        X: the nodes in the drawing ``(k, gdim)``.
+        told: least singular value of their rows with those of the prescribed motion when they were chosen.
+        halo: asks their owners.
+    """
+
+    node: Ints
+    component: Ints
+    X: Array
+    told: float
+    halo: Halo
+
+
+class RigidRows:
+    """Uniting equations of one coupling (collective).
+
+    Args:
+        config: configuration of the displacement.
+        coupling: attached.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+        avoided: owned nodes of contacts, which are eliminated rather than left ``(n_owned,)``.
+        loaded: Constants that the load sets.
+
+    Attributes:
+        equations: of this rank, one for each component of its nodes, with the gaps of the last call of ``at_present``; those of
+            components that are left or prescribed do not hold.
+    """
+
+    def __init__(
+        self, config: Configuration, coupling: RigidCoupling, free: Bools, avoided: Bools, loaded: Sequence[fem.Constant]
+    ):
+        self._config, self.coupling, self.set = config, coupling, coupling.nodes
+        own = self.set.nodes
+        self._free, self._avoided = free[own], avoided[own]
+        self._ramped = coupling.ramped(loaded)
+        self._wanted = coupling.wanted()
+        self._basis: Basis | None = None
+        #: Displacement at which the ramp began, and the motion there.
+        self._start: tuple[Array, Array] | None = None
+        self.at_present()
+
+    # -- steps -------------------------------------------------------------------------------------------------------------
+
+    def begin_step(self, start: Array, fraction: float) -> None:
+        """Begin a step whose ramp began at a displacement of the owned nodes ``(n_owned, gdim)`` and goes so far (collective)."""
+        held, wanted = list(self.coupling.prescribed), self.coupling.wanted()
+        own = start[self.set.nodes]
+        if self._start is None or reduced(self._config.comm, int(not np.array_equal(own, self._start[0]))):
+            # steps of one ramp count turns from the same
+            self._start = own.copy(), self.coupling.motion_of(start)
+        began = self._start[1][held]
+        self._wanted = np.where(self._ramped, began + fraction * (wanted - began), wanted) if fraction < 1.0 else wanted
+        self._basis = None
+
+    def place(self) -> None:
+        """Put the nodes where the nearest finite rigid motion takes them; components with Dirichlet conditions stay (collective)."""
+        if not self.set.large:
+            return
+        u, nodes = self._config.displacement[: self._config.n_owned], self.set.nodes
+        way = self.set.placement(u).displacement(self.set.X) - u[nodes]
+        self._config.shift(nodes, np.where(self._free, way, 0.0))
+
+    def end_step(self) -> None:
+        """Remember the number of turns, and refuse Dirichlet values that no rigid motion has (collective).
+
+        Raises:
+            ConflictError: naming the place.
+        """
+        config, eq = self._config, self.at_present()
+        shift = config.gdim
+        found = self.coupling.motion_of(config.displacement[: config.n_owned])
+        for i, value in zip(self.coupling.prescribed, self._wanted):
+            if i >= shift and shift == 2:
+                found[i] = value
+        self.coupling.turns = found[shift:]
+        size = float(reduced(config.comm, np.abs(config.displacement[: config.n_owned]).max(initial=0.0), op=MPI.MAX))
+        apart = np.where(~self._free & ~self._left, np.abs(eq.gap.reshape(-1, shift)), 0.0)
+        error = None
+        if (apart > CONTRADICTING * size).any():
+            worst = int(np.argmax(apart.max(axis=1)))
+            error = ConflictError(
+                f"the RigidCoupling of '{self.coupling.name}' and a Dirichlet value at {config.describe(int(self.set.nodes[worst]))} "
+                f"differ by {apart.max():.4g}: no rigid motion has the prescribed values; give values that agree, or leave conditions out"
+            )
+        agree(config.comm, error)
+
+    # -- rows --------------------------------------------------------------------------------------------------------------
+
+    def _aim(self) -> tuple[Placement, Array, Array]:
+        """Where rows are linearised, rows C of the prescribed motion ``(k, n_z)``, and what they lack ``(k,)`` (collective)."""
+        s, g, held = self.set, self._config.gdim, list(self.coupling.prescribed)
+        n_turns = 1 if g == 2 else 3
+        if not s.large:
+            at, turn = s.drawn, np.zeros(n_turns)
+        else:
+            at = s.placement(self._config.displacement[: self._config.n_owned])
+            turn = nearest_turn(at.turn, self.coupling.turns)
+            known = [self._wanted[held.index(i)] for i in range(g, g + n_turns) if i in held]
+            if len(known) == n_turns:
+                # the rows are exact where the turn is known
+                turn = np.array(known)
+                at = Placement(Motion(at.motion.translation, rotation_matrix(turn), at.motion.about))
+        C = np.zeros((g + n_turns, g + n_turns))
+        C[:g] = velocities(at.arms(s.point[None]))[0]
+        C[g:, g:] = turn_rates(turn)
+        now = np.append(at.displacement(s.point[None])[0], turn)
+        return at, C[held], self._wanted - now[held]
+
+    def at_present(self) -> UnitingEquations:
+        """The equations, linearised at the present displacement and with its gaps (collective)."""
+        s, config, g = self.set, self._config, self._config.gdim
+        at, C, lacking = self._aim()
+        # unit turns move the nodes by as much as unit shifts do
+        self._scale = np.append(np.ones(g), np.full(C.shape[1] - g, 1.0 / s.radius))
+        C = C * self._scale
+        lengths = np.linalg.norm(C, axis=1)
+        C, lacking = C / lengths[:, None], lacking / lengths
+        basis = self._told_by(at, C)
+        k, m = len(basis.node), len(s.nodes)
+        inverse = np.linalg.inv(np.concatenate([self._rows_of(basis, at), C]))
+        u = config.displacement[: config.n_owned]
+        off = basis.halo.take(u.__getitem__)[np.arange(k), basis.component]
+        off = off - at.displacement(basis.X)[np.arange(k), basis.component]
+        V = velocities(at.arms(s.X)) * self._scale
+        gap = u[s.nodes] - at.displacement(s.X) - V @ (inverse @ np.append(off, lacking))
+        nodes, which = np.unique(basis.node, return_inverse=True)
+        coefficients = np.zeros((m, g, len(nodes), g))
+        coefficients[:, :, which, basis.component] = V @ inverse[:, :k]
+        row, followed = np.repeat(np.arange(m * g), len(nodes)), np.tile(nodes, m * g)
+        active = self._free & ~self._left
+        self._inverse, self._at = inverse, at
+        self.equations = UnitingEquations(
+            np.repeat(s.nodes, g),
+            np.tile(np.eye(g), (m, 1)),
+            gap.ravel(),
+            active.ravel(),
+            row,
+            followed,
+            coefficients.reshape(-1, g),
+        )
+        return self.equations
+
+    def largest_gap_here(self) -> float:
+        """Largest gap over the sum of the coefficients of its equation, a length, on this rank."""
+        eq = self.equations
+        size = 1.0 + np.bincount(eq.row, np.abs(eq.coefficients).sum(axis=1), len(eq))
+        return float((np.abs(eq.gap) / size)[eq.active].max(initial=0.0))
+
+    def curvature(self, forces: Array) -> tuple[Ints, Array] | None:
+        """What turning forces add to the tangent, from those of the coupling ``(n_owned, gdim)`` (collective).
+
+        Rows at forces f_i turn by a turn t as ``sum r_i x f_i`` does: by ``(sum r_i f_i' - r_i . f_i) t``, with arms from the point, where
+        loads and reactions act.
+
+        Returns:
+            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None without any.
+        """
+        s, config, g, basis = self.set, self._config, self._config.gdim, self._basis
+        if not s.large or basis is None or not len(basis.node):
+            return None
+        f = forces[s.nodes] + self.coupling.nodal_forces()
+        arms = s.X + config.displacement[s.nodes] - s.point - self._at.displacement(s.point[None])
+        W = reduced(config.comm, arms.T @ f)
+        G = np.array([[-np.trace(W)]]) if g == 2 else W - np.trace(W) * np.eye(3)
+        nodes, which = np.unique(basis.node, return_inverse=True)
+        turns = (self._inverse * self._scale[:, None])[g:, : len(which)]
+        block = np.zeros((len(nodes), g, len(nodes), g))
+        block[which[:, None], basis.component[:, None], which, basis.component] = turns.T @ G @ turns
+        own = 1 if config.comm.rank == 0 else 0
+        return np.tile(nodes, (own, 1)), np.tile(block.reshape(len(nodes) * g, -1), (own, 1, 1))
+
+    # -- what is left ------------------------------------------------------------------------------------------------------
+
+    def _rows_of(self, basis: Basis, at: Placement) -> Array:
+        """Rows B of the components that are left ``(k, n_z)``."""
+        return (velocities(at.arms(basis.X)) * self._scale)[np.arange(len(basis.node)), basis.component]
+
+    def _told_by(self, at: Placement, C: Array) -> Basis:
+        """Components that tell the motion together with C, those of before as long as they do so well enough (collective)."""
+        if self._basis is not None and _told(np.concatenate([self._rows_of(self._basis, at), C])) < TOLD_WORSE * self._basis.told:
+            self._basis = None
+        if self._basis is None:
+            self._basis = self._choose(at, C)
+            at_nodes = self._config.to_global(self.set.nodes)[:, None, None] == self._basis.node
+            #: Components of this rank's nodes that are left ``(n, gdim)``.
+            self._left: Bools = (at_nodes & (np.arange(self._config.gdim)[:, None] == self._basis.component)).any(axis=2)
+        return self._basis
+
+    def _choose(self, at: Placement, C: Array) -> Basis:
+        """Components that tell the motion together with C, each as far from those before it as can be (collective).
+
+        Raises:
+            SurfaceError: if there are too few.
+        """
+        s, config, g = self.set, self._config, self._config.gdim
+        across = velocities(at.arms(s.X)) * self._scale
+        chosen: list[Array] = []
+        for c in np.linalg.qr(C.T)[0].T:
+            across = _without(across, c)
+        places = np.round(s.X / (COINCIDENT * config.size))
+        numbers = config.to_global(s.nodes)
+        for allowed in (~self._free, self._free & ~self._avoided[:, None], self._free):
+            while len(chosen) + len(C) < across.shape[2]:
+                size = np.where(allowed, np.linalg.norm(across, axis=2), 0.0)
+                largest = float(reduced(config.comm, size.max(initial=0.0), op=MPI.MAX))
+                if largest <= DEPENDENT:
+                    break
+                # of those that are alike the first in place, on any number of ranks
+                node, component = np.nonzero(size >= (1.0 - NEAR) * largest)
+                order = np.lexsort([component, *places[node].T[::-1]])[:1]
+                offer = np.full(2 * g + 2 + across.shape[2], np.inf)
+                if len(order):
+                    i, j = node[order[0]], component[order[0]]
+                    offer = np.concatenate([places[i], [j, numbers[i]], s.X[i], across[i, j]])
+                every = gathered(config.comm, offer)
+                best = every[np.lexsort([*every[:, g::-1].T])[0]]
+                chosen.append(best[: 2 * g + 2])
+                across = _without(across, best[2 * g + 2 :])
+        if len(chosen) + len(C) < across.shape[2]:
+            raise SurfaceError(
+                f"the RigidCoupling of '{self.coupling.name}': its nodes do not tell its motion beside what is prescribed; give it more "
+                "nodes, or leave out components of its motion"
+            )
+        table = np.array(chosen).reshape(-1, 2 * g + 2)
+        node, component = table[:, g + 1].astype(np.int64), table[:, g].astype(np.int64)
+        basis = Basis(node, component, table[:, g + 2 :], 0.0, Halo(config, node))
+        return replace(basis, told=_told(np.concatenate([self._rows_of(basis, at), C])))
+
+
+def _without(rows: Array, row: Array) -> Array:
+    """Rows ``(..., n)`` without what they have along another one."""
+    q = row / np.linalg.norm(row)
+    return rows - (rows @ q)[..., None] * q
+
+
+def _told(rows: Array) -> float:
+    """Least singular value."""
+    return float(np.linalg.svd(rows, compute_uv=False)[-1])
+
+
+def turn_rates(turn: Array) -> Array:
+    """Rates of a rotation vector ``(n_turns,)`` for unit angular velocities ``(n_turns, n_turns)``."""
+    angle = np.linalg.norm(turn)
+    if len(turn) == 1 or angle == 0.0:
+        return np.eye(len(turn))
+    W = turned(turn / angle, np.eye(3)).T
+    half = 0.5 * angle
+    return np.asarray(np.eye(3) - half * W + (1.0 - half / np.tan(half)) * W @ W)

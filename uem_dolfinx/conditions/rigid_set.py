@@ -1,0 +1,132 @@
+"""A set of nodes and a point that goes with them: how they move as one rigid body, and what a force and a moment at the point are for them.
+
+With weights w of sum 1, the middle ``m = sum w x`` and arms ``r = x - m``, a force f and a moment t at the point p become
+
+    f_i = w_i (f + a x r_i),    S a = t + (p - m) x f,    S = sum w (|r|^2 1 - r r')
+
+which have their sum and their moment, and are nearest to a uniform distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.rigid import Motion, rotation_vector
+from uem_dolfinx.parallel import reduced
+
+
+def velocities(arms: Array) -> Array:
+    """Velocities of points at ``arms (n, gdim)`` in translations and unit turns about the axes ``(n, gdim, gdim + n_turns)``."""
+    n, g = arms.shape
+    shifts = np.broadcast_to(np.eye(g), (n, g, g))
+    return np.concatenate([shifts, turned(np.eye(1 if g == 2 else 3)[:, None], arms).transpose(1, 2, 0)], axis=2)
+
+
+def turned(turns: Array, arms: Array) -> Array:
+    """``turns x arms`` of vectors ``(..., n_turns)`` and ``(..., gdim)``; in the plane a turn is one number."""
+    if arms.shape[-1] == 3:
+        return np.cross(turns, arms)
+    return np.asarray(turns * np.stack([-arms[..., 1], arms[..., 0]], axis=-1))
+
+
+def moments(arms: Array, forces: Array) -> Array:
+    """``arms x forces (..., gdim)``; one number each in the plane, ``(..., n_turns)``."""
+    if arms.shape[-1] == 3:
+        return np.cross(arms, forces)
+    return np.asarray(arms[..., :1] * forces[..., 1:] - arms[..., 1:] * forces[..., :1])
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a set is as one rigid body.
+
+    Attributes:
+        motion: from the drawing to the present, about the middle of the set.
+        small: small turn ``(n_turns,)`` in place of the motion's own; None for a finite one.
+    """
+
+    motion: Motion
+    small: Array | None = None
+
+    def arms(self, X: Array) -> Array:
+        """Arms from the middle of points ``X (n, gdim)`` of the drawing."""
+        return (X - self.motion.about) @ self.motion.Q.T
+
+    def displacement(self, X: Array) -> Array:
+        """Displacement of points ``X (n, gdim)`` of the drawing."""
+        if self.small is None:
+            return self.motion.carry(X) - X
+        return self.motion.translation + turned(self.small, X - self.motion.about)
+
+    @property
+    def turn(self) -> Array:
+        """Angle or rotation vector ``(n_turns,)``."""
+        return rotation_vector(self.motion.Q) if self.small is None else self.small
+
+
+class RigidSet:
+    """Nodes and weights of them (collective).
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned ones.
+        point: goes with them, in the drawing ``(gdim,)``.
+        large: whether turns are finite.
+
+    Attributes:
+        X: the nodes in the drawing ``(n, gdim)``.
+        middle: mean of these over all ranks ``(gdim,)``.
+        radius: root of their mean squared distance from it, a length.
+    """
+
+    def __init__(self, config: Configuration, nodes: Indices, point: Array, large: bool):
+        self.config, self.nodes, self.point, self.large = config, nodes, point, large
+        self.X: Array = config.X[nodes]
+        self.count = reduced(config.comm, len(nodes))
+        self.middle = self._mean(self.X)
+        self.radius = float(np.sqrt(self._mean(((self.X - self.middle) ** 2).sum(axis=1, keepdims=True))[0]))
+
+    def _mean(self, values: Array) -> Array:
+        """Mean of values ``(n, ...)`` at the nodes over all ranks (collective)."""
+        return np.asarray(reduced(self.config.comm, values.sum(axis=0))) / max(self.count, 1)
+
+    @property
+    def drawn(self) -> Placement:
+        """Where it was drawn."""
+        g = self.config.gdim
+        return Placement(Motion(np.zeros(g), np.eye(g), self.middle), None)
+
+    def placement(self, u: Array) -> Placement:
+        """Where a displacement ``(n_owned, gdim)`` takes it: the nearest rigid motion (collective)."""
+        own, arms, g = u[self.nodes], self.X - self.middle, self.config.gdim
+        if not self.large:
+            V = velocities(arms)
+            sums = self._mean(
+                np.concatenate([np.einsum("ngz,ngy->nzy", V, V), np.einsum("ngz,ng->nz", V, own)[:, :, None]], axis=2)
+            )
+            z: Array = np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
+            return Placement(Motion(z[:g], np.eye(g), self.middle), z[g:])
+        sums = self._mean(np.concatenate([own[:, :, None], own[:, :, None] * arms[:, None, :]], axis=2))
+        spread = self._mean(arms[:, :, None] * arms[:, None, :])
+        left, _, right = np.linalg.svd(sums[:, 1:] + spread)
+        left[:, -1] *= np.sign(np.linalg.det(left @ right))
+        return Placement(Motion(sums[:, 0], left @ right, self.middle))
+
+    def spread(self, u: Array, force: Array, moment: Array) -> Array:
+        """Forces at the nodes that a force and a moment at the point are ``(n, gdim)`` (collective)."""
+        if not (force.any() or moment.any()):
+            return np.zeros_like(self.X)
+        if self.large:
+            at = self.placement(u)
+            arms, lever = self.X + u[self.nodes] - self.middle - at.motion.translation, at.arms(self.point[None])[0]
+        else:
+            arms, lever = self.X - self.middle, self.point - self.middle
+        k = len(moment)
+        V = turned(np.eye(k)[:, None], arms[None])
+        S = self._mean(np.einsum("ang,bng->nab", V, V))
+        a: Array = np.asarray(np.linalg.lstsq(S, moment + moments(lever, force), rcond=None)[0], dtype=float)
+        return np.asarray(force + turned(a, arms)) / self.count

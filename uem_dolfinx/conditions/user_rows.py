@@ -1,0 +1,193 @@
+"""All equations of users together: linear ones, and rigid couplings, whose rows follow the bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, constants_of
+from uem_dolfinx.conditions.rigid_rows import RigidRows
+from uem_dolfinx.conditions.united_rows import UnitedRows, unite
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.parallel import agree
+
+
+class UserRows(Protocol):
+    """What a problem asks of equations of users.
+
+    Attributes:
+        equations: of this rank, as last taken.
+        multipliers: forces along what they eliminate ``(m,)``, as last taken.
+    """
+
+    equations: UnitingEquations
+    multipliers: Array
+
+    @property
+    def turning(self) -> bool:
+        """Whether they depend on where the bodies are."""
+
+    def take_load(self, at: float) -> None:
+        """Ask functions for the values of a load factor or time (collective)."""
+
+    def begin_step(self, start: Array, fraction: float) -> None:
+        """Begin a step whose ramp began at a displacement ``(n_owned, gdim)`` and goes so far (collective)."""
+
+    def place(self) -> None:
+        """Put nodes where equations that are not linear take them (collective)."""
+
+    def at_present(self) -> UnitingEquations:
+        """The equations at the present displacement, with its gaps (collective)."""
+
+    def largest_gap_here(self) -> float:
+        """Largest gap, a length, on this rank."""
+
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """What they add to the tangent, as a ``Contact`` does: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
+
+    def check(self) -> None:
+        """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
+
+    def forces(self, multipliers: Array) -> Array:
+        """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+
+
+class JoinedRows:
+    """Linear equations and rigid couplings of a problem.
+
+    Args:
+        config: configuration of the displacement.
+        linear: linear equations; None for none.
+        rigid: of each coupling that makes nodes rigid.
+        couplings: all of them.
+    """
+
+    def __init__(
+        self, config: Configuration, linear: UnitedRows | None, rigid: Sequence[RigidRows], couplings: Sequence[RigidCoupling]
+    ):
+        self._config, self.linear, self.rigid, self._couplings = config, linear, list(rigid), list(couplings)
+        self.turning: bool = any(one.set.large for one in self.rigid)
+        self.equations = self._joined()
+        self.multipliers: Array = np.zeros(len(self.equations))
+
+    def _joined(self) -> UnitingEquations:
+        parts = [one.equations for one in (self.linear, *self.rigid) if one is not None]
+        return UnitingEquations.join(parts, self._config.gdim)
+
+    def take_load(self, at: float) -> None:
+        """As of ``UserRows``."""
+        if self.linear is not None:
+            self.linear.take_load(at)
+        for one in self._couplings:
+            one.take_load(at)
+
+    def begin_step(self, start: Array, fraction: float) -> None:
+        """As of ``UserRows``."""
+        for one in (self.linear, *self.rigid):
+            if one is not None:
+                one.begin_step(start, fraction)
+
+    def place(self) -> None:
+        """As of ``UserRows``."""
+        if self.turning:
+            for one in self.rigid:
+                one.place()
+            self._config.whole.x.scatter_forward()
+
+    def at_present(self) -> UnitingEquations:
+        """As of ``UserRows``."""
+        for one in (self.linear, *self.rigid):
+            if one is not None:
+                one.at_present()
+        self.equations = self._joined()
+        return self.equations
+
+    def largest_gap_here(self) -> float:
+        """As of ``UserRows``."""
+        return max((one.largest_gap_here() for one in (self.linear, *self.rigid) if one is not None), default=0.0)
+
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """As of ``UserRows``."""
+        parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
+        return [part for part in parts if part is not None]
+
+    def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
+        """The couplings' forces at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        start = 0 if self.linear is None else len(self.linear.equations)
+        for one in self.rigid:
+            end = start + len(one.equations)
+            yield one, forces_of(self._config, one.equations, self.multipliers[start:end])
+            start = end
+
+    def check(self) -> None:
+        """As of ``UserRows``."""
+        if self.linear is not None:
+            self.linear.check()
+        for one, forces in self._forces_of_each():
+            one.end_step()
+            one.coupling.read_reactions(forces)
+
+    def forces(self, multipliers: Array) -> Array:
+        """As of ``UserRows``."""
+        return forces_of(self._config, self.equations, multipliers)
+
+
+def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -> Array:
+    """Forces of equations by their multipliers ``(m,)`` at the owned nodes ``(n_owned, gdim)`` (collective)."""
+    nodes = np.concatenate([config.to_global(eq.node), eq.followed])
+    own, theirs = multipliers[:, None] * eq.direction, -multipliers[eq.row, None] * eq.coefficients
+    return config.add_at_owners(nodes, np.concatenate([own, theirs]))
+
+
+def _refuse_shared(coupling: RigidCoupling, taken: Bools) -> None:
+    """Mark its nodes as taken ``(n_owned,)``; a ConflictError if another coupling has one (collective)."""
+    nodes, config = coupling.nodes.nodes, coupling.nodes.config
+    twice, error = nodes[taken[nodes]], None
+    if len(twice):
+        error = ConflictError(
+            f"the node at {config.describe(int(twice[0]))} is in the RigidCoupling of '{coupling.name}' and in another one: make it one "
+            "coupling of both parts, or give each its own nodes"
+        )
+    agree(config.comm, error)
+    taken[nodes] = True
+
+
+def rows_of_users(
+    config: Configuration,
+    equations: Sequence[Any],
+    couplings: Sequence[RigidCoupling],
+    free: Bools,
+    contactors: Sequence[Indices],
+    load: Any,
+    at: float,
+) -> UserRows | None:
+    """Equations of users among contactors ``(n,)`` of several contacts, None without any (collective).
+
+    Args:
+        config: configuration of the displacement.
+        equations: linear ones.
+        couplings: attached.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
+        contactors: owned nodes of each contact.
+        load: of the problem.
+        at: load factor or time at which functions are asked for their values first.
+    """
+    if not couplings:
+        return unite(config, equations, free, contactors, load, at) if equations else None
+    avoided = np.zeros(config.n_owned, dtype=bool)
+    avoided[np.concatenate([np.zeros(0, np.int32), *contactors])] = True
+    loaded, rigid, taken = constants_of(load), [], np.zeros(config.n_owned, dtype=bool)
+    for one in couplings:
+        one.take_load(at)
+        if not one.distribute:
+            _refuse_shared(one, taken)
+            rigid.append(RigidRows(config, one, free, avoided, loaded))
+    # linear equations eliminate none of their components
+    left = free & ~taken[:, None]
+    linear = unite(config, equations, left, contactors, load, at) if equations else None
+    return JoinedRows(config, linear, rigid, couplings)
