@@ -64,6 +64,8 @@ class UnitedMatrix:
         #: Z K Z with the diagonal of K, where it is crossed out, and the matrix.
         self._K: Any = None
         self._crossed: Ints = np.zeros(0, np.int64)
+        #: Places in it of prescribed components' diagonal.
+        self._held: Ints = np.zeros(0, np.int64)
         self._A: Any = None
         #: Keys of the blocks that K lacks, line of nodes times their number plus column, sorted.
         self._filled: Ints = np.zeros(0, np.int64)
@@ -110,8 +112,13 @@ class UnitedMatrix:
         at = np.concatenate([places.ravel(), held])
         self._changed = at, values[at]
         values[places] = np.where(adding[:, None, None], values[places], 0.0) + changes.value
-        values[held] = self._K.values[own]
+        values[held] = self._stiff(own)
         self._A.mat.assemble()
+
+    def _stiff(self, places: Ints) -> Array:
+        """Entries of K at ``places (k,)`` of its diagonal, a large one where there is none, as in bodies that are rigid ``(k,)``."""
+        own = self._K.values[places]
+        return own if own.all() else np.where(own != 0.0, own, np.abs(self._K.values).max(initial=0.0) or 1.0)
 
     def _changes(self, trial: Blocks, test: Blocks, G: Blocks | None) -> tuple[Blocks, Bools]:
         """Blocks of the products in owned rows, each place once, and which of them are added to what K has there ``(k,)`` (collective).
@@ -199,7 +206,8 @@ class UnitedMatrix:
             self._K.values[:] = 1.0
             self._K.mat.diagonalScale(free, free)
             held = np.flatnonzero(~P.free)
-            self._K.values[self._K.find(held, held + self._first)[0]] = 1.0
+            self._held = self._K.find(held, held + self._first)[0]
+            self._K.values[self._held] = 1.0
             self._crossed = np.flatnonzero(self._K.values == 0.0)
             self._beyond = self._places_beyond()
         return bool(changed)
@@ -208,6 +216,7 @@ class UnitedMatrix:
         """Take the values of K (collective)."""
         K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._K.values[self._crossed] = 0.0
+        self._K.values[self._held] = self._stiff(self._held)
         self._state, self._changed = K.stateGet(), None
 
     def _places_beyond(self) -> Blocks:

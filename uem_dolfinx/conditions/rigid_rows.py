@@ -18,7 +18,7 @@ from mpi4py import MPI
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.algebra.rings import DEPENDENT
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.places import COINCIDENT, NEAR
@@ -171,18 +171,53 @@ class RigidRows:
         coefficients = np.zeros((m, g, len(nodes), g))
         coefficients[:, :, which, basis.component] = V @ inverse[:, :k]
         row, followed = np.repeat(np.arange(m * g), len(nodes)), np.tile(nodes, m * g)
-        active = self._free & ~self._left
         self._inverse, self._at = inverse, at
         self.equations = UnitingEquations(
             np.repeat(s.nodes, g),
             np.tile(np.eye(g), (m, 1)),
             gap.ravel(),
-            active.ravel(),
+            self.eliminated.ravel(),
             row,
             followed,
             coefficients.reshape(-1, g),
         )
         return self.equations
+
+    @property
+    def eliminated(self) -> Bools:
+        """Components of the nodes that the equations eliminate ``(n, gdim)``."""
+        return self._free & ~self._left
+
+    def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
+        """Other equations with ``u_i = S_i q - gap_i`` in place of eliminated components of the set (collective)."""
+        config, g, eq, basis, s = self._config, self._config.gdim, equations, self._basis, self.set
+        assert basis is not None
+        known = np.zeros((config.n_owned, 1 + 3 * g))
+        known[s.nodes] = np.column_stack([np.ones(len(s.nodes)), s.X, self.eliminated, self.equations.gap.reshape(-1, g)])
+        # the terms of an equation, that of its own node first
+        m = len(eq)
+        row = np.concatenate([np.arange(m), eq.row])
+        node = np.concatenate([config.to_global(eq.node), eq.followed])
+        terms = np.concatenate([-eq.direction, eq.coefficients])
+        there = config.ask_owners(node, known)
+        mine = there[:, 0] > 0
+        X, gone, gap = there[mine, 1 : 1 + g], there[mine, 1 + g : 1 + 2 * g], there[mine, 1 + 2 * g :]
+        rows, taken = row[mine], terms[mine] * gone
+        terms[mine] -= taken
+        nodes, which = np.unique(basis.node, return_inverse=True)
+        V = np.einsum("kg,kgz->kz", taken, velocities(self._at.arms(X)) * self._scale) @ self._inverse[:, : len(which)]
+        added = np.zeros((m, len(nodes), g))
+        np.add.at(added.reshape(m, len(nodes) * g), (rows[:, None], which * g + basis.component), V)
+        i, k = np.nonzero(np.abs(added).max(axis=2, initial=0.0) > NEGLIGIBLE)
+        followed, kept = np.concatenate([eq.followed, nodes[k]]), np.concatenate([terms[m:], added[i, k]])
+        return replace(
+            eq,
+            direction=-terms[:m],
+            gap=eq.gap + np.bincount(rows, (taken * gap).sum(axis=1), m),
+            row=np.concatenate([eq.row, i]),
+            followed=followed,
+            coefficients=kept,
+        )
 
     def largest_gap_here(self) -> float:
         """Largest gap over the sum of the coefficients of its equation, a length, on this rank."""

@@ -40,12 +40,14 @@ class UnitedRows:
         equations: of this rank, with the gaps of the last call of ``at_present``.
         multipliers: forces of the equations along what they eliminate ``(m,)``, as last taken.
         turning: they do not depend on where the bodies are.
+        rigid: nor make they anything rigid.
 
     Raises:
         ConflictError: for equations that leave nothing to eliminate, or follow from others or contradict them.
     """
 
     turning = False
+    rigid = None
 
     def __init__(
         self,

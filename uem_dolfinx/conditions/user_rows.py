@@ -53,8 +53,29 @@ class UserRows(Protocol):
     def check(self) -> None:
         """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
 
+    @property
+    def rigid(self) -> RigidNodes | None:
+        """Rigid couplings, whose rows come last; None without any."""
+
     def forces(self, multipliers: Array) -> Array:
         """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+
+
+class RigidNodes(Protocol):
+    """What rigid couplings ask of other equations: to speak of the components that are left.
+
+    An equation at a node that is eliminated already would have to eliminate something else of a whole body.
+    """
+
+    @property
+    def n_rows(self) -> int:
+        """How many rows there are on this rank."""
+
+    def left(self, free: Bools) -> Bools:
+        """Free components ``(n_rows, gdim)`` without those that the couplings eliminate."""
+
+    def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
+        """Equations with what they say of eliminated components said by those that these follow (collective)."""
 
 
 class JoinedRows:
@@ -70,14 +91,37 @@ class JoinedRows:
     def __init__(
         self, config: Configuration, linear: UnitedRows | None, rigid: Sequence[RigidRows], couplings: Sequence[RigidCoupling]
     ):
-        self._config, self.linear, self.rigid, self._couplings = config, linear, list(rigid), list(couplings)
-        self.turning: bool = any(one.set.large for one in self.rigid)
+        self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
+        self.turning: bool = any(one.set.large for one in self.each)
         self.equations = self._joined()
         self.multipliers: Array = np.zeros(len(self.equations))
 
     def _joined(self) -> UnitingEquations:
-        parts = [one.equations for one in (self.linear, *self.rigid) if one is not None]
+        parts = [one.equations for one in (self.linear, *self.each) if one is not None]
         return UnitingEquations.join(parts, self._config.gdim)
+
+    @property
+    def rigid(self) -> JoinedRows | None:
+        """As of ``UserRows``."""
+        return self if self.each else None
+
+    @property
+    def n_rows(self) -> int:
+        """As of ``RigidNodes``."""
+        return sum(len(one.equations) for one in self.each)
+
+    def left(self, free: Bools) -> Bools:
+        """As of ``RigidNodes``."""
+        left = free.copy()
+        for one in self.each:
+            left[one.set.nodes] &= ~one.eliminated
+        return left
+
+    def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
+        """As of ``RigidNodes``."""
+        for one in self.each:
+            equations = one.rewritten(equations)
+        return equations
 
     def take_load(self, at: float) -> None:
         """As of ``UserRows``."""
@@ -88,20 +132,20 @@ class JoinedRows:
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """As of ``UserRows``."""
-        for one in (self.linear, *self.rigid):
+        for one in (self.linear, *self.each):
             if one is not None:
                 one.begin_step(start, fraction)
 
     def place(self) -> None:
         """As of ``UserRows``."""
         if self.turning:
-            for one in self.rigid:
+            for one in self.each:
                 one.place()
             self._config.whole.x.scatter_forward()
 
     def at_present(self) -> UnitingEquations:
         """As of ``UserRows``."""
-        for one in (self.linear, *self.rigid):
+        for one in (self.linear, *self.each):
             if one is not None:
                 one.at_present()
         self.equations = self._joined()
@@ -109,7 +153,7 @@ class JoinedRows:
 
     def largest_gap_here(self) -> float:
         """As of ``UserRows``."""
-        return max((one.largest_gap_here() for one in (self.linear, *self.rigid) if one is not None), default=0.0)
+        return max((one.largest_gap_here() for one in (self.linear, *self.each) if one is not None), default=0.0)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """As of ``UserRows``."""
@@ -119,7 +163,7 @@ class JoinedRows:
     def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
         """The couplings' forces at the owned nodes ``(n_owned, gdim)`` (collective)."""
         start = 0 if self.linear is None else len(self.linear.equations)
-        for one in self.rigid:
+        for one in self.each:
             end = start + len(one.equations)
             yield one, forces_of(self._config, one.equations, self.multipliers[start:end])
             start = end

@@ -178,7 +178,8 @@ class RigidMotions:
         if not np.isfinite(sums).all():
             return
         G, D = np.split(sums.reshape(self.count, self.n_modes, -1), [self.n_modes], axis=2)
-        S = np.sqrt(D / D.max(axis=1, keepdims=True))
+        # a body without stiffness, as one that a coupling makes rigid, has no work
+        S = np.sqrt(D / np.maximum(D.max(axis=1, keepdims=True), np.finfo(float).tiny))
         scale = np.where(D > 0, 1.0 / np.sqrt(np.where(D > 0, D, 1.0)), 0.0)
         values, vectors = np.linalg.eigh(0.5 * (G + G.transpose(0, 2, 1)) * scale * scale.transpose(0, 2, 1))
         held = S * np.where(values > SPRINGY, 1.0, 0.0)[:, None, :] * vectors

@@ -71,12 +71,13 @@ class OverConstraints:
             # temperatures of both sides stand in the same rows, and may be prescribed
             self.stacked = self.contestable = True
         self._n_linear = 0
+        self._rigid = None if linear is None else linear.rigid
         if linear is not None:
             self._meet(config, linear.equations, contactors, follows)
 
     def _meet(self, config: Configuration, linear: UnitingEquations, contactors: Indices, follows: Sequence[Bools]) -> None:
         """Take in how equations of users meet each other and those of contacts (collective)."""
-        self._n_linear = len(linear)
+        self._n_linear = len(linear) - (0 if self._rigid is None else self._rigid.n_rows)
         eliminated = np.zeros(config.n_local, dtype=bool)
         eliminated[linear.node] = True
         at_contactors = bool(eliminated[contactors].any())
@@ -85,6 +86,13 @@ class OverConstraints:
         followed |= bool((config.ask_owners(linear.followed, eliminated[: config.n_owned, None].astype(float)) > 0).any())
         at_contactors, followed = reduced(config.comm, np.array([at_contactors, followed])) > 0
         self.stacked, self.contestable = self.stacked or bool(followed), self.contestable or bool(at_contactors)
+
+    def parted(self, equations: UnitingEquations) -> tuple[UnitingEquations, list[UnitingEquations]]:
+        """Equations as they can be told to be independent, and those of rigid couplings, which others speak of no more (collective)."""
+        if self._rigid is None:
+            return equations, []
+        last = np.arange(len(equations)) >= len(equations) - self._rigid.n_rows
+        return self._rigid.rewritten(equations.select(~last)), [equations.select(last)]
 
     def restrict(
         self, equations: UnitingEquations, free: Bools, prescribed: Array
@@ -96,16 +104,18 @@ class OverConstraints:
             free: components that are not held ``(n_rows, gdim)``.
             prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
         """
-        firm = np.arange(len(equations)) >= len(equations) - self._n_linear
-        independent = IndependentEquations(self._unknowns, equations, free, firm=firm) if self.contestable else None
-        own = equations if independent is None else independent.equations
+        given, rigid = self.parted(equations)
+        firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
+        left = free if self._rigid is None else self._rigid.left(free)
+        independent = IndependentEquations(self._unknowns, given, left, firm=firm) if self.contestable else None
+        own = given if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         try:
-            return Restriction(self._unknowns, own, free, prescribed, stacked), independent
+            return Restriction(self._unknowns, joined(own, rigid, g), free, prescribed, stacked), independent
         except DependentRingError as error:
-            ring = error.rows if independent is None else independent.of_given(error.rows)
-        independent = IndependentEquations(self._unknowns, equations, free, ring, firm)
-        return Restriction(self._unknowns, independent.equations, free, prescribed), independent
+            ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
+        independent = IndependentEquations(self._unknowns, given, left, ring, firm)
+        return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,7 @@ class Rows:
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
         heat: equations of temperatures by number of their pair, which come after those of ``equations``, before those of users.
+        n_rigid: how many equations of rigid couplings come last on this rank.
     """
 
     equations: list[Constraints]
@@ -127,6 +138,7 @@ class Rows:
     test: Restriction
     frictionless: Restriction
     heat: dict[int, HeatEquations]
+    n_rigid: int
 
 
 @dataclass(frozen=True)
@@ -178,12 +190,18 @@ def make_rows(
     Q, independent = over_constraints.restrict(frictionless, free, prescribed)
     rotated = Q
     if any(e.test is not e.frictionless for e in equations):
-        test = UnitingEquations.join([*(e.test for e in equations), *more], g)
+        test, last = over_constraints.parted(UnitingEquations.join([*(e.test for e in equations), *more], g))
         if independent is not None and independent.found:
             independent = _rotated(pairs, independent, test)
             test = independent.equations
-        rotated = Restriction(Q.space, test, free, prescribed, Q.stacked, like=Q)
-    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q, heat)
+        rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
+    n_rigid = 0 if linear is None or linear.rigid is None else linear.rigid.n_rows
+    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q, heat, n_rigid)
+
+
+def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int) -> UnitingEquations:
+    """Equations and others after them."""
+    return UnitingEquations.join([equations, *more], block) if more else equations
 
 
 def _unites_heat(pair: Interface) -> bool:
@@ -200,7 +218,7 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         y: forces that were passed on by Q.
         du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
     """
-    lam = rows.test.multipliers(y)
+    lam, rigid = np.split(rows.test.multipliers(y), [len(rows.test.equations) - rows.n_rigid])
     redundant = np.zeros(len(lam), dtype=bool)
     if rows.independent is not None:
         lam, redundant = rows.independent.forces(lam), rows.independent.redundant
@@ -215,7 +233,7 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         assert heat is not None
         found[i] = found[i]._replace(heat=heat.read(equations, lam[part], redundant[part]))
         start = part.stop
-    return found, lam[start:]
+    return found, np.append(lam[start:], rigid)
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
