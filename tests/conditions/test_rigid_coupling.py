@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import at, box, clamp, highest, linear, refused, scene, slow, st_venant
+from helpers import at, blocks, box, clamp, highest, linear, modulus, refused, run, scene, slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -185,6 +185,98 @@ def test_a_spread_load_stiffens_nothing():
         loads = [uem.PointLoad((2.0, y), (0.0, 0.002)) for y in (0.0, 0.5, 1.0)]
         uem.UnitedProblem(law(b.u, 1.0), b.u, bcs=clamp(b.V, b.left), points=loads).solve()
         assert highest(COMM, np.abs(b.u.x.array - u)) <= 1e-10 * highest(COMM, np.abs(u))
+
+
+# -- in contact ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", ["contactor", "target"])
+def test_a_rigid_block_without_stiffness(side):
+    """Pressed on by a force and a moment it touches as one that is led to where it comes, whichever side it is; forces balance."""
+    found = []
+    for motion, force, moment in (((0.0, None, None), (0.0, -0.02), 0.001), (None, (0.0, 0.0), 0.0)):
+        b = blocks(COMM, "quadrilateral", 3, 3)
+        own = [b.high, b.low] if side == "contactor" else [b.low, b.high]
+        upper = b.scene.tag("upper", 1, lambda x: x[:, 1] >= 0.0)
+        motion = (0.0, *found[0]) if motion is None else motion
+        coupling = uem.RigidCoupling(upper, (0.4, 0.5), motion=motion, force=force, moment=moment, rotations="large")
+        contact, E = uem.Contact(*own), modulus(b.scene, 1.0, 0.0)
+        problem = uem.UnitedProblem(
+            st_venant(b.u, E), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact], couplings=[coupling], rtol=1e-11
+        )
+        (step,) = run(problem)
+        push, turn = coupling.reaction
+        total = contact.resultant().force * (1.0 if side == "contactor" else -1.0) + push + force
+        assert np.abs(total).max() <= 1e-11 and np.allclose(problem.reaction(b.bottom)[1], 0.02, rtol=1e-8)
+        found += [(coupling.displacement[1], coupling.rotation)]
+    assert push[1] == pytest.approx(-0.02, rel=1e-8) and turn == pytest.approx(0.001, rel=1e-7)
+
+
+def test_rigid_bodies_on_each_other():
+    """Flat on flat more contactors touch than two bodies have motions: what they carry together is the load, and where it acts."""
+    b = blocks(COMM, "quadrilateral", 2, 3)
+    upper, lower = b.scene.tag("upper", 1, lambda x: x[:, 1] >= 0.0), b.scene.tag("lower", 0, lambda x: x[:, 1] <= 0.0)
+    load = uem.RigidCoupling(upper, (0.5, 0.5), motion=(0.0, None, None), force=(0.0, -0.02), moment=0.002, rotations="large")
+    base = uem.RigidCoupling(lower, (0.5, -0.5), motion=(0.0, 0.0, 0.0), rotations="large")
+    contact = uem.Contact(b.high, b.low)
+    run(uem.UnitedProblem(st_venant(b.u, 1.0), b.u, contacts=[contact], couplings=[load, base]))
+    assert np.abs(b.u.x.array).max(initial=0.0) <= 1e-13
+    assert np.allclose(contact.resultant().force, (0.0, 0.02), atol=1e-12)
+    assert np.allclose(base.reaction[0], (0.0, 0.02), atol=1e-12) and base.reaction[1] == pytest.approx(-0.002, abs=1e-12)
+
+
+# -- in motion -------------------------------------------------------------------------------------------------------------
+
+
+def flying(scheme=None, mass=uem.lumped_mass):
+    """A rigid plate that flies and spins, of which nothing is stiff; the angle of Cayley's rule in a step."""
+    b, spin, dt = Bar(), 5.0, 0.05
+    plate = b.scene.tag("plate", 0, lambda x: x[:, 0] >= 0.0)
+    v = fem.Function(b.V)
+    v.interpolate(lambda x: np.stack([0.3 - spin * (x[1] - 0.5), spin * (x[0] - 1.0)]))
+    coupling = uem.RigidCoupling(plate, (1.0, 0.5), rotations="large")
+    dynamics = uem.Dynamics(mass(b.V, 2.0), velocity=v, scheme=scheme)
+    return b.problem(coupling, bcs=(), law=st_venant, dynamics=dynamics, rtol=1e-13), coupling, dynamics, spin, dt
+
+
+@pytest.mark.parametrize("mass", [uem.lumped_mass, slow(uem.consistent_mass)])
+def test_a_plate_that_spins(mass):
+    """The trapezoidal rule keeps its momentum, its energy and its rate of turning, for ever."""
+    problem, coupling, dynamics, spin, dt = flying(mass=mass)
+    energy, momentum = [], []
+    for _ in uem.time_steps(problem, dt, 8 * dt):
+        energy.append(dynamics.kinetic_energy())
+        momentum.append(dynamics.momentum())
+    assert coupling.rotation == pytest.approx(16.0 * np.arctan(0.5 * spin * dt), rel=1e-12)
+    assert np.allclose(coupling.displacement, (0.3 * 8 * dt, 0.0), atol=1e-12)
+    assert np.allclose(momentum, [1.2, 0.0], atol=1e-12) and np.allclose(energy, energy[0], rtol=1e-12)
+
+
+def test_a_block_that_strikes():
+    """A rigid block falls askew on one that flies free: momentum is kept to rounding, with friction, and the block stays rigid."""
+    s = scene(
+        COMM,
+        "quadrilateral",
+        [box("quadrilateral", [-1, -1], [2, 0], [6, 3]), box("quadrilateral", [0, 0.02], [1, 1.02], [2, 2])],
+    )
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V, name="u"), fem.Function(V)
+    v.interpolate(lambda x: np.where(x[1] > 0.01, 1.0, 0.0) * np.stack([0.3 - (x[1] - 0.5), x[0] - 1.5]))
+    coupling = uem.RigidCoupling(s.tag("block", 1, lambda x: x[:, 1] > 0.01), (0.5, 0.5), rotations="large")
+    contact = uem.Contact(s.tag("high", 1, at(1, 0.02)), s.tag("low", 0, at(1, 0.0)), friction=0.3)
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=v, contactors="massy")
+    E = modulus(s, 20.0, 0.0)
+    problem = uem.UnitedProblem(linear(u, E), u, contacts=[contact], couplings=[coupling], dynamics=dynamics, rtol=1e-12)
+    start, touched = None, 0
+    for step in uem.time_steps(problem, 0.02, 0.16):
+        start = dynamics.momentum() if start is None else start
+        assert np.abs(dynamics.momentum() - start).max() <= 1e-12
+        touched += step.iterations[-1].active > 0
+    assert touched > 1 and abs(coupling.rotation) > 0.05
+    block = np.flatnonzero(problem.config.X[:, 1] > 0.01)
+    R = rotation_matrix(np.array([coupling.rotation]))
+    where = (problem.config.X[block] - 0.5) @ R.T + 0.5 + coupling.displacement
+    assert highest(COMM, np.abs(problem.config.x[block] - where)) <= 1e-13
 
 
 # -- what is refused -------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
+from petsc4py import PETSc
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.algebra.rings import DEPENDENT
@@ -75,6 +76,8 @@ class RigidRows:
     ):
         self._config, self.coupling, self.set = config, coupling, coupling.nodes
         own = self.set.nodes
+        #: Components with Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
+        self._held_nodes: Bools = ~free
         self._free, self._avoided = free[own], avoided[own]
         self._ramped = coupling.ramped(loaded)
         self._wanted = coupling.wanted()
@@ -248,6 +251,50 @@ class RigidRows:
         own = 1 if config.comm.rank == 0 else 0
         return np.tile(nodes, (own, 1)), np.tile(block.reshape(len(nodes) * g, -1), (own, 1, 1))
 
+    # -- motion in time ----------------------------------------------------------------------------------------------------
+
+    def rates(self, M: PETSc.Mat, v: Array, a: Array) -> tuple[Array, Array]:
+        """Velocity and acceleration that the set has as a rigid body, with the same momentum and its rate (collective).
+
+        Rules of integration that act on each node keep the distances of nodes, not their rates.
+
+        Args:
+            M: mass of all nodes.
+            v: velocity of the owned nodes ``(n_owned, gdim)``.
+            a: likewise, of their acceleration.
+
+        Returns:
+            Those of the set's nodes ``(n, gdim)``, as they were where the set has no mass.
+        """
+        s, config, g = self.set, self._config, self._config.gdim
+        u, nodes, comm = config.displacement[: config.n_owned], s.nodes, self._config.comm
+        at, C, _ = self._aim()
+        V, arms = velocities(at.arms(s.X)), at.arms(s.X)
+        everywhere = velocities(config.X[: config.n_owned] + u - s.middle - at.motion.translation)
+        W = np.stack([(M * like(M, field)).array_r.reshape(-1, g)[nodes] for field in np.moveaxis(everywhere, 2, 0)], axis=2)
+        G, plain = (reduced(comm, np.einsum("ngz,ngy->zy", X, V)) for X in (W, V))
+        if not np.trace(G) > 0.0:
+            return v[nodes], a[nodes]
+        basis = self._told_by(at, C * self._scale)
+        held = basis.halo.take(self._held_nodes.__getitem__)[np.arange(len(basis.node)), basis.component]
+        rows = np.concatenate([C, velocities(at.arms(basis.X))[np.arange(len(basis.node)), basis.component][held]])
+
+        def rigid(field: Array) -> Array:
+            """The motion ``(n_z,)`` with the momentum of a field ``(n_owned, gdim)``, and with what is prescribed of it."""
+            momentum, sums = (reduced(comm, np.einsum("ngz,ng->z", X, field[nodes])) for X in (W, V))
+            known = C @ np.linalg.solve(plain, sums)
+            given = basis.halo.take(field.__getitem__)[np.arange(len(basis.node)), basis.component][held]
+            k = len(rows)
+            system = np.block([[G, rows.T], [rows, np.zeros((k, k))]])
+            z: Array = np.asarray(np.linalg.lstsq(system, np.concatenate([momentum, known, given]), rcond=None)[0], dtype=float)
+            return z[: len(G)]
+
+        z = rigid(v)
+        bend = turned(z[g:], turned(z[g:], arms))
+        left = a.copy()
+        left[nodes] -= bend
+        return V @ z, V @ rigid(left) + bend
+
     # -- what is left ------------------------------------------------------------------------------------------------------
 
     def _rows_of(self, basis: Basis, at: Placement) -> Array:
@@ -310,6 +357,13 @@ def _without(rows: Array, row: Array) -> Array:
     """Rows ``(..., n)`` without what they have along another one."""
     q = row / np.linalg.norm(row)
     return rows - (rows @ q)[..., None] * q
+
+
+def like(M: PETSc.Mat, values: Array) -> PETSc.Vec:
+    """A vector that M acts on, with values at the owned nodes ``(n_owned, gdim)``."""
+    vector = M.createVecRight()
+    vector.array[:] = values.ravel()
+    return vector
 
 
 def _told(rows: Array) -> float:

@@ -59,7 +59,7 @@ class Placement:
     def displacement(self, X: Array) -> Array:
         """Displacement of points ``X (n, gdim)`` of the drawing."""
         if self.small is None:
-            return self.motion.carry(X) - X
+            return self.motion.translation + (X - self.motion.about) @ (self.motion.Q - np.eye(X.shape[1])).T
         return self.motion.translation + turned(self.small, X - self.motion.about)
 
     @property

@@ -191,6 +191,9 @@ class UnitedRows:
         """Nothing, likewise."""
         return []
 
+    def settle(self, dynamics: Any) -> None:
+        """Nothing, likewise."""
+
     def at_present(self) -> UnitingEquations:
         """The equations with the gaps of the present displacement (collective)."""
         wanted = self._targets(self._weights @ self._wanted, self._start[0], self._ramped[0])

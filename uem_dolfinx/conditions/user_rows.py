@@ -50,6 +50,9 @@ class UserRows(Protocol):
     def curvature(self) -> list[tuple[Ints, Array]]:
         """What they add to the tangent, as a ``Contact`` does: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
 
+    def settle(self, dynamics: Any) -> None:
+        """Give nodes the velocities and accelerations that equations that are not linear leave them (collective)."""
+
     def check(self) -> None:
         """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
 
@@ -76,6 +79,15 @@ class RigidNodes(Protocol):
 
     def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
         """Equations with what they say of eliminated components said by those that these follow (collective)."""
+
+    def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
+        """Multipliers of the couplings' equations ``(k,)`` beside others as they were before they were rewritten (collective).
+
+        Args:
+            multipliers: beside the rewritten ones ``(k,)``.
+            equations: the others, as given.
+            lam: their multipliers ``(m,)``.
+        """
 
 
 class JoinedRows:
@@ -123,6 +135,13 @@ class JoinedRows:
             equations = one.rewritten(equations)
         return equations
 
+    def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
+        """As of ``RigidNodes``."""
+        # what was rewritten acts on the eliminated components themselves
+        forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))
+        parts = [np.where(one.eliminated, forces[one.set.nodes], 0.0).ravel() for one in self.each]
+        return np.asarray(multipliers - np.concatenate(parts))
+
     def take_load(self, at: float) -> None:
         """As of ``UserRows``."""
         if self.linear is not None:
@@ -167,6 +186,15 @@ class JoinedRows:
             end = start + len(one.equations)
             yield one, forces_of(self._config, one.equations, self.multipliers[start:end])
             start = end
+
+    def settle(self, dynamics: Any) -> None:
+        """As of ``UserRows``."""
+        for one in self.each if self.turning else ():
+            if one.set.large:
+                n, g = self._config.n_owned, self._config.gdim
+                v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
+                v[one.set.nodes], a[one.set.nodes] = one.rates(dynamics.mass.M, v, a)
+                dynamics.change_rates(v.ravel(), a.ravel())
 
     def check(self) -> None:
         """As of ``UserRows``."""

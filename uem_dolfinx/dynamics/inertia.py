@@ -352,6 +352,17 @@ class Dynamics:
             self.time, self._last, self.moving = self._until, dt, False
         self._copy_committed()
 
+    def change_rates(self, velocity: Array, acceleration: Array) -> None:
+        """Give free components of the committed state another velocity and acceleration, with the same momentum ``(n,)`` (collective)."""
+        n, free = self._n, ~self._held
+        change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
+        self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
+        self.acceleration.x.array[:n] += change
+        self.forces.x.array[:n] += (self.mass.M * self._like(change)).array_r
+        for field in (self.forces, self.acceleration, self.velocity):
+            field.x.scatter_forward()
+        self._copy_committed()
+
     def _copy_committed(self) -> None:
         """Displacement, velocity and acceleration as they are are those at the start of the next step."""
         self._u = np.array(self._displacement)

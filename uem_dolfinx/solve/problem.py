@@ -386,6 +386,8 @@ class UnitedProblem:
             material.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
+            if self.linear is not None:
+                self.linear.settle(self.dynamics)
         before = [pair.committed for pair in self.pairs]
         for pair in self.pairs:
             pair.commit()

@@ -25,7 +25,7 @@ from uem_dolfinx.parallel import agree, reduced
 from uem_dolfinx.solve.newton import IterationState
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
     from uem_dolfinx.contact.heat import HeatEquations
 
 
@@ -129,7 +129,8 @@ class Rows:
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
         heat: equations of temperatures by number of their pair, which come after those of ``equations``, before those of users.
-        n_rigid: how many equations of rigid couplings come last on this rank.
+        rigid: couplings whose equations come last; None without any.
+        given: what Q was made of before it was rewritten for these; None without any.
     """
 
     equations: list[Constraints]
@@ -138,7 +139,8 @@ class Rows:
     test: Restriction
     frictionless: Restriction
     heat: dict[int, HeatEquations]
-    n_rigid: int
+    rigid: RigidNodes | None = None
+    given: UnitingEquations | None = None
 
 
 @dataclass(frozen=True)
@@ -188,15 +190,26 @@ def make_rows(
     # the derivatives of the gaps tell which motions of a body nothing holds
     free = hold(stopping, resisting)
     Q, independent = over_constraints.restrict(frictionless, free, prescribed)
+    given = frictionless
     rotated = Q
     if any(e.test is not e.frictionless for e in equations):
-        test, last = over_constraints.parted(UnitingEquations.join([*(e.test for e in equations), *more], g))
+        given = UnitingEquations.join([*(e.test for e in equations), *more], g)
+        test, last = over_constraints.parted(given)
         if independent is not None and independent.found:
             independent = _rotated(pairs, independent, test)
             test = independent.equations
         rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
-    n_rigid = 0 if linear is None or linear.rigid is None else linear.rigid.n_rows
-    return Rows(equations, None if trial is frictionless else trial, independent, rotated, Q, heat, n_rigid)
+    couplings = None if linear is None else linear.rigid
+    return Rows(
+        equations,
+        None if trial is frictionless else trial,
+        independent,
+        rotated,
+        Q,
+        heat,
+        couplings,
+        None if couplings is None else given,
+    )
 
 
 def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int) -> UnitingEquations:
@@ -218,7 +231,8 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         y: forces that were passed on by Q.
         du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
     """
-    lam, rigid = np.split(rows.test.multipliers(y), [len(rows.test.equations) - rows.n_rigid])
+    n_rigid = 0 if rows.rigid is None else rows.rigid.n_rows
+    lam, last = np.split(rows.test.multipliers(y), [len(rows.test.equations) - n_rigid])
     redundant = np.zeros(len(lam), dtype=bool)
     if rows.independent is not None:
         lam, redundant = rows.independent.forces(lam), rows.independent.redundant
@@ -233,7 +247,9 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         assert heat is not None
         found[i] = found[i]._replace(heat=heat.read(equations, lam[part], redundant[part]))
         start = part.stop
-    return found, np.append(lam[start:], rigid)
+    if rows.rigid is not None and rows.given is not None:
+        last = rows.rigid.beside(last, rows.given.select(np.arange(len(rows.given)) < len(lam)), lam)
+    return found, np.append(lam[start:], last)
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:

@@ -102,10 +102,9 @@ class BodySystem:
         """Project the contactors where bodies and targets are now."""
         if self.linear is not None:
             self.linear.place()
-            self._here = None
+        self._here = None
         if not self.pairs:
             return
-        self._here = None
         self.bodies.check_displacement()
         with timed("search and projection"):
             for pair in self.pairs:
@@ -374,6 +373,8 @@ class BodySystem:
             self.bodies.assemble()
             self.floating.begin_motion()
             dynamics.accelerate(self.restriction(), self.residual())
+            if self.linear is not None:
+                self.linear.settle(dynamics)
 
     # -- linear system ---------------------------------------------------------------------------------------------------
 
