@@ -311,3 +311,11 @@ def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec
 def free_petsc_garbage(comm: MPI.Comm) -> None:
     """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective)."""
     PETSc.garbage_cleanup(comm)
+
+
+def in_all_cells(F: ufl.Form, u: fem.Function) -> ufl.Form:
+    """A residual that couples unknowns in all cells, by nothing where it is not integrated: its tangent then has their diagonal."""
+    if any(i.integral_type() == "cell" and i.subdomain_id() == "everywhere" for i in F.integrals()):
+        return F
+    nothing = fem.Constant(u.function_space.mesh, 0.0)
+    return F + nothing * ufl.inner(u, F.arguments()[0]) * ufl.dx(u.function_space.mesh)

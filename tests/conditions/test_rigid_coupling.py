@@ -129,8 +129,14 @@ def test_several_turns_are_counted():
     b = Bar()
     coupling = uem.RigidCoupling(b.scene.tag("all", 0, lambda x: x[:, 0] >= 0.0), (1.0, 0.5), motion=(0.1, 0.0, 6.0 * np.pi))
     problem = b.problem(coupling, bcs=(), law=st_venant)
+    state = problem.state()
     for step in uem.load_steps(problem, 4):
         assert coupling.rotation == pytest.approx(6.0 * np.pi * step.factor, rel=1e-13)
+        if step.number == 2:
+            # a run that goes on from a checkpoint knows them
+            for act in (*state.collect, *state.restore):
+                act()
+            assert coupling.turns == pytest.approx(3.0 * np.pi, rel=1e-13)
     assert np.abs(b.u.x.array.reshape(-1, 2) - (0.1, 0.0)).max(initial=0.0) <= 1e-13
 
 

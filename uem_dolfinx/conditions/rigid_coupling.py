@@ -164,11 +164,14 @@ class RigidCoupling:
             dtype=bool,
         )
 
-    def motion_of(self, u: Array) -> Array:
-        """Displacement of the point and rotation that a displacement ``(n_owned, gdim)`` makes ``(gdim + n_turns,)`` (collective)."""
+    def motion_of(self, u: Array, near: Array | None = None) -> Array:
+        """Displacement of the point and rotation that a displacement ``(n_owned, gdim)`` makes ``(gdim + n_turns,)`` (collective).
+
+        ``near (n_turns,)`` is a rotation that tells the number of turns, None for the one that was known last.
+        """
         at = self.nodes.placement(u)
         shift = at.displacement(self._point[None])[0]
-        return np.append(shift, at.turn if at.small is not None else nearest_turn(at.turn, self.turns))
+        return np.append(shift, at.turn if at.small is not None else nearest_turn(at.turn, self.turns if near is None else near))
 
     # -- what users read ---------------------------------------------------------------------------------------------------
 

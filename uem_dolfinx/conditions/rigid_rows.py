@@ -84,6 +84,8 @@ class RigidRows:
         self._basis: Basis | None = None
         #: Displacement at which the ramp began, and the motion there.
         self._start: tuple[Array, Array] | None = None
+        #: Rotation there, of a run that goes on from a checkpoint ``(n_turns,)``.
+        self._began: Array | None = None
         self.at_present()
 
     # -- steps -------------------------------------------------------------------------------------------------------------
@@ -94,10 +96,21 @@ class RigidRows:
         own = start[self.set.nodes]
         if self._start is None or reduced(self._config.comm, int(not np.array_equal(own, self._start[0]))):
             # steps of one ramp count turns from the same
-            self._start = own.copy(), self.coupling.motion_of(start)
+            self._start, self._began = (own.copy(), self.coupling.motion_of(start, self._began)), None
         began = self._start[1][held]
         self._wanted = np.where(self._ramped, began + fraction * (wanted - began), wanted) if fraction < 1.0 else wanted
         self._basis = None
+
+    @property
+    def turns(self) -> list[list[float]]:
+        """Rotations that tell the number of turns, now and where the ramp began: what a checkpoint keeps."""
+        now = self.coupling.turns
+        return [now.tolist(), now.tolist() if self._start is None else self._start[1][self._config.gdim :].tolist()]
+
+    @turns.setter
+    def turns(self, kept: list[list[float]]) -> None:
+        self.coupling.turns, self._began = (np.array(rotation) for rotation in kept)
+        self._start = None
 
     def place(self) -> None:
         """Put the nodes where the nearest finite rigid motion takes them; components with Dirichlet conditions stay (collective)."""

@@ -114,7 +114,9 @@ class RigidSet:
         spread = self._mean(arms[:, :, None] * arms[:, None, :])
         left, _, right = np.linalg.svd(sums[:, 1:] + spread)
         left[:, -1] *= np.sign(np.linalg.det(left @ right))
-        return Placement(Motion(sums[:, 0], left @ right, self.middle))
+        # sums over many nodes round where they come from: what is left of the displacement tells by how much
+        near = Placement(Motion(sums[:, 0], left @ right, self.middle))
+        return Placement(Motion(sums[:, 0] + self._mean(own - near.displacement(self.X)), left @ right, self.middle))
 
     def spread(self, u: Array, force: Array, moment: Array) -> Array:
         """Forces at the nodes that a force and a moment at the point are ``(n, gdim)`` (collective)."""

@@ -39,6 +39,7 @@ class UnitedRows:
     Attributes:
         equations: of this rank, with the gaps of the last call of ``at_present``.
         multipliers: forces of the equations along what they eliminate ``(m,)``, as last taken.
+        turns: nothing that a checkpoint would have to keep.
         turning: they do not depend on where the bodies are.
         rigid: nor make they anything rigid.
 
@@ -59,6 +60,7 @@ class UnitedRows:
         at: float = 0.0,
     ):
         self._config, self._declared = config, list(declared)
+        self.turns: list[Any] = []
         counts = [one.n_values(config.block) for one in self._declared]
         self._n_values = sum(counts)
         self._asked: list[Any] = [None] * len(counts)

@@ -23,10 +23,12 @@ class UserRows(Protocol):
     Attributes:
         equations: of this rank, as last taken.
         multipliers: forces along what they eliminate ``(m,)``, as last taken.
+        turns: what a checkpoint keeps of them.
     """
 
     equations: UnitingEquations
     multipliers: Array
+    turns: list[Any]
 
     @property
     def turning(self) -> bool:
@@ -111,6 +113,16 @@ class JoinedRows:
     def _joined(self) -> UnitingEquations:
         parts = [one.equations for one in (self.linear, *self.each) if one is not None]
         return UnitingEquations.join(parts, self._config.gdim)
+
+    @property
+    def turns(self) -> list[Any]:
+        """As of ``UserRows``."""
+        return [one.turns for one in self.each]
+
+    @turns.setter
+    def turns(self, kept: list[Any]) -> None:
+        for one, own in zip(self.each, kept):
+            one.turns = own
 
     @property
     def rigid(self) -> JoinedRows | None:

@@ -17,6 +17,7 @@ from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
+from uem_dolfinx.forms import in_all_cells
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
@@ -177,7 +178,8 @@ class UnitedProblem:
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")
-        F, at_points = revolved(F), None
+        # cells that a coupling makes rigid may have no stiffness, nor be in F
+        F, at_points = revolved(in_all_cells(F, u) if couplings else F), None
         if points or couplings:
             from uem_dolfinx.conditions.at_points import AtPoints
 
