@@ -39,8 +39,8 @@ def state_of(problem: Any) -> State:
             config.fill(starts, problem.progress.start)
         if problem.dynamics is not None:
             state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
-        if problem.linear is not None:
-            state.numbers["turns"] = problem.linear.turns
+        if problem.linear is not None and problem.linear.turns:
+            state.numbers["turns of couplings"] = problem.linear.turns
 
     def restore() -> None:
         if config.unknowns.mixed:
@@ -60,7 +60,7 @@ def state_of(problem: Any) -> State:
         for contact in problem.contacts:
             contact.take_load(at, known=True)
         if problem.linear is not None:
-            problem.linear.turns = state.numbers["turns"]
+            problem.linear.turns = state.numbers.get("turns of couplings", [])
             problem.linear.take_load(at)
 
     state.collect.append(collect)
