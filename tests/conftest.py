@@ -126,6 +126,9 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
     left, n = bodies.forces.copy(), config.n_owned
     rounding = 10 * first(problem.system.rounding())
     for contact in problem.contacts:
+        if not contact.on:
+            assert contact.n_active == 0 and highest(config.comm, np.abs(contact.force.x.array)) <= 0.0
+            continue
         # a small-sliding contact has been projected anew since
         if contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)

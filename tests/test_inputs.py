@@ -386,7 +386,8 @@ def test_load_of_the_wrong_number_of_arguments():
 def test_numbers_of_load_steps(steps):
     error = uem.InputError if isinstance(steps, (int, float)) and steps is not True else uem.InputTypeError
     problem = pressed(scene())
-    refused(error, (f"steps = {steps!r}", "a whole number, 1 or more"), lambda: next(uem.load_steps(problem, steps)))
+    words = ("steps[0] = 1", "a Step") if isinstance(steps, tuple) else (f"steps = {steps!r}", "a whole number, 1 or more")
+    refused(error, words, lambda: next(uem.load_steps(problem, steps)))
     assert not problem.u.x.array.any()
 
 

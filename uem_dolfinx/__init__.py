@@ -42,12 +42,12 @@ __all__ = [
     "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
     "OrientationError", "OutputError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant",
     "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme",
-    "SpaceError", "StVenantKirchhoff", "State", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
+    "SpaceError", "StVenantKirchhoff", "State", "Step", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
     "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric",
-    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha",
-    "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
-    "periodic", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent", "taylor_test", "time_steps",
-    "timing", "timings", "write_checkpoint",
+    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
+    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
+    "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent",
+    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -132,6 +132,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
     from uem_dolfinx.solve.modes import Vibrations, modes
+    from uem_dolfinx.solve.step import Step
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
@@ -144,7 +145,7 @@ _LATER = {
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
-    "Vibrations": "solve.modes", "modes": "solve.modes",
+    "Step": "solve.step", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 
 

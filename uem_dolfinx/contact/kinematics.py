@@ -283,6 +283,9 @@ class Discretisation(Protocol):
     def spread(self, values: Array) -> Array:
         """Of integrals with the shape functions, those with functions that are nowhere negative ``(n,)`` (collective)."""
 
+    def hold(self, free: Bools) -> None:
+        """Take which components of the owned nodes have no Dirichlet condition ``(n_owned, gdim)``, to be followed by ``place``."""
+
     def set_offset(self, offset: Array | None) -> None:
         """Take what gaps are less than heights ``(n,)``; contactors are to be placed again."""
 

@@ -27,6 +27,7 @@ from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.concave_edges import ConcaveEdges
     from uem_dolfinx.contact.corners import Corners
 
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
@@ -47,10 +48,9 @@ class NodeToSurface(OnTarget):
     ends_hold: bool | Bools = True
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
+        self.concave_edges: ConcaveEdges | None = None
         super().__init__(config, nodes, target, **how)
         self.chords = chords
-        #: Nodes that contactors followed last ``(n, nt)``, and which of their components may move ``(n, nt, gdim)``.
-        self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
         from uem_dolfinx.contact.concave_edges import create_concave_edges
 
         self.concave_edges = create_concave_edges(config, target, self.free) if self.sliding == "finite" else None
@@ -60,6 +60,14 @@ class NodeToSurface(OnTarget):
         """The same contactors and target with nodal gaps, for methods that push nodes."""
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
         return cls(other.config, other.nodes, other.target, free=other.free_of_owned, **how)
+
+    def hold(self, free: Bools) -> None:
+        """Take which components have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        super().hold(free)
+        #: Nodes that contactors followed last ``(n, nt)``, and which of their components may move ``(n, nt, gdim)``.
+        self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
+        if self.concave_edges is not None:
+            self.concave_edges.free = self.free
 
     def set_offset(self, offset: Array | None) -> None:
         """Take other offsets ``(n,)``, at corners too; contactors are to be placed again."""

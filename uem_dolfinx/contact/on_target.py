@@ -41,14 +41,19 @@ class OnTarget:
         self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf
     ):
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
-        self.free, self.free_of_owned, self.frictional = free[nodes], free, False
-        self.prescribed = bool(reduced(config.comm, int(not self.free.all())))
+        self.frictional = False
+        self.hold(free)
         self.anchor: Projection | None = None
         self.offset: Array | None = None
         #: Whether the next step finds feet of small sliding anew.
         self._renewing = False
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
+
+    def hold(self, free: Bools) -> None:
+        """Take which components of the owned nodes have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        self.free, self.free_of_owned = free[self.nodes], free
+        self.prescribed = bool(reduced(self.config.comm, int(not self.free.all())))
 
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""

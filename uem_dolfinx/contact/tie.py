@@ -143,6 +143,11 @@ class Tie:
         """Current positions of the contactors ``(n, gdim)``."""
         return self.config.X[self.nodes] + self.config.displacement[self.nodes]
 
+    def untie(self) -> None:
+        """Tie nothing any more; to be followed by ``remember`` and ``project``."""
+        self.rows, self.tied, self._here, self._lost, self.whole = None, np.zeros(len(self.nodes), dtype=bool), None, True, False
+        self._left_out = np.zeros_like(self._left_out)
+
     def _within_reach(self, state: PairState) -> Bools:
         """Contactors near enough to the target to be tied ``(n,)`` (collective)."""
         p = self.target.project(self._points)

@@ -28,7 +28,7 @@ class WatchedContact(ContactResults):
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete, and warn of a target too coarse for it (collective)."""
-        self.taken, self._slipped = True, False
+        self.taken, self._slipped, self._on = True, False, True
         self._entered: CornerInside | None = None
         self._off_at_start = self.pair.off.copy()
         nodes_on_facets = self.pair.discretisation.at_feet and self.contactor.dim > 0
@@ -37,6 +37,22 @@ class WatchedContact(ContactResults):
         self._corners = TargetCorners(self.pair, self.contactor) if nodes_on_facets else None
         if not self.adjust:
             warn_of_sagging_facets(self.pair)
+
+    @property
+    def on(self) -> bool:
+        """Whether it is switched on."""
+        return self._on
+
+    def switch(self, on: bool) -> None:
+        """Switch it on or off; its pair is the caller's."""
+        self._on = on
+
+    def look_at(self, before: PairState, stiffness: Array | None) -> None:
+        """Look at the contact after a step from the state ``before``, if it is on; ``stiffness`` as of ``corner_inside`` (collective)."""
+        if self.on:
+            self.look_at_ends()
+            self.look_at_corners(stiffness)
+            self.look_at_wear(before, stiffness)
 
     def look_at_ends(self) -> None:
         """Warn, once, if contactors have slid off the target's end since the start (collective)."""
@@ -56,7 +72,7 @@ class WatchedContact(ContactResults):
         Args:
             stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None where it is not known yet.
         """
-        found = None if self._corners is None or stiffness is None else self._corners.find(stiffness)
+        found = None if self._corners is None or stiffness is None or not self.on else self._corners.find(stiffness)
         return found or self._entered
 
     def look_at_corners(self, stiffness: Array | None) -> None:

@@ -316,7 +316,7 @@ def clock(step: LoadStep | TimeStep | float) -> float:
     """Load factor or time of a step; InputTypeError for what has none."""
     known = isinstance(step, (TimeStep, LoadStep, int, float, np.number))
     given.kind("step", step, known, "a step of load_steps or time_steps, or its factor or time")
-    return float(step.time if isinstance(step, TimeStep) else step.factor if isinstance(step, LoadStep) else step)
+    return float(step.time if isinstance(step, TimeStep | LoadStep) else step)
 
 
 def contact_suffixes(contacts: Sequence[Contact | GeneralContact]) -> list[str]:

@@ -51,8 +51,10 @@ class Bodies:
 
     Attributes:
         unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
+        held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
         free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
         free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
+        dead: forces at all unknowns that keep their direction, as of what a step releases, ghosts included ``(n,)``; None for none.
         wanted: values that the Dirichlet conditions ask for, at their unknowns, ghosts included ``(n,)``.
         tangent: K.
         points: loads and springs at nodes, or None.
@@ -70,7 +72,7 @@ class Bodies:
         points: AtPoints | None = None,
         check_inversion: bool | None = None,
     ):
-        self.config, self.comm, self.u, self.bcs = config, config.comm, config.whole, list(bcs)
+        self.config, self.comm, self.u = config, config.comm, config.whole
         self.unknowns = config.unknowns
         self.materials, self.dynamics, self.points = list(materials), dynamics, points
         #: The residual in UFL.
@@ -80,13 +82,9 @@ class Bodies:
             self._F = forms.form(F)
         self._b = compat.create_vector(self.u.function_space)
         self._u = compat.petsc_vector(self.u)
-        self._held: Bools = np.zeros(len(self.u.x.array), dtype=bool)
-        for bc in self.bcs:
-            self._held[compat.bc_dofs(bc)[0]] = True
         self._n_owned = len(self._b.array_r)
-        self.free: Bools = ~config.of(self._held)
-        self.free_rows: Bools = config.rows(~self._held[: self._n_owned])
-        self.tangent.free = self.free_rows
+        self.hold(bcs)
+        self.dead: Array | None = None
         if dynamics is not None:
             dynamics.hold(~self.free[: config.n_owned])
         self.wanted: Array = np.array(self.u.x.array)
@@ -120,6 +118,8 @@ class Bodies:
             forms.assemble_vector(self._b, self._F)
             if self.points is not None:
                 self.points.add_forces(self._b.array)
+            if self.dead is not None:
+                self._b.array[:] -= self.dead[: self._n_owned]
             if self.dynamics is not None:
                 self.config.add_to(self._b.array, self.dynamics.load().array_r)
         return bool(np.isfinite(self._b.norm()))
@@ -128,6 +128,11 @@ class Bodies:
     def residual(self) -> PETSc.Vec:
         """Owned part of the assembled residual, internal minus external forces."""
         return self.unknowns.vector(self.config.rows(self._b.array_r))
+
+    @property
+    def residual_of_all(self) -> Array:
+        """Copy of the assembled residual at all owned unknowns ``(n,)``."""
+        return np.array(self._b.array_r)
 
     @property
     def forces(self) -> Array:
@@ -221,16 +226,26 @@ class Bodies:
 
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
 
+    def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
+        """Take these Dirichlet conditions for all, from the next step on."""
+        self.bcs = list(bcs)
+        self.held: Bools = np.zeros(len(self.u.x.array), dtype=bool)
+        for bc in self.bcs:
+            self.held[compat.bc_dofs(bc)[0]] = True
+        self.free: Bools = ~self.config.of(self.held)
+        self.free_rows: Bools = self.config.rows(~self.held[: self._n_owned])
+        self.tangent.hold(self.free_rows)
+
     @property
     def prescribed(self) -> Array:
         """Increments that the Dirichlet conditions ask for in the rows of vectors, zero where free ``(n_rows, gdim)``."""
         n = self._n_owned
-        return np.asarray(self.config.rows(np.where(self._held[:n], self.wanted[:n] - self.u.x.array[:n], 0.0)))
+        return np.asarray(self.config.rows(np.where(self.held[:n], self.wanted[:n] - self.u.x.array[:n], 0.0)))
 
     def dirichlet_met(self) -> bool:
         """Whether the Dirichlet values are there (collective)."""
         there, field = self.u.x.array, self.unknowns.field_of if self.unknowns.mixed else None
-        parts = [self._held] if field is None else [self._held & (field == i) for i in range(self.unknowns.n_fields)]
+        parts = [self.held] if field is None else [self.held & (field == i) for i in range(self.unknowns.n_fields)]
         both = np.array([[np.abs(a).max(initial=0.0) for a in (self.wanted[h] - there[h], self.wanted[h])] for h in parts])
         self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
         return bool((both[:, 0] <= VALUE_ROUNDING * both[:, 1]).all())
@@ -254,7 +269,7 @@ class Bodies:
         """Set all unknowns to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""
         self._u.array[:] = self.config.from_rows(start.array_r + length * du.array_r)
         if length == 1.0:
-            held = np.flatnonzero(self._held[: self._n_owned])
+            held = np.flatnonzero(self.held[: self._n_owned])
             self._u.array[held] = self.wanted[held]
         self.u.x.scatter_forward()
 

@@ -15,11 +15,13 @@ def state_of(problem: Any) -> State:
     stiffness, own, config = fem.Function(problem.config.V), problem.config.functions(), problem.config
     starts = {name: fem.Function(f.function_space) for name, f in own.items()}
     functions = own | {"stiffness": stiffness}
+    carried = {name: fem.Function(f.function_space) for name, f in own.items()}
     for i, pair in enumerate(problem.pairs, 1):
         functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
     ramped = problem.dynamics is None
     if problem.dynamics is None:
-        functions |= {"load start" + name.removeprefix("displacement"): f for name, f in starts.items()}
+        for what, fields in (("load start", starts), ("released", carried)):
+            functions |= {what + name.removeprefix("displacement"): f for name, f in fields.items()}
     else:
         d = problem.dynamics
         functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
@@ -37,6 +39,7 @@ def state_of(problem: Any) -> State:
         state.numbers |= problem.progress.to_checkpoint(ramped)
         if ramped and problem.progress.ramp:
             config.fill(starts, problem.progress.start)
+            config.fill(carried, np.zeros(1) if problem.progress.carried is None else problem.progress.carried)
         if problem.dynamics is not None:
             state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
         if problem.linear is not None and problem.linear.turns:
@@ -52,7 +55,8 @@ def state_of(problem: Any) -> State:
         problem.committed, problem.motions = np.array(problem.u.x.array), problem.rigid_motions()
         problem.largest_forces = np.asarray(state.numbers["largest forces"])[()]
         problem.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
-        problem.progress.from_checkpoint(state.numbers, config.values_of(starts) if ramped else None)
+        at_start = (config.values_of(starts), config.values_of(carried)) if ramped else (None, None)
+        problem.progress.from_checkpoint(state.numbers, *at_start)
         if problem.dynamics is not None:
             problem.dynamics.from_checkpoint(state.numbers)
             problem.step_control.from_checkpoint(state.numbers)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.errors import ConvergenceError, UEMError, UserFunctionError
+from uem_dolfinx.errors import ConvergenceError, InputError, UEMError, UserFunctionError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
@@ -22,16 +23,18 @@ from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 
 if TYPE_CHECKING:
     from uem_dolfinx.solve.arc_length import AlongArc
+    from uem_dolfinx.solve.step import Step
 
 
 def load_steps(
-    problem: UnitedProblem, steps: int = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
+    problem: UnitedProblem, steps: int | Sequence[Step] = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
 ) -> Iterator[LoadStep]:
     """Apply the load in steps, cut on failure, increased again after easy ones to the nominal length at most, with a progress bar.
 
     Args:
         problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
-        steps: nominal number of equal steps; after a cut they end again at multiples of their length.
+        steps: nominal number of equal steps; after a cut they end again at multiples of their length. Or a list of ``Step``, each with a
+            number of its own, between which conditions, loads, contacts and coefficients change: the load factor goes from 0 to 1 in each.
         arc_length: make only the first step by its load, and all others as long as that one in displacement: the load factor follows,
             up to limit points and down beyond them, until it comes to 1. Dirichlet values stay as they are.
         checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
@@ -42,27 +45,53 @@ def load_steps(
         An iterator of converged steps.
 
     Raises:
-        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more; with ``arc_length`` if no load moves the bodies, or
-            Dirichlet values do.
+        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more, nor a list of ``Step``, or one of these is not of this
+            problem; with ``arc_length`` if no load moves the bodies, or Dirichlet values do, or there are several ``Step``.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
+    several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
-        steps, arc_length = given.count("steps", steps), given.flag("arc_length", arc_length)
-    given.alike(problem.comm, "load_steps", steps=steps, arc_length=arc_length)
-    begin_checkpoint(checkpoint, problem.state, next(iter(problem.config.functions().values())))
-    way: ByLoad | AlongArc = ByLoad(problem)
-    if arc_length:
-        from uem_dolfinx.solve.arc_length import AlongArc
+        arc_length = given.flag("arc_length", arc_length)
+        if several and arc_length:
+            raise InputError(
+                "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
+            )
+        n = 0 if several else given.count("steps", steps, "or give a list of Step")
+    given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length)
+    if isinstance(steps, Sequence):
+        from uem_dolfinx.solve.stages import check_stages
 
-        way = AlongArc(problem)
-    made = _load_steps(problem, steps, way)
+        check_stages(problem, steps)
+    begin_checkpoint(checkpoint, problem.state, next(iter(problem.config.functions().values())))
+    if isinstance(steps, Sequence):
+        made, total = _in_stages(problem, steps), sum(step.n for step in steps)
+    else:
+        way: ByLoad | AlongArc = ByLoad(problem)
+        if arc_length:
+            from uem_dolfinx.solve.arc_length import AlongArc
+
+            way = AlongArc(problem)
+        made, total = _load_steps(problem, steps, way), steps
     return between_steps(
-        problem.comm, problem.progress, progress_bar(made, "load steps", total=steps), checkpoint, problem.declared
+        problem.comm, problem.progress, progress_bar(made, "load steps", total=total), checkpoint, problem.declared
     )
+
+
+def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadStep]:
+    """The load steps of several ``Step``, one after the other."""
+    from uem_dolfinx.solve.stages import Stage
+
+    for step in steps:
+        stage = Stage(problem, step)
+        try:
+            for made in _load_steps(problem, step.n, ByLoad(problem)):
+                yield replace(made, step=step.name, before=problem.progress.ramp - 1)
+        finally:
+            stage.leave()
 
 
 def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> Iterator[LoadStep]:
@@ -117,7 +146,7 @@ class ByLoad:
 
     def __init__(self, problem: UnitedProblem):
         self._problem, self.tried, self.most = problem, 0.0, np.inf
-        self._ramped = not callable(problem.load)
+        self._ramped = not callable(problem.load) and (problem.stage is None or problem.stage.step.ramp)
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
         """Take a step from the committed load factor ``done`` and commit it (collective).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,6 +41,7 @@ from uem_dolfinx.solve.checks import (
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
 from uem_dolfinx.solve.passages import refuse_passages
+from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
@@ -148,7 +150,8 @@ class UnitedProblem:
             if not self.config.moves:
                 from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
 
-                check_ties(self.config.gdim, contacts, equations, materials=materials, dynamics=dynamics, points=points, couplings=couplings)
+                beside = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
+                check_ties(self.config.gdim, contacts, equations, **beside)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -209,15 +212,13 @@ class UnitedProblem:
         options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
         #: Equations of users; None without any.
         self.linear: UserRows | None = None
-        if ties:
-            ties = [ScalarTie(self.config, tie, free) for tie in ties]
-            equations = [*ties, *equations]
-        if equations or couplings:
-            from uem_dolfinx.conditions.user_rows import rows_of_users
-
-            nodes = [pair.nodes for pair in pairs] + [tie.followed for tie in ties]
-            own = equations, couplings, free, nodes, self.load, clock.get("at", 0.0)
-            self.linear = options["linear"] = rows_of_users(self.config, *own)
+        scalar = [ScalarTie(self.config, tie, free) for tie in ties] if ties else []
+        self._of_users = [*scalar, *equations], couplings, [tie.followed for tie in scalar]
+        self.unite(self.load, clock.get("at", 0.0))
+        if self.linear is not None:
+            options["linear"] = self.linear
+        #: The ``solve.stages.Stage`` that the problem is in; None outside of those.
+        self.stage: Any = None
         self.system = method(self.bodies, pairs, self.solver, **options)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
@@ -254,8 +255,22 @@ class UnitedProblem:
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
-    def set_load(self, at: float) -> None:
-        """Set loads, what else ``load`` sets, and friction, of a load factor or a time; a UserFunctionError if one raises (collective)."""
+    def unite(self, load: Any, at: float) -> None:
+        """Make rows of the equations of users under the present conditions, for a load and its factor or the time (collective)."""
+        equations, couplings, followed = self._of_users
+        if equations or couplings:
+            from uem_dolfinx.conditions.user_rows import rows_of_users
+
+            free, nodes = self.bodies.free[: self.config.n_owned], [pair.nodes for pair in self.pairs]
+            self.linear = rows_of_users(self.config, equations, couplings, free, nodes + followed, load, at)
+
+    def set_load(self, at: float, known: bool = False) -> None:
+        """Set loads, what else ``load`` sets, and friction, of a load factor or a time; a UserFunctionError if one raises (collective).
+
+        ``known`` says whether the committed state has been reached with them; else the next step begins with them.
+        """
+        if self.stage is not None:
+            self.stage.take_load(at)
         if isinstance(self.load, Mapping):
             for constant, value in self.load.items():
                 now = ask_together(self.comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
@@ -264,7 +279,7 @@ class UnitedProblem:
         elif self.load is not None:
             ask_together(self.comm, f"load({at:.6g})", self.load, at)
         for contact in self.contacts:
-            contact.take_load(at)
+            contact.take_load(at, known)
         if self.linear is not None:
             self.linear.take_load(at)
 
@@ -357,7 +372,9 @@ class UnitedProblem:
                 check_signals=lambda: self.progress.check_signals(self.comm),
             )
             self.system.end_step()
-            refuse_passages(self.config, self.pairs, self.committed, self.motions, moving=self.dynamics is not None)
+            on = [contact.on for contact in self.contacts]
+            pairs, motions = [*compress(self.pairs, on)], [*compress(self.motions, on)]
+            refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
         except UEMError as error:
             self.restore()
             if isinstance(error, MENDABLE):
@@ -396,9 +413,7 @@ class UnitedProblem:
             pair.project()
         self.motions = self.rigid_motions()
         for contact, state in zip(self.contacts, before):
-            contact.look_at_ends()
-            contact.look_at_corners(self.bodies.stiffness)
-            contact.look_at_wear(state, self.bodies.stiffness)
+            contact.look_at(state, self.bodies.stiffness)
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -428,14 +443,9 @@ class UnitedProblem:
             tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero. Of
                 axisymmetric bodies radial forces cancel around the axis.
         """
-        self.bodies.assemble()
         tdim = self.config.tdim
         nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
-        force = self.bodies.forces[nodes]
-        for contact in self.contacts:
-            force = force - contact.force.x.array.reshape(-1, self.config.gdim)[nodes]
-        if self.linear is not None:
-            force = force - self.linear.forces(self.linear.multipliers)[nodes]
+        force = self.config.of(reactions(self))[nodes]
         sums = self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0))
         return self.config.of_circles(np.sum(sums, axis=0))
 

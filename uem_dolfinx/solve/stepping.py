@@ -22,10 +22,10 @@ from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
 
-S = TypeVar("S", bound="Step")
+S = TypeVar("S", bound="ConvergedStep")
 
 
-class Step:
+class ConvergedStep:
     """What is told of every converged step, from its history of the Newton loop."""
 
     iterations: list[Iteration]
@@ -42,8 +42,10 @@ class Step:
         return sum(i.exchanges for i in self.iterations)
 
     def __repr__(self) -> str:
-        """All but the history, of which the numbers of iterations and exchanges."""
-        shown = {name: value for name, value in vars(self).items() if name != "iterations"}
+        """All that is not as by default but the history, of which the numbers of iterations and exchanges."""
+        shown = {
+            name: value for name, value in vars(self).items() if name != "iterations" and value != getattr(type(self), name, None)
+        }
         shown |= {"newton_iterations": self.newton_iterations, "exchanges": self.exchanges}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
@@ -72,6 +74,9 @@ class Progress:
         interruption: signals that are noted while the problem steps.
         end: ends the run on a signal of a number, once the problem is in its last converged state.
         inside: whether a step has been handed out, and the caller is not done with it.
+        step: name of the ``Step`` that this call is.
+        loads: values of its Constants at its beginning.
+        carried: what it releases: forces at all unknowns at its beginning, ghosts included ``(n,)``; None for nothing.
     """
 
     steps: int = 0
@@ -84,12 +89,20 @@ class Progress:
     interruption: Interruption | None = None
     end: Callable[[int], NoReturn] = lambda number: end_run(number, "the problem is in its last converged state")
     inside: bool = False
+    step: str = ""
+    loads: list[Any] = field(default_factory=list)
+    carried: Array | None = None
     _calls: int = 0
 
     @property
     def time(self) -> float:
         """Clock of tables that are ordered by steps."""
         return self.steps
+
+    @property
+    def ahead(self) -> int:
+        """The next call of ``load_steps``, counted from the one that the problem is in: below 0 if that comes later."""
+        return self._calls + 1 - self.ramp
 
     def begin_ramp(self, displacement: Array, steps: int) -> bool:
         """Begin a call of ``load_steps`` with so many steps, or go on with the one that a checkpoint was written in.
@@ -130,16 +143,24 @@ class Progress:
 
     def to_checkpoint(self, ramped: bool) -> dict[str, Any]:
         """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
-        load = {"load ramp": self.ramp, "load factor": self.factor, "arc length": self.reach} if ramped else {}
+        load: dict[str, Any] = {}
+        if ramped:
+            load = {"load ramp": self.ramp, "load factor": self.factor, "arc length": self.reach}
+            load |= {
+                "name of the step": self.step,
+                "loads at its beginning": self.loads,
+                "releases forces": self.carried is not None,
+            }
         return {"steps committed": self.steps} | load | (self.control.to_checkpoint() if ramped else {})
 
-    def from_checkpoint(self, kept: dict[str, Any], start: Array | None) -> None:
-        """Go on from what ``to_checkpoint`` returned, load steps from the displacement at their beginning."""
+    def from_checkpoint(self, kept: dict[str, Any], start: Array | None, carried: Array | None) -> None:
+        """Go on from what ``to_checkpoint`` returned, load steps from the displacement and what they release at their beginning."""
         self.steps = kept["steps committed"]
         self.resumed += 1
         if start is not None:
             self.ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
-            self.start = np.array(start)
+            self.start, self.step, self.loads = np.array(start), kept["name of the step"], kept["loads at its beginning"]
+            self.carried = carried if kept["releases forces"] else None
             self.control.from_checkpoint(kept)
             # a script that is run anew comes to this call of load_steps once more
             self._calls = max(0, min(self._calls, self.ramp - 1))

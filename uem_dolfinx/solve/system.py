@@ -67,16 +67,13 @@ class BodySystem:
         consistent_tangent: bool = True,
         linear: UserRows | None = None,
     ):
-        self.bodies, self.pairs, self.solver, self.linear = bodies, list(pairs), solver, linear
+        self.bodies, self.solver = bodies, solver
         self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
-        self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
         self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
         self._curvature: PETSc.Mat | None = None
-        self.exchanges = Exchanges(self.pairs)
-        #: Whether P differs from Q.
-        self._petrov_galerkin = False
+        self._petrov_galerkin = False  # whether P differs from Q
         #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
         self._not_unique: tuple[BodyState, bool] | None = None
         #: Whether the bodies have moved in this step.
@@ -88,13 +85,20 @@ class BodySystem:
         self._multipliers: Array = np.zeros(0)  # of the equations of users, as read last ``(m,)``
         #: Equations where the contactors were placed last, with the directions of slip there; None before they were asked for.
         self._here: Rows | None = None
-        #: How equations of several contacts can meet.
-        self.over_constraints = OverConstraints(self.config, self.pairs, linear)
-        self.floating = FloatingBodies(bodies, self.pairs, linear)
+        self.take(pairs, linear)
         self.place()
         for pair in self.pairs:
             check_initial(pair)
             pair.activate_touching()
+
+    def take(self, pairs: Sequence[Interface], linear: UnitedRows | None) -> None:
+        """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
+        self.pairs, self.linear, self._here = list(pairs), linear, None
+        self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
+        self.exchanges = Exchanges(self.pairs)
+        #: How equations of several contacts can meet.
+        self.over_constraints = OverConstraints(self.config, self.pairs, linear)
+        self.floating = FloatingBodies(self.bodies, self.pairs, linear)
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 

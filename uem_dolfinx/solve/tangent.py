@@ -67,10 +67,17 @@ class Tangent:
             self._form = forms.form(J)
         self._unknowns = config.unknowns
         self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
-        #: Components without Dirichlet condition ``(n_rows, gdim)``, which the bodies tell.
-        self.free: Bools = np.ones((0, 0), dtype=bool)
+        #: Components without Dirichlet condition ``(n_rows, gdim)``.
+        self._free: Bools = np.ones((0, 0), dtype=bool)
         #: Grows with every assembly.
         self.number = 0
+
+    def hold(self, free: Bools) -> None:
+        """Take which components have no Dirichlet condition ``(n_rows, gdim)``; K has places for all of them."""
+        self._free = free
+        if self._unknowns.mixed:
+            # its diagonal was completed where others were held
+            self._values = None
 
     def update(self) -> None:
         """Assemble K unless nothing it depends on has changed (collective)."""
@@ -87,7 +94,7 @@ class Tangent:
                 self._points.add_stiffness(self.K)
             if self._dynamics is not None and factor:
                 self.K.axpy(factor, self._dynamics.matrix, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-            self._unknowns.complete(self.K, self.free)
+            self._unknowns.complete(self.K, self._free)
         self._values, self._factor = values, factor
         self.number += 1
 

@@ -20,7 +20,7 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
-from uem_dolfinx.solve.stepping import Step, begin_checkpoint, between_steps
+from uem_dolfinx.solve.stepping import ConvergedStep, begin_checkpoint, between_steps
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
@@ -35,7 +35,7 @@ SHORTEST_GIVEN = 1.0 / 128
 
 
 @dataclass(frozen=True, repr=False)
-class TimeStep(Step):
+class TimeStep(ConvergedStep):
     """A converged time step.
 
     Attributes:

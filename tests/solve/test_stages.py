@@ -1,0 +1,227 @@
+"""Steps of one problem: conditions, loads, contacts and coefficients that change between them, and what that releases.
+
+The test to read first is ``test_a_column_through_its_steps``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import M, blocks, linear, modulus, refused
+from restart_scenes import COMM, bits
+
+import uem_dolfinx as uem
+from uem_dolfinx import forms
+
+
+class Column:
+    """A block on a block between rollers, each of height 1: pressures and ways are those of one dimension."""
+
+    def __init__(self, n=(2, 4), friction=0.0, held=("bottom", "sides", "top"), **how):
+        self.b = b = blocks(COMM, "quadrilateral", *n)
+        self.p, v = fem.Constant(b.scene.mesh, 0.0), ufl.TestFunction(b.V)
+        F = linear(b.u, modulus(b.scene, 1.0, 1.0)) + self.p * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
+        bottom, top, *sides = b.oedometer(0.02)
+        self.bcs = {"bottom": [bottom], "top": [top], "sides": sides}
+        self.joint = uem.Contact(b.high, b.low, name="joint", friction=friction, **how)
+        self.problem = uem.UnitedProblem(F, b.u, bcs=self.held(*held), contacts=[self.joint], rtol=1e-12)
+
+    def held(self, *names):
+        return [bc for name in names for bc in self.bcs[name]]
+
+    def steps(self):
+        """Pressed by a way, then by a load; the contact goes and comes again under the way."""
+        return [
+            uem.Step("press", 2),
+            uem.Step("load", 3, bcs=self.held("bottom", "sides"), loads={self.p: 0.03}),
+            uem.Step("part", 4, bcs=self.held("bottom", "top", "sides"), loads={self.p: 0.0}, contacts={self.joint: False}),
+            uem.Step("meet", contacts={self.joint: True}),
+        ]
+
+    def forces(self):
+        """In the contact, and of the conditions at the bottom and at the top, upwards (collective)."""
+        reactions = [self.problem.reaction(tag)[1] for tag in (self.b.bottom, self.b.top)]
+        return np.array([self.joint.resultant().force[1], *reactions])
+
+    def way(self):
+        """Of the top (collective)."""
+        there = self.b.scene.gather(self.b.u)[np.abs(self.b.scene.drawing[:, 1] - 1.0) < 1e-9, 1]
+        assert np.ptp(there) <= 1e-14
+        return there[0]
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_a_column_through_its_steps(coupling):
+    """Every force is linear in the step's factor, from what was carried to what is to be."""
+    column, pressed, times = Column(coupling=coupling), 0.5 * M * 0.02, []
+    for step in uem.load_steps(column.problem, column.steps()):
+        s, times = step.factor, [*times, step.time]
+        contact, bottom, top, way = {
+            "press": (pressed * s, pressed * s, -pressed * s, -0.02 * s),
+            "load": (loaded := pressed + (0.03 - pressed) * s, loaded, 0.0, -loaded / (0.5 * M)),
+            # of the contact's two forces one is the lower body's, the other the upper's, which the top holds as well
+            "part": (0.0, 0.03 * (1 - s), None, -0.06 / M + (0.06 / M - 0.02) * s),
+            "meet": (pressed, pressed, -pressed, -0.02),
+        }[step.step]
+        found = column.forces()
+        assert found[:2] == pytest.approx([contact, bottom], abs=1e-12) and column.way() == pytest.approx(way, abs=1e-12)
+        assert top is None or found[2] == pytest.approx(top, abs=1e-12)
+        assert column.joint.on is (step.step != "part")
+    assert np.allclose(times, [0.5, 1, 4 / 3, 5 / 3, 2, 2.25, 2.5, 2.75, 3, 4]) and step.cuts == 0
+    assert column.problem.bodies.dead is None and column.problem.load is None
+
+
+def test_at_once():
+    """Without a ramp the first load step has it all."""
+    column = Column()
+    press, load, *_ = column.steps()
+    load = uem.Step("load", bcs=load.bcs, loads=load.loads, ramp=False, n=2)
+    for step in uem.load_steps(column.problem, [press, load]):
+        assert column.forces()[0] == pytest.approx(0.5 * M * 0.02 * step.factor if step.step == "press" else 0.03, abs=1e-12)
+
+
+def test_a_step_that_is_left_goes_on_with_what_is_left():
+    """Left at a third of the release, the next step releases the other two thirds."""
+    column, pressed = Column(), 0.5 * M * 0.02
+    press, *_ = column.steps()
+    release = uem.Step("release", 3, bcs=column.held("bottom", "sides"))
+    for step in uem.load_steps(column.problem, [press, release]):
+        if step.step == "release":
+            break
+    assert column.forces()[0] == pytest.approx(pressed * 2 / 3, abs=1e-12)
+    for step in uem.load_steps(column.problem, [uem.Step("on", 2)]):
+        assert column.forces()[0] == pytest.approx(pressed * 2 / 3 * (1 - step.factor), abs=1e-12)
+
+
+@pytest.mark.parametrize("stops", [(3,), (6, 2)], ids=str)
+def test_interrupted_is_uninterrupted(stops, folder):
+    """Left in the middle of a step, and gone on with by the same script: the same numbers, in serial bit by bit; results go on."""
+
+    def run(name, stop=None):
+        column, made = Column(friction=0.1), []
+        checkpoint = uem.Checkpoint(folder / f"{name}.uem", every=1)
+        checkpoint.begin(column.problem.state())
+        steps = [*column.steps(), uem.Step("rough", 2, friction={column.joint: 0.3}, offset={column.joint: 0.01})]
+        with uem.HistoryWriter(folder / f"{name}.csv", column.problem, resume=True) as history:
+            for step in uem.load_steps(column.problem, steps, checkpoint=checkpoint):
+                made.append((step.step, step.number, step.time, *column.forces()))
+                history.write(step)
+                if len(made) == stop:
+                    break
+        return column, made
+
+    whole, wanted = run("whole")
+    assert whole.joint.friction == 0.3 and whole.joint.offset == 0.01 and len(wanted) == 12
+    assert wanted[-1][3] == pytest.approx(0.5 * M * 0.03, abs=1e-12)
+    done = 0
+    for stop in (*stops, None):
+        last, made = run("parts", stop)
+        for ours, theirs in zip(made, wanted[done:]):
+            assert ours[:2] == theirs[:2] and np.allclose(ours[2:], theirs[2:], rtol=0, atol=1e-14)
+        # a step that was left is not counted
+        done += len(made) - (stop is not None)
+    assert done == len(wanted)
+    if COMM.size == 1:
+        assert np.array_equal(bits(last.b.u.x.array), bits(whole.b.u.x.array))
+        assert (folder / "parts.csv").read_bytes() == (folder / "whole.csv").read_bytes()
+    again, made = run("parts")
+    assert made == [] and again.joint.friction == 0.3 and np.allclose(again.forces(), whole.forces(), rtol=0, atol=1e-12)
+
+
+def test_another_step_is_no_step_of_the_checkpoint(folder):
+    column = Column()
+    for step in uem.load_steps(column.problem, column.steps()[:2], checkpoint=uem.Checkpoint(folder / "run", every=1)):
+        if step.step == "load" and step.number == 2:
+            break
+    del column
+    other = Column()
+    press, load, *_ = other.steps()
+    steps = [press, uem.Step("pull", 3, bcs=load.bcs)]
+    refused(
+        uem.CheckpointError, "the step 'load', which is 'pull' now",
+        lambda: list(uem.load_steps(other.problem, steps, checkpoint=uem.Checkpoint(folder / "run"))),
+    )  # fmt: skip
+
+
+def test_steps_that_fail_are_cut():
+    """Within a step as without, from where the step began."""
+    column, failed = Column(), []
+    press, load, *_ = column.steps()
+    attempt = column.problem.attempt
+
+    def failing(**how):
+        if column.problem.stage.step is load and not failed:
+            failed.append(column.p.value.item())
+            raise uem.ConvergenceError("no")
+        return attempt(**how)
+
+    column.problem.attempt = failing
+    load = uem.Step("load", 2, bcs=load.bcs, loads=load.loads)
+    made = [(s.step, s.factor, s.cuts) for s in uem.load_steps(column.problem, [press, load])]
+    assert made == [("press", 0.5, 0), ("press", 1.0, 0), ("load", 0.25, 1), ("load", 0.5, 0), ("load", 1.0, 0)]
+    assert failed == [0.015] and column.forces()[0] == pytest.approx(0.03, abs=1e-12)
+
+
+def test_begun_once_with_friction_and_offset_on_their_way():
+    """``begin`` is called once; a coefficient and an offset by place go from what they are to what they are to be."""
+    column, begun = Column(friction=lambda x: 0.2 + 0.1 * x[0]), []
+    steps = [
+        uem.Step("press", begin=lambda: begun.append("press")),
+        uem.Step(
+            "rough", 2, friction={column.joint: 0.6}, offset={column.joint: lambda x: np.full(x.shape[1], 0.01)},
+            begin=lambda: begun.append("rough"),
+        ),
+        uem.Step("smooth", 2, friction={column.joint: lambda x, s: 0.6 - 0.5 * s}),
+    ]  # fmt: skip
+    for step in uem.load_steps(column.problem, steps):
+        x, s = column.b.scene.mesh.geometry.dim and column.problem.config.X[column.joint.nodes, 0], step.factor
+        first = 0.2 + 0.1 * x
+        mu = {"press": first, "rough": first + (0.6 - first) * s, "smooth": np.full(len(x), 0.6 - 0.5 * s)}[step.step]
+        assert np.allclose(column.joint.friction_values(), mu, rtol=0, atol=1e-15)
+        fitted = {"press": 0.0, "rough": 0.01 * s, "smooth": 0.01}[step.step]
+        overlap = (0.02 if step.step != "press" else 0.02 * s) + fitted
+        assert column.forces()[0] == pytest.approx(0.5 * M * overlap, abs=1e-12)
+    assert begun == ["press", "rough"]
+    assert np.allclose(column.joint.friction(np.zeros((3, 4))), 0.1) and callable(column.joint.offset)
+
+
+def test_a_tie_that_lets_go():
+    """What a tie carries in tension is released like the rest; it does not come again."""
+    column = Column(tied=True)
+    pull = uem.Step("pull", loads={column.p: -0.03}, bcs=column.held("bottom", "sides"))
+    steps = [pull, uem.Step("let go", 2, bcs=column.held("bottom", "sides", "top"), contacts={column.joint: False})]
+    for step in uem.load_steps(column.problem, steps):
+        left = 1.0 if step.step == "pull" else 1.0 - step.factor
+        assert column.forces()[1] == pytest.approx(-0.03 * left, abs=1e-12)
+    assert column.joint.n_active == 0 and column.joint.resultant().force == pytest.approx(0.0)
+    refused(
+        uem.InputError, "tied='after'", lambda: uem.load_steps(column.problem, [uem.Step("tie", contacts={column.joint: True})])
+    )
+
+
+def test_what_steps_refuse():
+    """Each on all ranks, before the first step is taken."""
+    column, other = Column(), Column()
+    step, steps = uem.Step, lambda *some: uem.load_steps(column.problem, list(some))
+    for error, words, call in [
+        (uem.InputTypeError, "n", lambda: step("a", "two")),
+        (uem.InputTypeError, "Step('a'): contacts", lambda: step("a", contacts=[column.joint])),
+        (uem.InputTypeError, "on or off", lambda: step("a", contacts={column.joint: "off"})),
+        (uem.InputError, "0 or a positive", lambda: step("a", friction={column.joint: -0.1})),
+        (uem.InputTypeError, "begin", lambda: step("a", begin=1)),
+        (uem.InputTypeError, "steps[1]", lambda: steps(step("a"), 3)),
+        (uem.InputError, "one Step at least", lambda: steps()),
+        (uem.InputError, "step 2, 'b': contact 'joint' is not the problem's", lambda: steps(step(), step("b", offset={other.joint: 1}))),
+        (uem.InputError, "made without friction", lambda: steps(step("a", friction={column.joint: 0.3}))),
+        (uem.InputTypeError, "the law Coulomb", lambda: steps(step("a", friction={column.joint: uem.Tresca(0.3)}))),
+        (uem.SpaceError, "bcs[0]", lambda: steps(step("a", bcs=other.held("top")))),
+        (uem.InputError, "arc_length", lambda: uem.load_steps(column.problem, [step("a")], arc_length=True)),
+    ]:  # fmt: skip
+        refused(error, words, call)
+    column.problem.load = lambda s: None
+    refused(uem.InputError, "the problem has a load", lambda: steps(step("a")))
+    held = Column(tied=True, coupling="mortar")
+    loose = [uem.Step("a"), uem.Step("b", bcs=held.held("bottom", "top"))]
+    refused(uem.InputError, "is tied, and a step changes its conditions", lambda: list(uem.load_steps(held.problem, loose)))

@@ -1,0 +1,123 @@
+"""Contacts between two steps: switched off and on, and parameters that go from one value to another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.checks import check_initial
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
+from uem_dolfinx.contact.state import FrictionState, PairState
+from uem_dolfinx.errors import InputError
+
+
+def switch_off(pair: Interface) -> None:
+    """Let a pair touch nothing; what it has slipped, worn and dissipated stays (collective)."""
+    if pair.tie is not None:
+        pair.tie.untie()
+    n, g, f, none = len(pair.nodes), pair.config.gdim, pair.committed.friction, np.zeros(len(pair.nodes), dtype=bool)
+    state = PairState.initial(n, g)
+    if f is not None:
+        fresh = FrictionState.initial(n, g)
+        state = replace(state, friction=replace(fresh, slipped=f.slipped, work=f.work, worn=f.worn))
+    for name in ("bond", "heat"):
+        if getattr(pair.committed, name) is not None:
+            state = replace(state, **{name: np.zeros_like(getattr(pair.committed, name))})
+    settle(pair, (state, none, none, none))
+
+
+def switch_on(pair: Interface) -> None:
+    """Let a pair begin as at the start of a problem, where bodies and target are now (collective).
+
+    Raises:
+        PenetrationError: if a contactor is deeper inside than ``max_penetration``.
+    """
+    pair.discretisation.begin_step()
+    pair.project()
+    check_initial(pair)
+    pair.activate_touching()
+
+
+def settle(pair: Interface, memory: Any = None) -> None:
+    """Place a committed state, or what ``Interface.memory`` is given, under the present conditions and offsets (collective)."""
+    pair.remember(pair.memory() if memory is None else memory)
+    pair.project()
+
+
+def take_friction(contact: Contact, law: Field | FrictionLaw, known: bool) -> None:
+    """Let friction of a contact follow the load factor from 0 on by a law (collective).
+
+    Args:
+        contact: made with friction by such a law.
+        law: as of ``blended``.
+        known: whether the committed state has been reached with it, at a factor that the contact is told next.
+
+    Raises:
+        InputError, InputTypeError: as the setter of ``Contact.friction``.
+    """
+    contact._at = 0.0
+    if known:
+        contact._friction = law
+    else:
+        contact.friction = law
+
+
+def leave_friction(contact: Contact, to: Field | FrictionLaw, at: float) -> None:
+    """Let friction that has gone to ``to`` stay what it is at a load factor."""
+    there = at == 1.0 and not follows_load(as_law(to))
+    contact._friction = to if there else _with_field(contact._friction, _frozen(as_law(contact._friction), at))
+
+
+def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[[float], float]) -> Field | FrictionLaw:
+    """Friction that goes from what it is to another, by a function of place and of the load factor.
+
+    Args:
+        contact: whose friction it is.
+        to: friction at the end; a function of place and of the load factor is taken as it is.
+        share: of the way that is done at a load factor, from 0 to 1.
+    """
+    if follows_load(as_law(to)):
+        return to
+    before, after = _frozen(as_law(contact.friction), contact._at), as_law(to).field
+
+    def at(x: Array, s: float) -> Any:
+        return value_at(between(before, after, share(s)), x)
+
+    return _with_field(to, at)
+
+
+def between(a: Field, b: Field, share: float) -> Field:
+    """What lies at a part of the way from a to b, numbers or functions of place."""
+    if not (callable(a) or callable(b)):
+        return (1.0 - share) * a + share * b
+    return lambda x: (1.0 - share) * value_at(a, x) + share * value_at(b, x)
+
+
+def value_at(field: Field, x: Array) -> Any:
+    """A number, or what a function of place returns at ``x (3, n)``."""
+    return np.asarray(field(x), dtype=float) if callable(field) else field
+
+
+def _frozen(law: FrictionLaw, at: float) -> Field:
+    """The law's parameter as it is at a load factor."""
+    f = law.field
+    return (lambda x: np.broadcast_to(f(x, at), x.shape[1:])) if follows_load(law) and callable(f) else f
+
+
+def _with_field(friction: Any, parameter: Field) -> Any:
+    """The same law with another parameter."""
+    if not hasattr(friction, "limit"):
+        return parameter
+    if "field" not in vars(friction):
+        raise InputError(given.sentence("friction", friction, "a law with an attribute field of its own, to be ramped in a step"))
+    other = copy(friction)
+    object.__setattr__(other, "field", parameter)
+    return other
