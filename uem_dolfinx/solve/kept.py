@@ -28,6 +28,9 @@ def state_of(problem: Any) -> State:
         functions["mean velocity"] = d.mean_velocity
     for i, material in enumerate(problem.materials, 1):
         functions |= {f"{name} {i}": f for name, f in material.history.items()}
+    of_equations = fem.Function(config.V)
+    if problem.linear is not None:
+        functions["multipliers of equations"] = of_equations
     state = State(problem.config.mesh, functions, problem.contacts, settings=problem.settings.describe(problem.comm))
 
     def collect() -> None:
@@ -40,6 +43,11 @@ def state_of(problem: Any) -> State:
         if ramped and problem.progress.ramp:
             config.fill(starts, problem.progress.start)
             config.fill(carried, np.zeros(1) if problem.progress.carried is None else problem.progress.carried)
+        if problem.linear is not None:
+            eq, nodal = problem.linear.equations, np.zeros((config.n_owned, config.gdim))
+            np.add.at(nodal, eq.node, problem.linear.multipliers[:, None] * eq.direction)
+            of_equations.x.array[: nodal.size] = nodal.ravel()
+            of_equations.x.scatter_forward()
         if problem.dynamics is not None:
             state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
         if problem.linear is not None and problem.linear.turns:
@@ -66,7 +74,15 @@ def state_of(problem: Any) -> State:
         if problem.linear is not None:
             problem.linear.turns = state.numbers.get("turns of couplings", [])
             problem.linear.take_load(at)
+            problem.progress.of_equations = np.array(of_equations.x.array).reshape(-1, config.gdim)
+            take_multipliers(problem)
 
     state.collect.append(collect)
     state.restore.append(restore)
     return state
+
+
+def take_multipliers(problem: Any) -> None:
+    """Give the equations of users the multipliers that a checkpoint has kept by what they eliminate."""
+    eq = problem.linear.equations
+    problem.linear.multipliers = np.einsum("mg,mg->m", eq.direction, problem.progress.of_equations[eq.node])

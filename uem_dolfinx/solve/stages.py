@@ -26,6 +26,7 @@ from uem_dolfinx.contact.switched import (
 from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import check_conditions
+from uem_dolfinx.solve.kept import take_multipliers
 from uem_dolfinx.solve.memory import move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.reactions import owned_displacement, reactions
@@ -163,6 +164,8 @@ class Stage:
         if other or left or come or problem.linear is not None:
             assert isinstance(problem.system, BodySystem)
             problem.unite(step.loads, 0.0)
+            if problem.linear is not None and problem.progress.ahead == 0:
+                take_multipliers(problem)
             problem.system.take([contact.pair for contact in problem.contacts if contact.on], problem.linear)
 
     def _hold(self, changed: Bools) -> None:

@@ -77,6 +77,8 @@ class Progress:
         step: name of the ``Step`` that this call is.
         loads: values of its Constants at its beginning.
         carried: what it releases: forces at all unknowns at its beginning, ghosts included ``(n,)``; None for nothing.
+        of_equations: multipliers of equations of users at the components that these eliminate, as a checkpoint has kept them
+            ``(n_local, gdim)``.
     """
 
     steps: int = 0
@@ -92,6 +94,7 @@ class Progress:
     step: str = ""
     loads: list[Any] = field(default_factory=list)
     carried: Array | None = None
+    of_equations: Array = field(default_factory=lambda: np.zeros((0, 0)))
     _calls: int = 0
 
     @property
