@@ -19,13 +19,13 @@ from uem_dolfinx import forms
 class Column:
     """A block on a block between rollers, each of height 1: pressures and ways are those of one dimension."""
 
-    def __init__(self, n=(1, 2), friction=0.0, held=("bottom", "sides", "top"), equations=(), **how):
+    def __init__(self, n=(1, 2), kind=uem.Contact, held=("bottom", "sides", "top"), equations=(), **how):
         self.b = b = blocks(COMM, "quadrilateral", *n)
         self.p, v = fem.Constant(b.scene.mesh, 0.0), ufl.TestFunction(b.V)
         F = linear(b.u, modulus(b.scene, 1.0, 1.0)) + self.p * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
         bottom, top, *sides = b.oedometer(0.02)
         self.bcs = {"bottom": [bottom], "top": [top], "sides": sides}
-        self.joint = uem.Contact(b.high, b.low, name="joint", friction=friction, **how)
+        self.joint = kind(b.high, b.low, name="joint", **how)
         self.problem = uem.UnitedProblem(F, b.u, bcs=self.held(*held), contacts=[self.joint], equations=equations, rtol=1e-12)
 
     def held(self, *names):
@@ -80,6 +80,7 @@ def test_a_column_through_its_steps(coupling):
     assert column.joint.initial_overlap == 0.0
     assert np.allclose(times, [0.5, 1, 4 / 3, 5 / 3, 2, 2.25, 2.5, 2.75, 3, 3.5, 4]) and step.cuts == 0
     assert column.problem.bodies.dead is None and column.problem.load is None
+    assert column.problem.bodies.tangent.number == 1
 
 
 def test_at_once():
@@ -226,6 +227,21 @@ def test_a_tie_that_lets_go():
     refused(
         uem.InputError, "tied='after'", lambda: uem.load_steps(column.problem, [uem.Step("tie", contacts={column.joint: True})])
     )
+
+
+def test_a_bolt_is_tightened_locked_and_let_go():
+    """The force is ramped, whatever else moves; locked, the section loses what the top's condition carried."""
+    column = Column(kind=uem.Preload, force=0.0)
+    tighten = uem.Step("tighten", 2, preload={column.joint: 0.03})
+    let_go = uem.Step("let go", 2, preload={column.joint: None}, bcs=column.held("bottom", "sides"))
+    for step in uem.load_steps(column.problem, [tighten, let_go]):
+        wanted = 0.03 * (step.factor if step.step == "tighten" else 1.0 - step.factor)
+        assert column.joint.carried == pytest.approx(wanted, abs=1e-12)
+        assert column.joint.locked is (step.step == "let go")
+    refused(
+        uem.InputError, "preload 'joint' cannot be switched",
+        lambda: uem.load_steps(column.problem, [uem.Step(contacts={column.joint: False})]),
+    )  # fmt: skip
 
 
 def test_what_steps_refuse():

@@ -15,6 +15,7 @@ from uem_dolfinx.contact.checks import check_initial
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
+from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.errors import InputError
 
@@ -74,6 +75,23 @@ def leave_friction(contact: Contact, to: Field | FrictionLaw, at: float) -> None
     """Let friction that has gone to ``to`` stay what it is at a load factor."""
     there = at == 1.0 and not follows_load(as_law(to))
     contact._friction = to if there else _with_field(contact._friction, _frozen(as_law(contact._friction), at))
+
+
+def take_preload(bolt: Preload, force: Callable[[float], float] | None, known: bool) -> None:
+    """Let a section carry a force that follows the load factor from 0 on, or lock it with None; ``known`` as above (collective)."""
+    if force is None and not known:
+        bolt.lock()
+    elif force is not None:
+        bolt._at = 0.0
+        if known:
+            bolt._force = force
+        else:
+            bolt.tighten(force)
+
+
+def leave_preload(bolt: Preload, at: float) -> None:
+    """Let the force stay what it is at a load factor."""
+    bolt._force = bolt._force(at) if callable(bolt._force) else bolt._force
 
 
 def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[[float], float]) -> Field | FrictionLaw:

@@ -121,6 +121,7 @@ def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
             (problem.dynamics is not None, "a problem in time"),
             (any(pair.frictional for pair in problem.pairs), "a contact with friction"),
             (bool(problem.materials), "a law with history"),
+            (problem.bodies.dead is not None, "forces that a step has not released yet"),
         ):
             if present:
                 raise InputError(

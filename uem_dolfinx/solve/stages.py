@@ -18,10 +18,12 @@ from uem_dolfinx.contact.switched import (
     between,
     blended_friction,
     leave_friction,
+    leave_preload,
     settle,
     switch_off,
     switch_on,
     take_friction,
+    take_preload,
 )
 from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
@@ -62,7 +64,7 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
 def _check(problem: UnitedProblem, step: Step, words: str) -> None:
     if step.bcs is not None:
         check_conditions(problem.config, step.bcs)
-    for contact in [*step.contacts, *step.friction, *step.offset]:
+    for contact in [*step.contacts, *step.friction, *step.offset, *step.preload]:
         if not any(contact is one for one in problem.declared):
             names = ", ".join(repr(one.name) for one in problem.declared) or "none"
             raise InputError(f"{words}: contact '{contact.name}' is not the problem's: expected one of its contacts, {names}")
@@ -77,7 +79,7 @@ def _check(problem: UnitedProblem, step: Step, words: str) -> None:
             )
     for contact, on in step.contacts.items():
         if isinstance(contact, Preload):
-            raise InputError(f"{words}: preload '{contact.name}' cannot be switched: tighten it to another force, 0 for none")
+            raise InputError(f"{words}: preload '{contact.name}' cannot be switched: give the step preload = {{preload: 0.0}}")
         if on and getattr(contact, "tied", False) is True:
             raise InputError(
                 f"{words}: contact '{contact.name}' is tied from the start, and cannot be switched on: make it with tied='after', and "
@@ -118,7 +120,7 @@ class Stage:
         if fresh and step.begin is not None:
             ask_together(problem.comm, f"begin of the step '{step.name}'", step.begin)
         self._switch(fresh)
-        constants = self._take_loads(fresh)
+        starts = self._take_loads(fresh)
         known = not fresh
         for contact, value in step.friction.items():
             take_friction(contact, blended_friction(contact, value, self._share), known)
@@ -126,7 +128,7 @@ class Stage:
         self._offsets = {contact: contact.offset for contact in step.offset}
         problem.stage = self
         if fresh:
-            progress.step, progress.loads = step.name, constants
+            progress.step, progress.loads = step.name, starts
         else:
             problem.set_load(progress.factor if progress.ahead == 0 else 1.0, known=True)
             move_targets(problem, problem.motions)
@@ -214,20 +216,24 @@ class Stage:
     # -- what is ramped --------------------------------------------------------------------------------------------------
 
     def _take_loads(self, fresh: bool) -> list[Any]:
-        """Let the problem's load be the step's; returns the Constants' values at its beginning."""
-        problem, loads = self._problem, self.step.loads
-        if not isinstance(loads, dict):
-            problem.load = loads
-            return []
-        starts = (
-            [np.array(c.value, dtype=float) for c in loads] if fresh or problem.progress.ahead < 0 else problem.progress.loads
-        )
+        """Let loads and preloads be the step's; returns where they begin (collective)."""
+        problem, loads, bolts = self._problem, self.step.loads, self.step.preload
+        constants = dict(loads) if isinstance(loads, dict) else {}
+        starts = problem.progress.loads
+        if fresh or problem.progress.ahead < 0:
+            starts = [np.asarray(c.value).tolist() for c in constants]
+            starts += [bolt.carried for bolt in bolts]
 
         def ramp(start: Any, end: Any) -> Callable[[float], Any]:
+            if callable(end):
+                return end
             return lambda s: (1.0 - self._share(s)) * np.asarray(start) + self._share(s) * np.asarray(end)
 
-        problem.load = {c: v if callable(v) else ramp(start, v) for (c, v), start in zip(loads.items(), starts)}
-        return [np.asarray(start).tolist() for start in starts]
+        ramps = [ramp(start, end) for start, end in zip(starts, [*constants.values(), *bolts.values()])]
+        problem.load = dict(zip(constants, ramps)) if constants else loads
+        for (bolt, force), follows in zip(bolts.items(), ramps[len(constants) :]):
+            take_preload(bolt, None if force is None else follows, not fresh)
+        return starts
 
     def take_load(self, at: float) -> None:
         """Release what was carried, and take offsets, as far as a load factor tells (collective)."""
@@ -244,3 +250,5 @@ class Stage:
         problem.load = problem.stage = None
         for contact, value in self.step.friction.items():
             leave_friction(contact, value, self._at)
+        for bolt in self.step.preload:
+            leave_preload(bolt, self._at)

@@ -12,6 +12,7 @@ from uem_dolfinx import given
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_field, given_friction
+from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.solve.checks import check_load
 
 
@@ -35,8 +36,10 @@ class Step:
         friction: of contacts that were made with friction, as of ``Contact``, by the same law: its coefficient, or other parameter, is
             ramped; a function of place and s is taken as it is.
         offset: of contacts, as of ``Contact``: a length or a function of place, ramped.
-        begin: called when the step begins, before anything else, on all ranks, as ``contact.tie`` and ``preload.lock``; not again by a
-            run that goes on from a checkpoint of this step or a later one.
+        preload: of ``Preload`` sections: the force at the step's end, to which it grows from what the section carries, or a function of s;
+            None locks the section at its present length.
+        begin: called when the step begins, before anything else, on all ranks, as ``contact.tie``; not again by a run that goes on from a
+            checkpoint of this step or a later one, which has to know what it has done.
         ramp: False lets all of this act in full from the first load step on.
 
     Raises:
@@ -50,6 +53,7 @@ class Step:
     contacts: Mapping[Contact | GeneralContact, bool] = field(default_factory=dict, kw_only=True)
     friction: Mapping[Contact, Field | FrictionLaw] = field(default_factory=dict, kw_only=True)
     offset: Mapping[Contact, Field] = field(default_factory=dict, kw_only=True)
+    preload: Mapping[Preload, float | Callable[[float], float] | None] = field(default_factory=dict, kw_only=True)
     begin: Callable[[], None] | None = field(default=None, kw_only=True)
     ramp: bool = field(default=True, kw_only=True)
 
@@ -64,7 +68,7 @@ class Step:
             found = getattr(self, what)
             given.kind(f"{of}{what}", found, isinstance(found, Mapping), f"{values} by contact, as {{contact: ...}}")
             for contact in found:
-                words = "a Contact" if kinds is Contact else "a Contact or a GeneralContact"
+                words = f"a {getattr(kinds, '__name__', 'Contact or a GeneralContact')}"
                 given.kind(f"{of}a name in {what}", contact, isinstance(contact, kinds), words)
             take(what, {contact: check(value) for contact, value in found.items()})
 
@@ -75,9 +79,10 @@ class Step:
         of_contacts("contacts", "True and False", Contact | GeneralContact, lambda on: given.flag(f"{of}on or off", on))
         of_contacts("friction", "coefficients or laws", Contact, given_friction)
         of_contacts("offset", "lengths or functions", Contact, lambda offset: given_field(f"{of}offset", offset))
+        of_contacts("preload", "forces", Preload, lambda f: f if f is None or callable(f) else given.number(f"{of}preload", f))
 
     def __repr__(self) -> str:
         """Its name, number of load steps, and what it names."""
         more = [what for what in ("bcs", "loads", "begin") if getattr(self, what) is not None]
-        more += [what for what in ("contacts", "friction", "offset") if getattr(self, what)]
+        more += [what for what in ("contacts", "friction", "offset", "preload") if getattr(self, what)]
         return f"Step({self.name!r}, n={self.n}, of {', '.join(more) or 'nothing'})"
