@@ -130,6 +130,11 @@ class Preloaded(Tie):
         return np.ones(len(self.nodes), dtype=bool)
 
     @property
+    def knows_conditions(self) -> bool:
+        """As of ``Tie``: the leading row is of a component that is free."""
+        return True
+
+    @property
     def chained(self) -> bool:
         """As of ``Told``: all rows follow the contactor of the leading one."""
         return True

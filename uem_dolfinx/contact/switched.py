@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.checks import check_initial
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.state import FrictionState, PairState
+from uem_dolfinx.contact.tie import Tie
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import agree, agreed, reduced
 
 
 def switch_off(pair: Interface) -> None:
@@ -45,6 +47,55 @@ def switch_on(pair: Interface) -> None:
     pair.project()
     check_initial(pair)
     pair.activate_touching()
+
+
+def hold(pair: Interface, free: Bools, changed: Bools | None) -> None:
+    """Take other Dirichlet conditions (collective).
+
+    Args:
+        pair: that is told.
+        free: components of the owned nodes without condition ``(n_owned, gdim)``.
+        changed: local nodes whose conditions have changed since the last step ``(n_local,)``; None if it has been made with them.
+
+    Raises:
+        InputError: if its discretisation takes no other conditions, or they change at nodes whose tie knows of them.
+    """
+    config, own, tie = pair.config, pair.discretisation, pair.tie
+    tied = tie is not None and bool(reduced(config.comm, int(tie.tied.sum())))
+    with agreed(config.comm):
+        if not hasattr(own, "hold"):
+            raise InputError(
+                f"{pair.name}: its discretisation {type(own).__name__} has no method hold, and takes no other conditions: give it one, or "
+                "keep the conditions of all steps"
+            )
+    if tie is not None and tie.knows_conditions and tied and changed is not None:
+        _refuse_at_ties(tie, changed)
+    if tie is not None and tie.means is not None:
+        tie.means.hold(free)
+    own.hold(free)
+    if pair.friction is not None:
+        pair.friction.free = free[pair.nodes]
+    if tied and changed is None:
+        # its rows were made under those of the script's beginning
+        pair.from_checkpoint(pair.to_checkpoint())
+    settle(pair)
+
+
+def _refuse_at_ties(tie: Tie, changed: Bools) -> None:
+    """Raise if conditions have changed at local nodes ``(n_local,)`` that are tied, or followed by what is (collective)."""
+    config = tie.config
+    followed = tie.followed_by_ties()
+    here = changed[: config.n_owned, None].astype(float)
+    X = config.ask_owners(followed, np.column_stack([here, config.X[: config.n_owned]]))
+    at = np.concatenate([config.X[tie.nodes[tie.tied & changed[tie.nodes]]], X[X[:, 0] > 0, 1:]])
+    error = None
+    if len(at):
+        place = ", ".join(f"{x:.6g}" for x in at[0])
+        error = InputError(
+            f"{tie.name}: the node at ({place}) is tied, and a step changes its conditions: mortar and preloads expect the same in "
+            "all steps that it is tied in; keep them, or tie by coupling='node_to_surface'"
+        )
+    agree(config.comm, error)
 
 
 def settle(pair: Interface, memory: Any = None) -> None:

@@ -75,6 +75,7 @@ class Tie:
         reach: contactors that are tied at the start are no farther from the target, a length; None is a side of its facet.
 
     Attributes:
+        means: as given.
         rows: of what is tied; None before.
         tied: contactors that are united with the target in all components ``(n,)``.
         whole: whether no contactor is left for contact, on any rank.
@@ -95,7 +96,7 @@ class Tie:
     ):
         self.config, self.nodes, self.discretisation, self.target = config, nodes, discretisation, discretisation.target
         self.name, self.sliding, self.max_penetration = name, sliding, max_penetration
-        self._means, self._reach = means, reach
+        self.means, self._reach = means, reach
         self.rows: TiedRows | None = None
         self.tied: Bools = np.zeros(len(nodes), dtype=bool)
         self.whole = False
@@ -124,7 +125,7 @@ class Tie:
             SurfaceError: if there are none.
         """
         drag = 0.0 if state.friction is None else state.friction.tau
-        forces = state.lam[:, None] * projection.normal + drag if self._means else state.force
+        forces = state.lam[:, None] * projection.normal + drag if self.means else state.force
         self.at.x.array[:] = self.config.displacement.ravel()
         self._make(self._within_reach(state) if which is None else which, off)
         assert self.rows is not None
@@ -148,12 +149,21 @@ class Tie:
         self.rows, self.tied, self._here, self._lost, self.whole = None, np.zeros(len(self.nodes), dtype=bool), None, True, False
         self._left_out = np.zeros_like(self._left_out)
 
+    @property
+    def knows_conditions(self) -> bool:
+        """Whether its rows belong to the Dirichlet conditions that there were when they were made."""
+        return self.means is not None
+
+    def followed_by_ties(self) -> Ints:
+        """Global nodes that tied contactors follow, repeated or not ``(k,)`` (collective)."""
+        return np.zeros(0, np.int64) if self.rows is None else self._equations().followed
+
     def _within_reach(self, state: PairState) -> Bools:
         """Contactors near enough to the target to be tied ``(n,)`` (collective)."""
         p = self.target.project(self._points)
         reach = p.facet_size if self.target.n_nodes else self.max_penetration
         near = np.abs(p.gap) <= (reach if self._reach is None else self._reach)
-        return np.asarray(near if self._means else near & ~past_end(p, state, np.inf))
+        return np.asarray(near if self.means else near & ~past_end(p, state, np.inf))
 
     def _make(self, which: Bools, off: Bools) -> None:
         """Rows of contactors ``which (n,)`` where they were at the displacement ``at``, or are on a rigid target (collective)."""
@@ -162,11 +172,11 @@ class Tie:
             self._take_rows(to_surface(config, nodes, self.target, which), off)
             return
         with config.at(config.values_of(config.functions() | {"displacement": self.at})):
-            if self._means is not None:
-                self._means.let_go()
-                found = self._means.place(self._points, PairState.initial(len(nodes), config.gdim))
-                rows = to_means(self._means, found.rows, which, kept)
-                self._means.let_go()
+            if self.means is not None:
+                self.means.let_go()
+                found = self.means.place(self._points, PairState.initial(len(nodes), config.gdim))
+                rows = to_means(self.means, found.rows, which, kept)
+                self.means.let_go()
             else:
                 assert isinstance(self.target, MeshTarget)
                 rows = to_facets(config, nodes, self.target, self.target.project(self._points), which, kept)

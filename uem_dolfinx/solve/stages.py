@@ -17,6 +17,7 @@ from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.switched import (
     between,
     blended_friction,
+    hold,
     leave_friction,
     leave_preload,
     settle,
@@ -104,7 +105,7 @@ class Stage:
 
     Raises:
         CheckpointError: if the problem's state is one of another step.
-        InputError: if conditions change at nodes that are tied.
+        InputError: if conditions change at nodes that mortar ties.
     """
 
     def __init__(self, problem: UnitedProblem, step: Step):
@@ -154,8 +155,8 @@ class Stage:
         other = bool(reduced(problem.comm, bool(changed.any()), op=MPI.LOR))
         if fresh:
             problem.progress.carried = self._carried(acting, held & changed, left)
-        if other:
-            self._hold(changed)
+        for pair in problem.pairs if other else ():
+            hold(pair, bodies.free[: problem.config.n_owned], None if not fresh else problem.config.of(changed).any(axis=1))
         for part, on in parts:
             part.switch(on)
         for part in left if fresh else ():
@@ -169,30 +170,6 @@ class Stage:
             if problem.linear is not None and problem.progress.ahead == 0:
                 take_multipliers(problem)
             problem.system.take([contact.pair for contact in problem.contacts if contact.on], problem.linear)
-
-    def _hold(self, changed: Bools) -> None:
-        """Tell all pairs of other conditions, at the unknowns ``changed (n,)`` (collective)."""
-        problem = self._problem
-        config, free = problem.config, problem.bodies.free[: problem.config.n_owned]
-        nodes = config.of(changed)[: config.n_owned].any(axis=1)
-        for pair in problem.pairs:
-            with agreed(problem.comm):
-                hold = getattr(pair.discretisation, "hold", None)
-                if hold is None:
-                    raise InputError(
-                        f"{pair.name}: its discretisation {type(pair.discretisation).__name__} has no method hold, and takes no other "
-                        "conditions: give it one, or keep the conditions of its nodes"
-                    )
-                bad = pair.nodes[pair.tied & nodes[pair.nodes]]
-                if len(bad):
-                    raise InputError(
-                        f"{pair.name}: the contactor at {config.describe(int(bad[0]))} is tied, and a step changes its conditions: "
-                        "expected the same in all steps; keep them, or tie it by another surface"
-                    )
-            hold(free)
-            if pair.friction is not None:
-                pair.friction.free = free[pair.nodes]
-            settle(pair)
 
     # -- what is released ------------------------------------------------------------------------------------------------
 
