@@ -42,7 +42,8 @@ def state_of(problem: Any) -> State:
         state.numbers |= problem.progress.to_checkpoint(ramped)
         if ramped and problem.progress.ramp:
             config.fill(starts, problem.progress.start)
-            config.fill(carried, np.zeros(1) if problem.progress.carried is None else problem.progress.carried)
+            released = problem.progress.carried
+            config.fill(carried, np.zeros(len(problem.bodies.held)) if released is None else released)
         if problem.linear is not None:
             eq, nodal = problem.linear.equations, np.zeros((config.n_owned, config.gdim))
             np.add.at(nodal, eq.node, problem.linear.multipliers[:, None] * eq.direction)
