@@ -120,6 +120,11 @@ class Interface(Told):
             if self.friction is not None:
                 self.friction.replace(kinematics)
 
+    def stiffness_across(self, stiffness: Array | None) -> Array:
+        """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
+        assert stiffness is not None
+        return np.asarray(np.einsum("ng,ng->n", self.projection.normal**2, np.abs(stiffness[self.nodes])))
+
     @property
     def off(self) -> Bools:
         """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import UEMError
 from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.solve.newton import Iteration
 
 
 @dataclass(frozen=True)
@@ -62,3 +64,37 @@ def move_targets(problem: Any, motions: list[Motion | None]) -> None:
     for pair, motion in zip(problem.pairs, motions):
         if pair.target.motion is not motion:
             pair.target.motion = motion
+
+
+def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, bool]) -> list[Iteration]:
+    """Take the last step of a problem once more, and keep it in its place (collective).
+
+    Args:
+        problem: inside a loop over steps.
+        before: what the step began with.
+        led: where the ramp of Dirichlet values began, how far it went, and whether something led the load.
+
+    Raises:
+        UEMError: as of ``UnitedProblem.attempt``, after the step has been put back as it was.
+    """
+    start, fraction, arc = led
+    dynamics, now, moved, found = problem.dynamics, Memory.of(problem), problem.rigid_motions(), np.array(problem.u.x.array)
+    before.put_back(problem)
+    move_targets(problem, moved)
+    if arc:
+        # past a limit point the load alone would lead away
+        problem.u.x.array[:] = found
+    if dynamics is not None:
+        dynamics.begin(dynamics.dt)
+    try:
+        history: list[Iteration] = problem.attempt(start=start, fraction=fraction)
+    except UEMError:
+        now.put_back(problem)
+        raise
+    finally:
+        problem.led = led
+    problem.keep()
+    if dynamics is not None:
+        # which may have been rounded to a multiple of the step
+        dynamics.time = now.dynamics[0]
+    return history

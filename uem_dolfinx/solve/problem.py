@@ -150,8 +150,8 @@ class UnitedProblem:
             if not self.config.moves:
                 from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
 
-                beside = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
-                check_ties(self.config.gdim, contacts, equations, **beside)
+                others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
+                check_ties(self.config.gdim, contacts, equations, **others)
             self.materials = check_materials(materials, F, u)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
@@ -234,7 +234,7 @@ class UnitedProblem:
         from uem_dolfinx.solve.memory import Memory
 
         self._before = Memory.of(self)
-        self._led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
+        self.led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
         for contact in self.contacts:
             contact.begin()
         from uem_dolfinx.solve.settings import Settings
@@ -296,36 +296,12 @@ class UnitedProblem:
         """
         with self.progress.checking_signals(self.comm):
             if self.progress.inside and start is None and fraction == 1.0:
-                return self._solve_again()
+                from uem_dolfinx.solve.memory import take_again
+
+                return take_again(self, self._before, self.led)
             history = self.attempt(start=start, fraction=fraction)
             self.commit()
             return history
-
-    def _solve_again(self) -> list[Iteration]:
-        """Take the last step once more from the state that it began with, and commit it in its place (collective)."""
-        from uem_dolfinx.solve.memory import Memory, move_targets
-
-        led = start, fraction, arc = self._led
-        dynamics, now, moved, found = self.dynamics, Memory.of(self), self.rigid_motions(), np.array(self.u.x.array)
-        self._before.put_back(self)
-        move_targets(self, moved)
-        if arc:
-            # past a limit point the load alone would lead away
-            self.u.x.array[:] = found
-        if dynamics is not None:
-            dynamics.begin(dynamics.dt)
-        try:
-            history = self.attempt(start=start, fraction=fraction)
-        except UEMError:
-            now.put_back(self)
-            raise
-        finally:
-            self._led = led
-        self._keep()
-        if dynamics is not None:
-            # which may have been rounded to a multiple of the step
-            dynamics.time = now.dynamics[0]
-        return history
 
     def attempt(
         self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: ContactMethod | None = None
@@ -347,7 +323,7 @@ class UnitedProblem:
         """
         for pair in self.pairs:
             check_moved(pair)
-        self._led = start, fraction, along is not None
+        self.led = start, fraction, along is not None
         with agreed(self.comm):
             start = self.committed if start is None else given.vector("start", start, len(self.committed))
             fraction = given.number("fraction", fraction)
@@ -395,10 +371,11 @@ class UnitedProblem:
         from uem_dolfinx.solve.memory import Memory
 
         self._before = Memory.of(self)
-        self._keep()
+        self.keep()
         self.progress.steps += 1
 
-    def _keep(self) -> None:
+    def keep(self) -> None:
+        """Make the present state the committed one; what the step began with stays what it was (collective)."""
         self.committed = np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
         for material in self.materials:

@@ -91,7 +91,7 @@ class BodySystem:
             check_initial(pair)
             pair.activate_touching()
 
-    def take(self, pairs: Sequence[Interface], linear: UnitedRows | None) -> None:
+    def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
         """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
         self.pairs, self.linear, self._here = list(pairs), linear, None
         self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
@@ -201,11 +201,9 @@ class BodySystem:
             if moved:
                 for pair in pairs:
                     pair.place_again()
-            here = [(pair, self.bodies.rounding_at(pair.nodes)) for pair in pairs]
-            violated = count(
-                pairs,
-                [pair.violated(pair.gap, pair.traction, self._along(pair), least, 0.0, self._swept) for pair, least in here],
-            )
+            here = [(pair, pair.stiffness_across(bodies.stiffness), bodies.rounding_at(pair.nodes)) for pair in pairs]
+            found = [pair.violated(pair.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here]
+            violated = count(pairs, found)
             # one that is let go of falls, whatever the active set lacks
             unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
             wanting = not (at_rest and violated == 0 and not moved)
@@ -285,7 +283,7 @@ class BodySystem:
             moved = increment if sliding is None else increment + sliding
             violated = []
             for pair, gap, seen in zip(self.pairs, predicted, forces):
-                along = self._along(pair)
+                along = pair.stiffness_across(self.bodies.stiffness)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
             if self._adrift:
@@ -334,11 +332,6 @@ class BodySystem:
         every = F + (self.bodies.residual - self.residual())
         more = None if self.linear is None else self.linear.forces(self._multipliers)
         return self.floating.slide(*unbalanced(self.pairs, every, forces, more))
-
-    def _along(self, pair: Interface) -> Array:
-        """Stiffness of the pair's contactors along their normals ``(n,)``."""
-        assert self.bodies.stiffness is not None
-        return np.asarray(np.einsum("ng,ng->n", pair.projection.normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
