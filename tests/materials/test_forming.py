@@ -181,8 +181,9 @@ class Thrown:
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"kind": "plane_stress"}, ("kind = 'plane_stress'", "'3d' or 'plane_strain'")),
+        ({"kind": "plane_stress"}, ("kind = 'plane_stress'", "'3d', 'plane_strain' or 'axisymmetric'")),
         ({"kind": "3d"}, ("kind = '3d'", "2 components")),
+        ({"kind": "axisymmetric"}, ("kind = 'axisymmetric'", "uem.axisymmetric(mesh)")),
         ({"E": 0.0}, ("E = 0.0", "a positive number")),
         ({"nu": 0.5}, ("nu = 0.5", "between -1 and 0.5")),
         ({"yield_stress": -1.0}, ("yield_stress = -1.0", "a positive number, or infinity")),

@@ -89,7 +89,7 @@ def forming(comm: MPI.Comm) -> Ramps:
     """A soft body flattened by a rigid plane with friction."""
     b = blocks(comm, "quadrilateral", 2, 1, gap=1.0)
     metal, press = (
-        uem.FinitePlasticity(b.u, 100.0, 0.3, [(0.0, 1.0), (0.1, 2.0)], 1.0, kind="plane_strain"),
+        uem.FinitePlasticity(b.u, 100.0, 0.3, [(0.0, 1.0), (0.1, 2.0)], 1.0, kinematic_hardening=3.0, kind="plane_strain"),
         uem.RigidPlane([0, 0], [0, -1.0]),
     )
     contact = uem.Contact(b.low, press, friction=0.1)

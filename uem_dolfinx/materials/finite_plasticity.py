@@ -12,6 +12,7 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.geometry.axisymmetry import displacement_gradient
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
 from uem_dolfinx.materials.elastic import POISSON
@@ -20,11 +21,15 @@ from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return, to_com
 from uem_dolfinx.materials.von_mises import VonMises
 
 #: Components of F that vary in each kind, by row and column.
-VARYING = {"3d": np.divmod(np.arange(9), 3), "plane_strain": np.divmod(np.array([0, 1, 3, 4]), 3)}
+VARYING = {
+    "3d": np.divmod(np.arange(9), 3),
+    "plane_strain": np.divmod(np.array([0, 1, 3, 4]), 3),
+    "axisymmetric": np.divmod(np.array([0, 1, 3, 4, 8]), 3),
+}
 
 
 class FinitePlasticity(VonMises):
-    """Elasto-plasticity of von Mises at strains and rotations of any size, as in metal forming, with isotropic hardening.
+    """Elasto-plasticity of von Mises at strains and rotations of any size, as in metal forming, with isotropic and kinematic hardening.
 
         F = F_e F_p,    tau = kappa ln(J) 1 + 2 mu dev(ln V_e),    q(tau) <= yield stress at peeq
 
@@ -32,8 +37,17 @@ class FinitePlasticity(VonMises):
     ``det F_p = 1`` to rounding, so that the radial return of small strains acts on the logarithmic strain; the result is hyperelastic
     in ``F_e``, and no rigid rotation changes it. In small strains it is ``VonMises``, to second order in the strain.
 
+    With kinematic hardening the yield surface has its centre at a back stress, in the axes of F_p and V_e
+
+        q(2 mu dev(ln U_e) - 2/3 kinematic_hardening ln V_p) <= yield stress at peeq
+
+    with ``U_e^2 = F_e^T F_e`` and ``V_p^2 = F_p F_p^T``: Prager's rule, derived from an energy of ``V_p``. No plastic spin is assumed,
+    and beside ``peeq`` the plastic strain is all that the law remembers. In simple shear the back stress grows up to a shear of 3
+    and falls slowly beyond, as the logarithm of the stretch does, without oscillations.
+
     Volumes are treated as there, so that the same cells do not lock: what resists their change is integrated by a rule of its own,
-    with one point in quadrilaterals and hexahedra of degree 1. That part is an energy in ``J``, and the tangent is symmetric.
+    with one point in quadrilaterals and hexahedra of degree 1; there, in axisymmetry, ``J`` is the ratio of the volumes of the cell's
+    rings. That part is an energy in ``J``, and the tangent is symmetric.
 
     Args:
         u: displacement, a Function of a vector Lagrange space.
@@ -42,7 +56,8 @@ class FinitePlasticity(VonMises):
         yield_stress: in uniaxial tension, force per present area times J; infinite where the body is elastic. Or a table: pairs
             (equivalent plastic strain, yield stress), the strains from 0 upwards, with straight lines between.
         hardening: increase of the yield stress per equivalent plastic strain, with a table beyond its last point; or ``Voce``.
-        kind: ``"3d"`` or ``"plane_strain"``.
+        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none.
+        kind: ``"3d"``, ``"plane_strain"``, or ``"axisymmetric"`` on a mesh that has been declared so.
         cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
         quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
 
@@ -65,11 +80,13 @@ class FinitePlasticity(VonMises):
         yield_stress: Any,
         hardening: Any = 0.0,
         *,
+        kinematic_hardening: Any = 0.0,
         kind: str = "3d",
         cells: Part | None = None,
         quadrature_degree: int | None = None,
     ):
         given.word("kind", kind, tuple(VARYING))
+        self._kinematic_hardening = kinematic_hardening
         super().__init__(u, E, nu, yield_stress, hardening, kind=kind, cells=cells, quadrature_degree=quadrature_degree)
 
     def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
@@ -77,6 +94,7 @@ class FinitePlasticity(VonMises):
         E, nu, count = self._cellwise("E", E, given.POSITIVE), self._cellwise("nu", nu, POISSON), len(self._points.points)
         self._E, self._nu, self._bulk = np.repeat(E, count), np.repeat(nu, count), E / (3 * (1 - 2 * nu))
         self._mu = self._E / (2 * (1 + self._nu))
+        self._modulus = np.repeat(self._cellwise("kinematic_hardening", self._kinematic_hardening, given.NOT_NEGATIVE), count)
         #: Outcome of the last update.
         self._trial: Flowed
         #: Yield stress over peeq.
@@ -93,7 +111,7 @@ class FinitePlasticity(VonMises):
     @property
     def parameters(self) -> dict[str, Array]:
         """Parameters at this rank's quadrature points ``(n_points,)``, and those of its yield curve, by name."""
-        return {"E": self._E, "nu": self._nu, **self._curve.parameters}
+        return {"E": self._E, "nu": self._nu, "kinematic_hardening": self._modulus, **self._curve.parameters}
 
     def _create_functions(self) -> None:
         """Functions at the quadrature points, zero outside of this material's cells."""
@@ -107,26 +125,53 @@ class FinitePlasticity(VonMises):
     def _compile(self) -> None:
         """Prepare the displacement's gradient at the points of stress, and ln J at those of pressure."""
         self._strain = self._points.compile(self._components(self.u))
-        self._volume_change = self._pressure_points.compile(ufl.ln(ufl.det(self._deformation())))
+        self._volume_change = self._pressure_points.compile(ufl.ln(self._volume_ratio()))
 
     def _gradient(self, w: Any) -> Expr:
         """Gradient of a displacement ``(3, 3)``."""
-        G = ufl.grad(w)
-        return G if self.kind == "3d" else ufl.as_matrix([[G[0, 0], G[0, 1], 0], [G[1, 0], G[1, 1], 0], [0, 0, 0]])
+        G = displacement_gradient(w)
+        return ufl.as_matrix([[G[0, 0], G[0, 1], 0], [G[1, 0], G[1, 1], 0], [0, 0, 0]]) if self.kind == "plane_strain" else G
 
     def _components(self, w: Any) -> Expr:
         """Those of a gradient that vary."""
         G = self._gradient(w)
         return ufl.as_vector([G[i, j] for i, j in np.transpose(VARYING[self.kind]).tolist()])
 
-    def _deformation(self) -> Expr:
-        """F ``(3, 3)``."""
-        return ufl.Identity(3) + self._gradient(self.u)
+    @property
+    def _of_rings(self) -> bool:
+        """Whether changes of volume are those of the rings that cells stand for, each told at its cell's centre."""
+        return self.kind == "axisymmetric" and not self._pressure_points.degree
+
+    def _volume_ratio(self) -> Expr:
+        """J; of rings, present over reference volume, exact if the cell is a parallelogram.
+
+        A ring's volume is the integral of ``2 pi r`` and the area. Over such a cell both ``r`` and the ratio of areas are linear in
+        each coordinate, and the mean of their product is that at the centre and the product of their slopes along the sides over 12.
+        """
+        F = ufl.Identity(3) + self._gradient(self.u)
+        if not self._of_rings:
+            return ufl.det(F)
+        r, area = ufl.SpatialCoordinate(self.mesh)[0], F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+        return area * F[2, 2] + self._mean_of_slopes(area, r + self.u[0]) / r
+
+    def _volume_variation(self, v: Any) -> Expr:
+        """Derivative of ``ln J`` along ``v``."""
+        F, G = ufl.Identity(3) + self._gradient(self.u), self._gradient(v)
+        if not self._of_rings:
+            return ufl.inner(ufl.inv(F).T, G)
+        r, area = ufl.SpatialCoordinate(self.mesh)[0], F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+        grown = F[1, 1] * G[0, 0] + F[0, 0] * G[1, 1] - F[1, 0] * G[0, 1] - F[0, 1] * G[1, 0]
+        slopes = self._mean_of_slopes(grown, r + self.u[0]) + self._mean_of_slopes(area, v[0])
+        return (grown * F[2, 2] + area * G[2, 2] + slopes / r) / self._volume_ratio()
+
+    def _mean_of_slopes(self, a: Expr, b: Expr) -> Expr:
+        """What the mean over a parallelogram of a product has beyond the product of the means."""
+        A = ufl.Jacobian(self.mesh)
+        return ufl.dot(ufl.dot(ufl.grad(a), A), ufl.dot(ufl.grad(b), A)) / 12
 
     def residual(self, v: Any) -> ufl.Form:
         """Internal virtual work of the material's cells; see ``VonMises.residual``."""
-        F = self._deformation()
-        pressed = self._kappa * ufl.ln(ufl.det(F)) * ufl.inner(ufl.inv(F).T, self._gradient(v)) * self._pressure_points.dx
+        pressed = self._kappa * ufl.ln(self._volume_ratio()) * self._volume_variation(v) * self._pressure_points.dx
         return ufl.dot(self._piola, self._components(v)) * self._points.dx + pressed
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
@@ -147,7 +192,7 @@ class FinitePlasticity(VonMises):
                 gradient = np.zeros((len(values), 3, 3))
                 gradient[:, varying[0], varying[1]] = values
                 before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
-                flowed = logarithmic_return(gradient, *before, self._mu, self._curve, varying)
+                flowed = self._return(gradient, *before)
                 logarithm = self._volume_changes() @ self._spread.T
                 stress = flowed.stress.copy()
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
@@ -159,14 +204,25 @@ class FinitePlasticity(VonMises):
             self._points.write(self._upper, flowed.tangent[:, rows, columns])
             self._points.write(self.stress, stress)
 
+    def _return(self, gradient: Array, plastic_strain: Array, peeq: Array) -> Flowed:
+        varying = VARYING[self.kind]
+        if not self._modulus.any():
+            return logarithmic_return(gradient, plastic_strain, peeq, self._mu, self._curve, varying)
+        from uem_dolfinx.materials.back_stress import kinematic_return
+
+        return kinematic_return(gradient, plastic_strain, peeq, self._mu, self._curve, self._modulus, varying)
+
     def energy(self) -> float:
-        """Elastic energy stored at the present displacement (collective)."""
+        """Elastic energy stored at the present displacement, and that of the back stress (collective)."""
         self.update()
         pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
         return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
 
     def dissipation(self) -> float:
-        """Plastic work done since the start, as committed, what hardening stores of it included (collective)."""
+        """Plastic work done since the start, as committed, less that against the back stress (collective).
+
+        What isotropic hardening stores is part of it; the work against the back stress comes back, and is part of ``energy``.
+        """
         return self._points.integrate(self._curve.work(self._points.read(self.peeq)[:, 0]))
 
     def _plastic_strains(self) -> Array:

@@ -105,13 +105,13 @@ def _principal_tangent(change: Array, d: Array, s: Array, a: Array, c: Array, ba
         (a - s)[:, None] * own - a / 3 * own.sum(axis=0) - d[:, None] * (c * np.einsum("an,ain->in", d, own))
     )
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        by_j, by_i = (a / 2 * _logarithm_slope((change[k] - change[m]) / (1 + change[m])) for k, m in ((i, j), (j, i)))
+        by_j, by_i = (a / 2 * logarithm_slope((change[k] - change[m]) / (1 + change[m])) for k, m in ((i, j), (j, i)))
         out[i, j] = by_j * basis[i, j] + (by_i - s[i]) * basis[j, i]
         out[j, i] = by_i * basis[j, i] + (by_i - s[i]) * basis[i, j]
     return out
 
 
-def _logarithm_slope(r: Array) -> Array:
+def logarithm_slope(r: Array) -> Array:
     """``log(1 + r) / r``, 1 at 0: of a ratio 1 + r, so that there is no difference of equals."""
     same = r == 0
     return np.where(same, 1.0, np.log1p(r) / np.where(same, 1.0, r))

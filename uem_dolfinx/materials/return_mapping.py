@@ -11,11 +11,11 @@ from uem_dolfinx.arrays import Array
 #: A stress outside the yield surface by no more than this part of the yield stress is on it.
 #: [convention; yield stress; test_thresholds_motion.py::test_on_the_yield_surface]
 ON_SURFACE = 1e-10
-#: Returns that iterate, in plane stress and to saturating curves, end with a Newton step below this part of their unknown; the next one
-#: would be its square.
+#: Returns that iterate, in plane stress, to saturating curves and around a back stress in finite strain, end with a Newton step below this
+#: part of their unknown; the next one would be its square.
 #: [bound; consistency parameter; -]
 RETURNED = 1e-10
-#: Those steps; they come from one side and are quadratic, and random states took 7 at most.
+#: Those steps; they are quadratic, and random states took 7 at most, with a back stress and elastic strains of one half 18.
 #: [bound; steps; -]
 MAX_STEPS = 50
 

@@ -1,0 +1,235 @@
+"""Return in finite strain with kinematic hardening, whose back stress is elastic in the plastic strain, at many points at once.
+
+[Ortiz and Stainier, Computer Methods in Applied Mechanics and Engineering 171 (1999) 419-444, for the incremental potential; Bhatia,
+Positive Definite Matrices, ch. 6, for the geometry]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.materials.hardening import Linear, YieldCurve
+from uem_dolfinx.materials.logarithmic import (
+    SYMMETRIC_COMPONENTS,
+    Flowed,
+    logarithm_slope,
+    logarithmic_return,
+    to_components,
+    to_tensors,
+)
+from uem_dolfinx.materials.return_mapping import MAX_STEPS, ON_SURFACE, RETURNED
+
+
+def kinematic_return(
+    gradient: Array, plastic_strain: Array, peeq: Array, mu: Array, curve: YieldCurve, modulus: Array, components: Sequence[Ints]
+) -> Flowed:
+    """Return to the yield surface around the back stress ``2/3 modulus ln(V_p)``, V_p the plastic stretch.
+
+    The plastic strain is the one at which
+
+        mu |dev ln(V_e)|^2 + 1/3 modulus |ln(V_p)|^2 + integral of the yield stress over peeq
+
+    is least. With ``C_p = F_p^T F_p`` these are distances of C_p from C, from 1 and from its committed value in the geometry of positive
+    tensors, in which such a sum is convex. It depends on C and C_p alone, and so neither on rotations nor on how F_p is turned. Where
+    all principal axes agree it is the radial return.
+
+    Args:
+        gradient: of the displacement ``(n, 3, 3)``.
+        plastic_strain: committed ``(n, k)``, as in ``Flowed``.
+        peeq: committed ``(n,)``.
+        mu: shear modulus ``(n,)``.
+        curve: yield stress over ``peeq``.
+        modulus: increase of the back stress in uniaxial tension per plastic strain ``(n,)``.
+        components: rows and columns of F that may vary, each ``(c,)``.
+
+    Returns:
+        As ``logarithmic_return``, NaN also where no return was found; ``energy`` includes that of the back stress.
+    """
+    F, one = gradient + np.eye(3), np.eye(3)
+    C, committed = F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain)
+    i = np.flatnonzero(np.isfinite(C).all(axis=(1, 2)))
+    i = i[np.linalg.det(F[i]) > 0]
+    points = _Points(i, C[i], committed[i], mu[i], modulus[i], peeq[i])
+    # F_p^-1 but for a rotation, on which nothing depends
+    L = np.linalg.cholesky(committed[i])
+    driving = points.driving(L)
+    q = np.sqrt(1.5) * np.linalg.norm(driving, axis=(1, 2))
+    beyond = np.flatnonzero(q > (1 + ON_SURFACE) * curve.at(points.peeq, i)[0])
+    points, q = points.some(beyond), q[beyond]
+    dp = curve.increment(q, points.peeq, 3 * points.mu + points.modulus, points.i)
+    L = _settled(points, curve, L[beyond] @ _exponential(-1.5 * (dp / q)[:, None, None] * driving[beyond]))
+    plastic, new, i = plastic_strain.copy(), peeq.copy(), points.i
+    plastic[i] = to_components((one - L @ L.transpose(0, 2, 1)) / 2, plastic.shape[1])
+    found = np.flatnonzero(np.isfinite(L).all(axis=(1, 2)))
+    points, i, L = points.some(found), i[found], L[found]
+    step = points.step(L, curve)
+    new[i] = step.peeq
+    flowed = logarithmic_return(gradient, plastic, new, mu, Linear(np.full(len(mu), np.inf), np.zeros(len(mu))), components)
+    mixed = points.mixed(L, F[i], components)
+    flowed.tangent[i] -= mixed.transpose(0, 2, 1) @ np.linalg.solve(step.hessian, mixed)
+    strains = np.log1p(-2 * np.linalg.eigvalsh(to_tensors(np.where(np.isfinite(plastic), plastic, 0.0)))) / 2
+    return replace(flowed, energy=flowed.energy + modulus / 3 * (strains**2).sum(axis=1))
+
+
+def _settled(points: _Points, curve: YieldCurve, L: Array) -> Array:
+    """Factors of ``C_p^-1`` where the potential is least, by Newton's method; NaN where it has not come to an end ``(m, 3, 3)``.
+
+    Steps end below their part of the strains, or where they are rounding: so small that the next one must be far smaller, and it is not.
+    """
+    L, left, last = L.copy(), np.arange(len(L)), np.full(len(L), np.inf)
+    for _ in range(MAX_STEPS):
+        if not len(left):
+            break
+        step = points.some(left).step(L[left], curve)
+        S = -np.asarray(np.linalg.solve(step.hessian, step.slope[:, :, None])[:, :, 0], dtype=np.float64)
+        L[left] = L[left] @ _exponential(-to_tensors(S))
+        length, lost = np.linalg.norm(S, axis=1), ~np.isfinite(L[left]).all(axis=(1, 2))
+        L[left[lost]] = np.nan
+        rounding = (length >= last[left]) & (length <= RETURNED**0.5 * step.size)
+        last[left] = length
+        left = left[~((length <= RETURNED * step.size) | rounding | lost)]
+    L[left] = np.nan
+    return L
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Potential of a step in one state of flow, at m points.
+
+    Attributes:
+        slope: its derivative by further flow ``(m, 6)``.
+        hessian: its second one, regular by what resists a change of volume ``(m, 6, 6)``.
+        peeq: equivalent plastic strain ``(m,)``.
+        size: of the strains ``(m,)``.
+    """
+
+    slope: Array
+    hessian: Array
+    peeq: Array
+    size: Array
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The potential of a step at m points as a function of a factor L of ``C_p^-1 = L L^T``.
+
+    Flow by a deviator S takes L to ``L exp(-S)``. It changes the elastic strain ``E = ln(L^T C L) / 2`` by ``-K(E) S``, the plastic
+    strain ``A = ln(V_p)`` by ``K(A) S`` and that of the step, D, by ``K(D) S``. In the principal axes of a strain e component ij of
+    ``K(e) S`` is ``h coth(h) S_ij`` with ``h = e_i - e_j``.
+
+    Attributes:
+        i: their numbers in the yield curve ``(m,)``.
+        C: right Cauchy-Green tensor ``(m, 3, 3)``.
+        committed: ``C_p^-1`` ``(m, 3, 3)``.
+        mu, modulus, peeq: ``(m,)``, the last one as committed.
+    """
+
+    i: Ints
+    C: Array
+    committed: Array
+    mu: Array
+    modulus: Array
+    peeq: Array
+
+    def some(self, k: Ints) -> _Points:
+        """Those with these numbers."""
+        return _Points(*(getattr(self, field.name)[k] for field in fields(self)))
+
+    def _elastic(self, L: Array) -> _Strain:
+        return _Strain.of(L.transpose(0, 2, 1) @ self.C @ L)
+
+    def _plastic(self, L: Array, since: Array) -> _Strain:
+        """What has flowed since ``C_p^-1`` was this."""
+        back = np.asarray(np.linalg.inv(L), dtype=np.float64)
+        return _Strain.of(back @ since @ back.transpose(0, 2, 1))
+
+    def driving(self, L: Array) -> Array:
+        """Deviator of the stress less the back stress ``(m, 3, 3)``."""
+        E, A = self._elastic(L), self._plastic(L, np.eye(3))
+        return 2 * self.mu[:, None, None] * _deviator(E.tensor) - 2 / 3 * self.modulus[:, None, None] * A.tensor
+
+    def step(self, L: Array, curve: YieldCurve) -> _Step:
+        """Its derivatives by flow from L."""
+        E, A, D = self._elastic(L), self._plastic(L, np.eye(3)), self._plastic(L, self.committed)
+        elastic, plastic, flow = (to_components(strain.tensor, 6) for strain in (E, A, D))
+        length = np.linalg.norm(flow, axis=1)
+        peeq = self.peeq + np.sqrt(2 / 3) * length
+        stress, hardening = curve.at(peeq, self.i)
+        along, force = flow / length[:, None], np.sqrt(2 / 3) * stress
+        stiff, back_stiff = 2 * self.mu, 2 / 3 * self.modulus
+        slope = _NO_VOLUME @ (back_stiff[:, None] * plastic - stiff[:, None] * elastic + force[:, None] * along).T
+        line = along[:, :, None] * along[:, None, :]
+        hessian = stiff[:, None, None] * (_NO_VOLUME @ E.curvature @ _NO_VOLUME + _VOLUME)
+        hessian += back_stiff[:, None, None] * A.curvature + (force / length)[:, None, None] * (D.curvature - line)
+        hessian += (2 / 3 * hardening)[:, None, None] * line
+        return _Step(slope.T, hessian, peeq, np.linalg.norm(elastic, axis=1) + length)
+
+    def mixed(self, L: Array, F: Array, components: Sequence[Ints]) -> Array:
+        """Derivative of the slope by components of F ``(m, 6, c)``."""
+        E, (rows, columns) = self._elastic(L), components
+        turned = L @ E.axes
+        # Q^T dE Q with dE that of the elastic strain, by each component
+        there, here = (F @ turned)[:, rows].transpose(1, 0, 2), turned[:, columns].transpose(1, 0, 2)
+        change = there[..., :, None] * here[..., None, :]
+        change = E.divided * (change + change.swapaxes(-1, -2)) / 2
+        change = E.axes @ change @ E.axes.transpose(0, 2, 1)
+        by = to_components(change.reshape(-1, 3, 3), 6).reshape(len(components[0]), -1, 6)
+        return -2 * self.mu[:, None, None] * (_NO_VOLUME @ by.transpose(1, 2, 0))
+
+
+@dataclass(frozen=True)
+class _Strain:
+    """Half the logarithm of positive tensors: eigenvalues of these, of it, and the axes, ``(m, 3)``, ``(m, 3)`` and ``(m, 3, 3)``."""
+
+    squares: Array
+    values: Array
+    axes: Array
+
+    @staticmethod
+    def of(A: Array) -> _Strain:
+        """Of a tensor ``(m, 3, 3)``."""
+        squares, axes = np.linalg.eigh(A)
+        return _Strain(squares, np.log(squares) / 2, axes)
+
+    @property
+    def tensor(self) -> Array:
+        """Itself ``(m, 3, 3)``."""
+        return (self.axes * self.values[:, None, :]) @ self.axes.transpose(0, 2, 1)
+
+    @property
+    def divided(self) -> Array:
+        """Divided differences ``(ln b_i - ln b_j) / (b_i - b_j)`` of the tensor's eigenvalues ``(m, 3, 3)``."""
+        of, by = self.squares[:, :, None], self.squares[:, None, :]
+        return logarithm_slope((of - by) / by) / by
+
+    @property
+    def curvature(self) -> Array:
+        """K, see ``_Points`` ``(m, 6, 6)``."""
+        rows, columns = SYMMETRIC_COMPONENTS[6]
+        h = self.values[:, rows] - self.values[:, columns]
+        weights = np.where(h == 0, 1.0, h / np.tanh(np.where(h == 0, 1.0, h)))
+        pairs = self.axes[:, :, rows].transpose(2, 0, 1)[..., :, None] * self.axes[:, :, columns].transpose(2, 0, 1)[..., None, :]
+        pairs = (pairs + pairs.swapaxes(-1, -2)) / np.where(np.equal(rows, columns), 2.0, 2**0.5)[:, None, None, None]
+        basis = to_components(pairs.reshape(-1, 3, 3), 6).reshape(6, -1, 6).transpose(1, 2, 0)
+        return (basis * weights[:, None, :]) @ basis.transpose(0, 2, 1)
+
+
+#: Projections of the components of symmetric tensors onto the volume's part and onto deviators.
+#: [format; components; -]
+_VOLUME = np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]) / 3
+_NO_VOLUME = np.eye(6) - _VOLUME
+
+
+def _deviator(A: Array) -> Array:
+    return A - np.trace(A, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+
+
+def _exponential(A: Array) -> Array:
+    """Of symmetric tensors ``(m, 3, 3)``; NaN where they are not finite."""
+    sound = np.isfinite(A).all(axis=(1, 2), keepdims=True)
+    values, axes = np.linalg.eigh(np.where(sound, A, 0.0))
+    return np.where(sound, (axes * np.exp(values)[:, None, :]) @ axes.transpose(0, 2, 1), np.nan)
