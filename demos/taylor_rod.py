@@ -3,10 +3,11 @@
 mpirun -n 2 python3 demos/taylor_rod.py --plot taylor_rod.png
 
 Options:
-    n: cells along each side of the three blocks of the quarter section
+    n: cells along half of the radius
     layers: cells along the rod
     dt: time step in microseconds
     end: end of the run in microseconds
+    kind: a quarter in 3D, or half of the section of a body of revolution
     rho_inf: part of the fastest motions that a time step keeps, 0 to 1
     contactors: contactors with their mass, or without
 """
@@ -23,7 +24,8 @@ Options:
 # The wall is imposed in two ways. By contact the foot may leave it: its rim, thrown outwards, lifts off and curls up. Held by
 # Dirichlet conditions the foot stays flat. Here contactors keep their mass, as they do in the codes compared, and the touch itself
 # gives some energy to the rod; with `--contactors massless` it does not, steps are cut at first, and the rim comes out 8 % too wide.
-# The rule of time integration damps what the steps do not resolve. A quarter is modelled with hexahedra.
+# The rule of time integration damps what the steps do not resolve. A quarter is modelled with hexahedra, or half of the section with
+# quadrilaterals by `--kind axisymmetric`.
 
 # %%
 import common
@@ -41,6 +43,7 @@ args = common.arguments(
     dt=1.0,
     end=80.0,
     rho_inf=0.3,
+    kind=("3d", "axisymmetric"),
     contactors=("massy", "massless"),
     coupling=("node_to_surface", "mortar"),
 )
@@ -57,21 +60,29 @@ PUBLISHED = {"length": 21.45, "foot": 7.1}
 # %%
 def impact(wall: str) -> tuple[dict[str, float], np.ndarray, uem.EnergyBook]:
     """The figures measured, the outline of the section at the end ``(n, 2)``, and the energies."""
-    mesh, tags = uem.read_gmsh(
-        common.MESHES / "rod.geo", comm, gdim=3, parameters={"R": R, "L": L, "n": args.n, "layers": args.layers}
-    )
-    V = uem.function_space(mesh, 1, (3,))
+    if args.kind == "3d":
+        parameters = {"R": R, "L": L, "n": args.n, "layers": args.layers}
+        mesh, tags = uem.read_gmsh(common.MESHES / "rod.geo", comm, gdim=3, parameters=parameters)
+        foot, held = tags["foot"], [tags["on_x"], tags["on_y"]]
+    else:
+        parameters = {"W": R, "H": L, "n_w": 2 * args.n, "n_h": args.layers}
+        mesh, tags = uem.read_gmsh(common.MESHES / "billet.geo", comm, gdim=2, parameters=parameters)
+        uem.axisymmetric(mesh)
+        foot, held = tags["middle"], [tags["axis"]]
+    gdim = mesh.geometry.dim
+    upwards = np.eye(gdim)[-1]
+    V = uem.function_space(mesh, 1, (gdim,))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
-    copper = uem.FinitePlasticity(u, E, nu, Y, hardening)
-    bcs = [uem.dirichlet(V, tags["on_x"], 0), uem.dirichlet(V, tags["on_y"], 1)]
+    copper = uem.FinitePlasticity(u, E, nu, Y, hardening, kind=args.kind)
+    bcs = [uem.dirichlet(V, tag, component) for component, tag in enumerate(held)]
     contacts = []
     if wall == "contact":
-        contacts = [uem.Contact(tags["foot"], uem.RigidPlane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]), coupling=args.coupling)]
+        contacts = [uem.Contact(foot, uem.RigidPlane(0 * upwards, upwards), coupling=args.coupling)]
     else:
-        bcs.append(uem.dirichlet(V, tags["foot"], 2))
+        bcs.append(uem.dirichlet(V, foot, gdim - 1))
     dynamics = uem.Dynamics(
         uem.consistent_mass(V, rho),
-        velocity=(0.0, 0.0, -speed),
+        velocity=-speed * upwards,
         scheme=uem.generalised_alpha(args.rho_inf),
         contactors=args.contactors,
     )
@@ -94,15 +105,16 @@ def impact(wall: str) -> tuple[dict[str, float], np.ndarray, uem.EnergyBook]:
             opened.close()
     config = problem.config
     X, x = config.X[: config.n_owned], config.x[: config.n_owned]
-    r, z = np.hypot(X[:, 0], X[:, 1]), X[:, 2]
+    # radius and height, before and now, and which nodes are of the section y = 0
+    r, z = np.linalg.norm(X[:, :-1], axis=1), X[:, -1]
+    radii, heights, section = np.linalg.norm(x[:, :-1], axis=1), x[:, -1], np.abs(X[:, 1]) < 1e-9 if gdim == 3 else r > -1
     length, radius, peeq = (
-        float(max(comm.allgather(values.max(initial=0.0))))
-        for values in (x[:, 2], np.hypot(x[:, 0], x[:, 1]), copper.peeq.x.array)
+        float(max(comm.allgather(values.max(initial=0.0)))) for values in (heights, radii, copper.peeq.x.array)
     )
     # along the foot, up the side and back along the rear
     way = np.where(z < 1e-9, r, np.where(z > L - 1e-9, 2 * R + L - r, R + z))
-    outer = (np.abs(X[:, 1]) < 1e-9) & ((z < 1e-9) | (z > L - 1e-9) | (r > R - 1e-9))
-    outline = np.concatenate(comm.allgather(np.column_stack([way, x[:, 0], x[:, 2]])[outer]))
+    outer = section & ((z < 1e-9) | (z > L - 1e-9) | (r > R - 1e-9))
+    outline = np.concatenate(comm.allgather(np.column_stack([way, radii, heights])[outer]))
     outline = outline[outline[:, 0].argsort(), 1:]
     first, last = book.rows[0], book.rows[-1]
     figures = {

@@ -6,6 +6,7 @@ Options:
     n: cells along half of the height; half of the width has three times as many
     reduction: relative reduction of the billet's height
     hardening: increase of the yield stress per equivalent plastic strain
+    kind: a long billet in plane strain, or a disc
 """
 
 # %% [markdown]
@@ -19,8 +20,12 @@ Options:
 #
 #     p = 2/sqrt(3) Y exp(2 mu (b/2 - x) / h),    mean p = 2/sqrt(3) Y (exp(q) - 1) / q,    q = mu b / h,
 #
-# where the width b grows as the height h shrinks. It knows nothing of the shear beside the tools and of bulging sides, and is good to
-# some per cent where the billet is wider than high. With `--hardening` the mean strain ln(h0 / h) tells the yield stress.
+# where the width b grows as the height h shrinks. `--kind axisymmetric` makes the billet a disc of the same section, for which
+#
+#     p = Y exp(2 mu (a - r) / h),    mean p = 2 Y (exp(q) - 1 - q) / q^2,    q = 2 mu a / h
+#
+# with the radius a. The method knows nothing of the shear beside the tools and of bulging sides, and is good to some per cent where the
+# billet is wider than high. With `--hardening` the mean strain ln(h0 / h) tells the yield stress.
 
 # %%
 import common
@@ -32,7 +37,8 @@ from dolfinx import fem
 import uem_dolfinx as uem
 
 args = common.arguments(
-    __doc__, mu=0.1, n=6, steps=60, reduction=0.5, hardening=0.0, coupling=("node_to_surface", "mortar")
+    __doc__, mu=0.1, n=6, steps=60, reduction=0.5, hardening=0.0, kind=("plane_strain", "axisymmetric"),
+    coupling=("node_to_surface", "mortar"),
 )  # fmt: skip
 E, nu, Y, width, height = 500.0, 0.3, 1.0, 2.0, 1.0
 
@@ -45,9 +51,12 @@ E, nu, Y, width, height = 500.0, 0.3, 1.0, 2.0, 1.0
 mesh, tags = uem.read_gmsh(
     common.MESHES / "billet.geo", comm, gdim=2, parameters={"W": width / 2, "H": height / 2, "n_w": 3 * args.n, "n_h": args.n}
 )
+disc = args.kind == "axisymmetric"
+if disc:
+    uem.axisymmetric(mesh)
 V = uem.function_space(mesh, 1, (2,))
 u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
-metal = uem.FinitePlasticity(u, E, nu, Y, args.hardening, kind="plane_strain")
+metal = uem.FinitePlasticity(u, E, nu, Y, args.hardening, kind=args.kind)
 tool = uem.RigidPlane([0.0, height / 2], [0.0, -1.0])
 contact = uem.Contact(contactor=[tags["face"], tags["side"]], target=tool, friction=args.mu, coupling=args.coupling)
 problem = uem.UnitedProblem(
@@ -64,17 +73,25 @@ problem = uem.UnitedProblem(
 
 # %% [markdown]
 # ## The force
-# Per length of the whole billet.
+# Of the whole billet, per length in plane strain.
 
 
 # %%
+# the model is half of the width, or all of the disc; strains, and stresses in flow, over those of uniaxial compression
+wide, strain = (1, 1.0) if disc else (2, 2 / 3**0.5)
+
+
 def slab(reduction: float) -> float:
     """Force by the slab method."""
     h = height * (1 - reduction)
+    flow = Y + args.hardening * strain * np.log(height / h)
+    if disc:
+        a = width / 2 * np.sqrt(height / h)
+        q = 2 * args.mu * a / h
+        return flow * np.pi * a**2 * (2 * (np.expm1(q) - q) / q**2 if q else 1.0)
     b = width * height / h
     q = args.mu * b / h
-    flow = Y + args.hardening * 2 / 3**0.5 * np.log(height / h)
-    return 2 / 3**0.5 * flow * b * (np.expm1(q) / q if q else 1.0)
+    return strain * flow * b * (np.expm1(q) / q if q else 1.0)
 
 
 rows, iterations = [], 0
@@ -86,7 +103,7 @@ writer = (
 for step in uem.load_steps(problem, args.steps):
     iterations += step.newton_iterations
     reduction = args.reduction * step.factor
-    force = 2 * float(contact.resultant(on="target").force[1])
+    force = wide * float(contact.resultant(on="target").force[1])
     rows.append({"reduction": reduction, "force": force, "slab": slab(reduction), "error": force / slab(reduction) - 1})
     if writer is not None:
         metal.cell_averages()
@@ -99,16 +116,18 @@ if writer is not None:
 # The volume that is left tells whether cells lock or leak; the work of the tool goes into plastic flow and friction.
 
 # %%
-area = uem.integrate(ufl.det(ufl.Identity(2) + ufl.grad(u)) * ufl.dx(domain=mesh))
+F = uem.displacement_gradient(u)
+J = ufl.det(ufl.Identity(len(F[0, :])) + F)
+present, drawn = (uem.integrate(volume * ufl.dx(domain=mesh)) for volume in (J, 1.0))
 peeq = metal.cell_averages()["peeq"]
 largest = max(comm.allgather(float(peeq.x.array.max(initial=0.0))))
 results = {
     "forming_error": max(abs(row["error"]) for row in rows),
     "force": rows[-1]["force"],
     "slab": rows[-1]["slab"],
-    "volume_change": area / (width * height / 4) - 1,
-    "plastic_work": 4 * metal.dissipation(),
-    "friction_work": 4 * contact.dissipation,
+    "volume_change": present / drawn - 1,
+    "plastic_work": 2 * wide * metal.dissipation(),
+    "friction_work": 2 * wide * contact.dissipation,
     "peeq": largest,
     "iterations_per_step": iterations / len(rows),
     "curve": rows[:: max(1, len(rows) // 10)],
@@ -123,7 +142,7 @@ if args.plot:
             reductions = np.linspace(0.0, args.reduction, 100)
             right.plot(reductions, [slab(r) for r in reductions], "k", lw=1, label="slab method")
             right.plot([row["reduction"] for row in rows], [row["force"] for row in rows], ".", label="computed")
-            right.set(xlabel="reduction of the height", ylabel="force per length", ylim=(0, None))
+            right.set(xlabel="reduction of the height", ylabel="force" if disc else "force per length", ylim=(0, None))
             right.grid(alpha=0.25)
             right.legend(frameon=False)
 
