@@ -36,6 +36,9 @@ def made(E=100.0, rho=1.0, friction=0.1, scheme=None, coupling="node_to_surface"
     if as_what == "plastic":
         materials = [uem.VonMises(b.u, 100.0, 0.3, E, kind="plane_strain")]
         F = materials[0].residual(v)
+    elif as_what == "back stress":
+        materials = [uem.FinitePlasticity(b.u, 100.0, 0.3, 1.0, kinematic_hardening=E, kind="plane_strain")]
+        F = materials[0].residual(v)
     else:
         F = uem.LinearElastic(E, 0.3, kind="plane_strain").residual(b.u, v) * ufl.dx
     dynamics = uem.Dynamics(
@@ -49,6 +52,7 @@ OTHERS = {
     "constant": ({"as_what": "constant"}, {"E": 200.0}, r"F, Constant 1 \(now 200, then 100\)"),
     "function": ({"as_what": "function"}, {"E": 200.0}, r"F, Function \d \(now 200, then 100\)"),
     "yield stress": ({"as_what": "plastic"}, {"E": 3.0}, r"material 1, yield_stress \(now 3, then 100\)"),
+    "back stress": ({"as_what": "back stress"}, {"E": 3.0}, r"material 1, kinematic_hardening \(now 3, then 100\)"),
     "density": ({}, {"rho": 2.0}, r"mass \(now 4 4, .*, then 2 2, "),
     "friction": ({}, {"friction": 0.2}, r"contact 1 'pair', friction \(now 0.2, then 0.1\)"),
     "scheme": ({}, {"scheme": uem.generalised_alpha(0.5)}, r"scheme \(now Scheme\(beta=0.44.*, then Scheme\(beta=0.25"),
