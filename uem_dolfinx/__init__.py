@@ -36,18 +36,19 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Balance", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ConvergenceError", "Coulomb", "Dynamics",
-    "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity", "FloatingBodyError", "FrictionError",
-    "GeneralContact", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError",
-    "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError",
-    "OrientationError", "OutputError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant",
-    "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme",
-    "SpaceError", "StVenantKirchhoff", "State", "Step", "Stribeck", "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca",
-    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric",
-    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
-    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
-    "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "tangent",
-    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "Balance", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError",
+    "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity",
+    "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError",
+    "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError",
+    "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError", "PointLoad",
+    "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid",
+    "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Step", "Stribeck",
+    "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
+    "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet",
+    "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate",
+    "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
+    "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "tangent", "taylor_test", "time_steps",
+    "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -122,6 +123,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
+    from uem_dolfinx.contact.parameters import ContactParameter
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
@@ -131,6 +133,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.frames import outline
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
+    from uem_dolfinx.solve.history import History, recording
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.step import Step
 
@@ -144,7 +147,9 @@ _LATER = {
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
+    "ContactParameter": "contact.parameters",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
+    "History": "solve.history", "recording": "solve.history",
     "Step": "solve.step", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 

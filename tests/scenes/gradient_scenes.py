@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import ufl
-from block_scenes import blocks, run
+from block_scenes import blocks, clamp, run
 from dolfinx import fem
 
 import uem_dolfinx as uem
@@ -66,10 +66,17 @@ def pressed(
     bcs = [uem.dirichlet(b.V, b.bottom, value=sides)]
     bcs.append(fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V))
     target = uem.RigidSphere([0.4] * (g - 1) + [-3.0], 3.0) if rigid else b.low
+    if rigid == "paraboloid":
+        target = uem.RigidParaboloid([0.4] * (g - 1) + [0.0], -np.eye(g)[-1], 3.0)
+    elif rigid == "plane":
+        target = uem.RigidPlane([0.4] * (g - 1) + [0.0], np.eye(g)[-1] + 0.02 * np.eye(g)[0])
+    values = {"offset": 0.0, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
 
     def solve():
         u.x.array[:] = 0.0
-        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure)
+        if rigid:
+            target.move(values["place"], values["turn"])
+        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure, offset=float(values["offset"]))
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], rtol=1e-13, **options)
         run(problem)
         return problem
@@ -82,7 +89,20 @@ def pressed(
     X = ufl.SpatialCoordinate(mesh)
     J = ufl.inner(u, u) * ufl.dx + E * field * u[g - 1] * ufl.dx
     return SimpleNamespace(
-        b=b, F=F, J=J, of_pressures=of_pressures, E=E, load=load, top=top, field=field, sides=sides, X=X, solve=solve, u=u, v=v
+        b=b,
+        F=F,
+        J=J,
+        of_pressures=of_pressures,
+        E=E,
+        load=load,
+        top=top,
+        field=field,
+        sides=sides,
+        X=X,
+        solve=solve,
+        u=u,
+        v=v,
+        values=values,
     )
 
 
@@ -127,3 +147,80 @@ def orders(s, functional, *names):
         told[name] = uem.taylor_test(at, slope, 1e-3, 2)
         values[...] = before
     return told
+
+
+DRAGGED = [
+    ("triangle", None, "neo", ("friction", "X")),
+    ("triangle", "plane", "linear", ("E", "full", "top", "place", "turn")),
+    ("tetrahedron", None, "linear", ("E", "friction")),
+    ("hexahedron", "sphere", "linear", ("X", "place")),
+]
+
+
+def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
+    """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
+
+    ``solve()`` takes the steps anew with the present values of all that the solution depends on; ``values`` are those of the contact.
+    """
+    b = blocks(comm, cell, *((3, 4) if cell == "triangle" else (2, 3)), overhang=0.25)
+    mesh, g, u, v = b.scene.mesh, b.gdim, b.u, ufl.TestFunction(b.V)
+    E, top, full = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(g)), fem.Constant(mesh, np.zeros(g))
+    top.value[0], top.value[-1] = 0.03, -0.05
+    kind = "plane_strain" if g == 2 else "3d"
+    material = uem.NeoHooke(E, 0.3, kind=kind) if law == "neo" else uem.LinearElastic(E, 0.3, kind=kind)
+    F = material.residual(u, v) * ufl.dx - ufl.inner(full, v) * ufl.dx
+    push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V)
+    values = {"full": np.full(g, 0.002), "friction": mu, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
+
+    def solve():
+        u.x.array[:] = 0.0
+        target = b.low
+        if rigid is not None:
+            middle, up = [0.5] * (g - 1), np.eye(g)[-1] + 0.05 * np.eye(g)[0]
+            target = uem.RigidPlane([*middle, 0.0], up) if rigid == "plane" else uem.RigidSphere([*middle, -3.0], 3.0)
+            target.move(values["place"], values["turn"])
+        contact = uem.Contact(b.high, target, friction=float(values["friction"]))
+        bcs, load = [*clamp(b.V, b.bottom), push], {full: values["full"]}
+        problem, states = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load=load, rtol=1e-13), []
+        with uem.recording(problem) as history:
+            for _ in uem.load_steps(problem, steps):
+                now = contact.pair.trial
+                told = np.array([now.active.sum(), (now.active & now.friction.stick).sum()])
+                states.append(comm.allreduce(told).tolist())
+        return SimpleNamespace(problem=problem, history=history, contact=contact, states=states)
+
+    w = fem.Function(b.V)
+    compat.set_bc_values(w.x.array, [uem.dirichlet(b.V, b.top, 0, 1.0)])
+    w.x.scatter_forward()
+    J = ufl.inner(u, u) * ufl.dx + ufl.replace(F, {v: w})
+    return SimpleNamespace(b=b, u=u, E=E, full=full, top=top, X=ufl.SpatialCoordinate(mesh), J=J, solve=solve, values=values)
+
+
+def control_of(s, contact, name):
+    """The control of a dragged scene with a name."""
+    return uem.ContactParameter(contact, name) if name in ("friction", "offset", "place", "turn") else getattr(s, name)
+
+
+def changed(s, name):
+    """A change of a control of a dragged scene."""
+    g = s.b.gdim
+    changes = {"E": 1.0, "full": np.eye(g)[-1], "top": np.linspace(1.0, -1.0, g), "X": wave(s.b.V, 0.05), "friction": 1.0}
+    return (changes | {"place": np.linspace(0.5, 1.0, g), "turn": 1.0 if g == 2 else np.linspace(0.5, 1.0, 3)})[name]
+
+
+def drag_anew(s, name, change, h):
+    """All steps with a control changed by h, which is then put back; and the functional."""
+    values = s.b.scene.mesh.geometry.x if name == "X" else s.values[name] if name in s.values else getattr(s, name).value
+    before = np.array(values)
+    if name == "X":
+        move(s, change, h)
+    elif name in s.values:
+        s.values[name] = before + h * change
+    else:
+        values[...] = before + h * change
+    found, J = s.solve(), uem.integrate(s.J)
+    if name in s.values:
+        s.values[name] = before
+    else:
+        values[...] = before
+    return found, J

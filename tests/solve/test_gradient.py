@@ -147,7 +147,7 @@ def test_what_is_refused():
     """What depends on all steps, what is no equilibrium, no functional and no control."""
     s = pressed("triangle")
     problem, J = s.solve(), s.J
-    one = "a Constant, a Function or ufl.SpatialCoordinate(mesh)"
+    one = "a Constant, a Function, ufl.SpatialCoordinate(mesh) or a ContactParameter"
     refused(
         uem.InputTypeError, f"controls = 1.0: expected a list; each item must be {one}", lambda: uem.gradient(problem, J, 1.0)
     )

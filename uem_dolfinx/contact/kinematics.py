@@ -246,6 +246,10 @@ class Discretisation(Protocol):
     """Ties contactors to a target. It keeps the feet or segments of a contact with small sliding, and what holds for one step."""
 
     @property
+    def offset(self) -> Array | None:
+        """What gaps are less than heights ``(n,)``; None for nothing."""
+
+    @property
     def target(self) -> Target:
         """What the contactors may touch."""
 

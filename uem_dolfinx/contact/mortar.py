@@ -189,15 +189,30 @@ class Mortar(Contactors):
 
     def _weighted_offset(self, rows: WeightedRows) -> Array:
         """What the present offsets take from the gaps of rows, which may have been made with others ``(n,)`` (collective)."""
-        at, offsets = rows.points, self._offsets(rows.facets)
+        offsets = self._offsets(rows.facets)
         assert offsets is not None and self.offset is not None
+        total, length = self._over_lengths(rows, offsets)
+        return np.where(rows.covered, total / length, self.offset)
+
+    def _over_lengths(self, rows: WeightedRows, values: Array) -> tuple[Array, Array]:
+        """Weighted ``values (m, nn)`` at the facets' nodes, and what plain rows were divided by ``(n,)`` each (collective)."""
+        at = rows.points
         coefficients = at.duals.C @ self.basis.T
-        weighted = np.einsum("mij,mj->mi", coefficients, offsets)
+        weighted = np.einsum("mij,mj->mi", coefficients, values)
         own = np.einsum("mii,mg->mig", coefficients, at.planes.normal)
         parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, 1 + self.config.gdim)
         total = self.config.add_at_owners(at.nodes.ravel(), parts)[self.nodes]
-        length = np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
-        return np.where(rows.covered, total[:, 0] / length, self.offset)
+        return total[:, 0], np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
+
+    def with_variation(self, kinematics: MortarKinematics) -> MortarKinematics:
+        """The kinematics with rows that are derivatives of the gaps where these do not vanish on parallel facets, too (collective)."""
+        rows = kinematics.rows
+        if self.sliding != "finite":
+            return kinematics
+        _, scale = self._over_lengths(rows, np.zeros(rows.points.nodes.shape))
+        variation, _ = self.elimination.variation(rows.points, scale, rows.plain)
+        equations, length = self.elimination.derivatives(rows.plain, variation)
+        return replace(kinematics, rows=replace(rows, equations=equations, length=length))
 
     def set_offset(self, offset: Array | None) -> None:
         """Take other offsets ``(n,)``; contactors are to be placed again."""

@@ -333,7 +333,7 @@ class Sliding:
         tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
         np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.test.direction[i])
         if du is not None and self._follows_slip:
-            sideways, part, stiffness = self._turning(state, kinematics)
+            sideways, part, stiffness = self.turning(state, kinematics)
             i = np.flatnonzero(self.slipping(state))
             taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
             tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
@@ -352,7 +352,7 @@ class Sliding:
         """Whether friction changes as contactors that slip move: in space its direction, and by laws of rate its size."""
         return self.config.gdim == 3 or of_rate(self.limits.law)
 
-    def _turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
+    def turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
         """How friction changes as contactors that slip move over the target.
 
         Returns:
@@ -376,7 +376,7 @@ class Sliding:
         if not self._follows_slip:
             return None
         i = np.flatnonzero(self.slipping(state))
-        sideways, part, stiffness = self._turning(state, kinematics)
+        sideways, part, stiffness = self.turning(state, kinematics)
         nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
         (k, m), g = share.shape, self.config.gdim
         blocks = np.einsum("ka,kb,kgh->kagbh", share, moved, stiffness).reshape(k, m * g, m * g)

@@ -73,6 +73,9 @@ class Projection(Protocol):
     def turnings(self, which: Ints, s: Array) -> Array:
         """Derivative of the rows along tangents ``s (k, gdim)``, which turn with the normal ``(k, (1 + nn) g, (1 + nn) g)``."""
 
+    def normal_slopes(self, which: Ints) -> Array:
+        """Derivative of the normal with respect to contactor and target nodes ``(k, g, (1 + nn) g)``."""
+
 
 class Target(Protocol):
     """Anything that points can be projected onto, meshed or rigid.
@@ -216,6 +219,11 @@ class FacetProjection:
         k, size = len(n), ds.shape[2]
         return np.concatenate([ds[:, None], -on_target], axis=1).reshape(k, size, size)
 
+    def normal_slopes(self, which: Ints) -> Array:
+        """Derivative of the normal as the foot moves and the facet turns."""
+        t, m, _, _, _, L = _foot_derivatives(*self._at(which))
+        return -np.einsum("kfg,kfi->kgi", t, np.linalg.solve(m, L))
+
     def _at(self, which: Ints) -> list[Array]:
         return [getattr(self, f)[which] for f in ("normal", "height", "weights", "dN", "ddN", "x", "shape_operator")]
 
@@ -229,6 +237,12 @@ def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, 
     H = -np.einsum("kfi,kfj->kij", D, N)
     H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
     return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+
+
+def foot_slopes(p: FacetProjection, which: Ints) -> tuple[Array, Array]:
+    """Tangents at feet ``(k, fdim, gdim)``, and derivatives of their coordinates by points and nodes ``(k, fdim, (1 + nn) gdim)``."""
+    t, _, _, _, D, _ = _foot_derivatives(*p._at(which))
+    return t, D
 
 
 def _foot_derivatives(

@@ -104,6 +104,10 @@ class RigidProjection:
         """Derivative of tangents ``s (k, gdim)``, which turn with the normal ``(k, gdim, gdim)``."""
         return -np.einsum("kg,kh,khi->kgi", self.normal[which], s, self.shape_operator[which])
 
+    def normal_slopes(self, which: Ints) -> Array:
+        """Derivative of the normal ``(k, gdim, gdim)``."""
+        return self.shape_operator[which]
+
 
 class RigidSurface:
     """Rigid target of any shape, still or moved as a rigid body.

@@ -19,11 +19,15 @@ has a further load that moves contactors against their targets, by which the for
 
     lam' = L'S' [ (K + G) du + dF/dm m' ],    w = S L dJ/dlam
     dJ/du + (K + G) w in place of dJ/du,    a - w in place of a where it meets dF/dm or dF/dX - K
+
+Parameters of a contact change gaps and contact forces alone: c closes the gaps, and what forces at the same multipliers change by counts
+as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/du``, and (K + G)' stands for (K + G) in what goes back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,16 +37,19 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.parameters import ContactParameter, motion_of, rubbed, thickened, turned
 from uem_dolfinx.contact.pressure_slopes import PressureSlopes
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.rows import BodyState
+from uem_dolfinx.solve.rows import BodyState, Rows
 from uem_dolfinx.solve.system import CLOSED, BodySystem
+from uem_dolfinx.solve.tangent import curvature_of
 
 
 class Motion(NamedTuple):
@@ -65,10 +72,17 @@ class Linearised:
     Attributes:
         F: the residual in UFL, and ``test`` its test function.
         P: restriction matrix of the active contactors.
+        rows: their equations.
+        multipliers: of all equations of contacts, and of users ``(m,)``.
+        ramp: how much of a change of its values a Dirichlet condition takes over.
     """
 
+    P: Restriction
+    rows: Rows
+    multipliers: Array
+
     def __init__(self, problem: UnitedProblem):
-        self.problem, self.config = problem, problem.config
+        self.problem, self.config, self.ramp = problem, problem.config, 1.0
         self.F = problem.bodies.F
         self.test = self.F.arguments()[0]
 
@@ -81,17 +95,30 @@ class Linearised:
         return self
 
     def _linearise(self) -> None:
+        system, state = self.problem.system, self._state()
+        assert isinstance(system, BodySystem)
+        # no step begins: a factorisation of the same matrix goes on serving
+        system.linearise(state, 1)
+        self.K, self.G = self.problem.bodies.tangent.K, system.curvature
+        self._tell_idle()
+
+    def _state(self) -> BodyState:
+        """Equations and multipliers where the problem is (collective)."""
         bodies, system = self.problem.bodies, self.problem.system
         assert isinstance(system, BodySystem)
         bodies.wanted[:] = self.problem.u.x.array
         system.place()
         bodies.assemble()
         state = system.assemble_constraints(lambda norm, scale, rounding: True)
-        # no step begins: a factorisation of the same matrix goes on serving
-        system.linearise(state, 1)
         assert isinstance(state, BodyState)
-        self.P, self.K, self.G, self._rows = state.trial, bodies.tangent.K, system.curvature, state.rows
-        idle = 0
+        self.P, self.rows = state.trial, state.rows
+        self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
+        return state
+
+    def _tell_idle(self) -> None:
+        """Count contactors at which functionals have a gradient on either side (collective)."""
+        bodies, system, idle = self.problem.bodies, self.problem.system, 0
+        assert isinstance(system, BodySystem)
         for pair in system.pairs:
             now, rounding = pair.trial, bodies.rounding_at(pair.nodes)
             touches = ~now.active & ~pair.off & (np.abs(pair.gap) <= CLOSED * self.config.size)
@@ -115,16 +142,16 @@ class Linearised:
         Raises:
             InputError: where they have none.
         """
-        if self._rows.independent is not None and self._rows.independent.found:
+        if self.rows.independent is not None and self.rows.independent.found:
             raise InputError(
                 f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "
                 "replaced by others, so that pressures have no derivatives here; let nodes be contactors of one contact, with free normals"
             )
-        return PressureSlopes(contact, self._rows.equations[self.problem.contacts.index(contact)])
+        return PressureSlopes(contact, self.rows.equations[self.problem.contacts.index(contact)])
 
     def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
         """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective)."""
-        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self._rows.equations)]
+        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.rows.equations)]
         return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
 
     def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
@@ -138,15 +165,73 @@ class Linearised:
         assert isinstance(self.problem.system, BodySystem)
         return self.config.vector(self.problem.system.floating.without_open_motions(np.array(v.array_r)))
 
+    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
+        """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
+        return curvature_of([self.problem.pairs[k] for k in which], self.config.unknowns.vector(), True, False)
+
+    def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
+        """``a = Q mu`` of the adjoint problem under forces (collective)."""
+        return self.solve(forces)
+
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
         """``(K + G) du`` (collective)."""
         return forms.product(self.K, du, self.G)
+
+    def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G)' a`` (collective)."""
+        return self.stiffness(a)
+
+    def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``K' a`` (collective)."""
+        return forms.product(self.K, a)
+
+    def share(self, m: Control) -> float:
+        """How much of a change of a control the state has seen: all of it, unless load steps lead there."""
+        return 1.0
+
+    def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
+        """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).
+
+        A rigid surface that moves by b(x) leaves bodies behind as if it stood still and these moved by -b, and turns its forces.
+
+        Returns:
+            Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
+        """
+        k, pair, config = self.problem.contacts.index(m.contact), m.contact.pair, self.config
+        gaps, first = np.zeros_like(self.multipliers), sum(len(own) for own in self.rows.equations[:k])
+        if m.parameter == "friction":
+            return gaps, rubbed(pair)
+        if self.P.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+            raise InputError(
+                f"contact '{m.contact.name}': equations follow each other in rings, or conflict, so that its {m.parameter} has no "
+                "derivative here; let nodes be contactors of one contact, with free normals"
+            )
+        own, rows = slice(first, first + len(self.rows.equations[k])), self.rows.equations[k].trial
+        if m.parameter == "offset":
+            gaps[own], forces = thickened(pair, self.multipliers[own])
+            return gaps, forces
+        b, pushed = motion_of(m, config.x[: config.n_owned], entry), np.zeros((config.n_owned, config.gdim))
+        there = np.einsum("kg,kg->k", rows.coefficients, config.ask_owners(rows.followed, b))
+        gaps[own] = np.bincount(rows.row, there, len(rows)) - np.einsum("mg,mg->m", rows.direction, b[rows.node])
+        if m.parameter == "turn":
+            nodes, force = pair.nodal_forces(pair.trial)
+            pushed = config.add_at_owners(nodes, turned(force, entry))
+        if (stiffness := self.stiffness_of([k])) is not None:
+            pushed = pushed + forms.product(stiffness, config.vector(b)).array_r.reshape(-1, config.gdim)
+        return gaps, -pushed
 
     def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
         """What moves with changes of controls (collective)."""
         config = self.config
         forces, prescribed, shape = config.vector(), np.zeros((config.n_owned, config.gdim)), fem.Function(config.V)
+        gaps = np.zeros_like(self.multipliers)
         for m, change in direction:
+            if isinstance(m, ContactParameter):
+                for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):
+                    opened, pushed = self.changes(m, entry)
+                    gaps += size * opened
+                    forces.array[:] -= size * pushed.ravel()
+                continue
             if isinstance(m, ufl.SpatialCoordinate):
                 shape.x.array[:] += change.x.array
                 if (form := forms.expanded(ufl.derivative(self.F, m, change))) is not None:
@@ -161,6 +246,7 @@ class Linearised:
         forces.axpy(1.0, forms.product(self.K, drawn))
         held = ~self.problem.bodies.free[: config.n_owned]
         c = self.P.carried(prescribed + np.where(held, drawn.array_r.reshape(-1, config.gdim), 0.0))
+        c.axpy(-1.0, self.P.read_back(gaps))
         way = self.solve(forces - self.stiffness(c))
         way.axpy(1.0, c)
         reactions = self.stiffness(way) - forces
@@ -177,9 +263,9 @@ class Linearised:
         """How a contact's pressure changes with a motion (collective)."""
         slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
         multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
-        ends = np.cumsum([len(own) for own in self._rows.equations])
+        ends = np.cumsum([len(own) for own in self.rows.equations])
         found = fem.Function(contact.pressure.function_space)
-        part = multipliers[ends[k] - len(self._rows.equations[k]) : ends[k]]
+        part = multipliers[ends[k] - len(self.rows.equations[k]) : ends[k]]
         found.x.array[contact.nodes] = slopes.along(part, motion.du, motion.shape)
         found.x.scatter_forward()
         return found
@@ -204,19 +290,21 @@ class Adjoint:
         at: the problem, linearised.
         J: the functional.
         pressing: contacts whose pressures it holds.
+        handed: derivative by the places of the owned nodes through what later steps remember of them ``(n_owned, gdim)``.
 
     Attributes:
         a: what forces do to J, less what they do to contact forces by themselves, a Function of the displacement's space.
+        left: derivative by a change of the displacement with everything else at rest, what the adjoint forces have not taken up.
         by_values: derivative of J by the prescribed displacement of every owned component, zero where free ``(n_owned, gdim)``.
     """
 
-    def __init__(self, at: Linearised, J: ufl.Form, pressing: Sequence[Contact] = ()):
+    def __init__(self, at: Linearised, J: ufl.Form | None, pressing: Sequence[Contact] = (), handed: npt.ArrayLike | float = 0.0):
         self.at, self.config = at, at.config
-        config, functionals, weights = at.config, [J], {}
+        config, functionals, weights = at.config, [] if J is None else [J], {}
         now, drawn = config.vector(), config.vector()
         for contact in pressing:
             p = contact.pressure
-            of_p = _derivative(J, p, ufl.TestFunction(p.function_space))
+            of_p = _derivative(functionals[0], p, ufl.TestFunction(p.function_space))
             of_nodes = np.zeros(len(contact.nodes))
             if of_p is not None:
                 of_nodes = forms.assemble_array(p.function_space, forms.form(of_p))[contact.nodes]
@@ -231,34 +319,51 @@ class Adjoint:
                 of_u.array[:] += forms.assemble_array(config.V, forms.form(part))
         of_u = at.held(of_u)
         lift = at.lift(weights)
-        drive = of_u + at.stiffness(lift) + now
-        along = at.solve(drive)
+        drive = of_u + at.stiffness(lift) + now + config.vector(handed)
+        along = at.solve_back(drive)
         left = along - lift
         self.a = at.function(left)
         #: J with its areas, and the work of the residual along a, with their signs.
         self._forms = *((functional, 1.0) for functional in functionals), (ufl.replace(at.F, {at.test: self.a}), -1.0)
         held = ~at.problem.bodies.free[: config.n_owned]
-        self.by_values = np.where(held, at.P.carried_back(drive - at.stiffness(along)), 0.0)
+        self.left = drive - at.stiffness_back(along)
+        self.by_values = np.where(held, at.P.carried_back(self.left), 0.0)
         #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
-        self._by_places = (forms.product(at.K, left) - of_u + drawn).array_r + self.by_values.ravel()
+        self._by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
 
-    def by(self, m: Control) -> Array | fem.Function:
+    @cached_property
+    def by_gaps(self) -> Array:
+        """Derivative by the gaps of all equations ``(m,)`` (first time: collective)."""
+        return -self.at.P.multipliers(self.at.P.pass_on(self.left))
+
+    def by(self, m: Control | ContactParameter) -> Array | fem.Function:
         """Derivative by a control."""
+        if isinstance(m, ContactParameter):
+            return self._by_contact(m)
         if isinstance(m, fem.Constant):
             return self._by_constant(m)
         return self._by_function(m) if isinstance(m, fem.Function) else self._by_shape(m)
 
+    def _by_contact(self, m: ContactParameter) -> Array:
+        """An array of its shape."""
+        found = np.zeros(m.shape(self.config.gdim))
+        a = self.a.x.array[: self.config.n_owned * self.config.gdim].reshape(-1, self.config.gdim)
+        for entry in np.ndindex(found.shape):
+            opened, pushed = self.at.changes(m, entry)
+            found[entry] = self.by_gaps @ opened - (a * pushed).sum()
+        return np.asarray(reduced(self.config.comm, found))
+
     def _by_constant(self, m: fem.Constant) -> Array:
         """An array of its shape."""
-        comm, shape = self.config.comm, np.shape(m.value)
+        comm, shape, share = self.config.comm, np.shape(m.value), self.at.share(m)
         found = np.zeros(shape)
         for entry in np.ndindex(shape):
             unit = np.zeros(shape)
             unit[entry] = 1.0
             for form, sign in self._forms:
                 if (part := _along(form, m, unit)) is not None:
-                    found[entry] += sign * forms.assemble_scalar(forms.form(part), comm)
-            found[entry] += float(reduced(comm, float((self.by_values * self.at.prescribed_by(m, unit)).sum())))
+                    found[entry] += share * sign * forms.assemble_scalar(forms.form(part), comm)
+            found[entry] += self.at.ramp * float(reduced(comm, float((self.by_values * self.at.prescribed_by(m, unit)).sum())))
         return found
 
     def _by_function(self, m: fem.Function) -> fem.Function:
@@ -269,7 +374,7 @@ class Adjoint:
         # conditions that take its values tell which
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own, added = which > 0.5, fem.Function(V)
-        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.by_values[own])
+        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.at.ramp * self.by_values[own])
         forms.sum_ghosts(added)
         found.x.array[:] += added.x.array
         return found

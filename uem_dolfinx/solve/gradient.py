@@ -6,7 +6,7 @@ The active set is that of the state: where a contactor has neither force nor gap
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import ufl
@@ -15,6 +15,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -26,10 +27,11 @@ from uem_dolfinx.solve.system import BodySystem
 #: Fields of contacts, by the words in their names.
 RESULTS = ("active", "force", "gap", "pressure", "slip", "status", "traction")
 #: In words, what a functional may be differentiated by.
-A_CONTROL = "a Constant, a Function or ufl.SpatialCoordinate(mesh)"
+A_CONTROL = "a Constant, a Function, ufl.SpatialCoordinate(mesh) or a ContactParameter"
+AnyControl: TypeAlias = Control | ContactParameter
 
 
-def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | Control) -> list[Array | fem.Function]:
+def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl] | AnyControl) -> list[Array | fem.Function]:
     """Derivatives of a functional at the present equilibrium by parameters of the problem, by one adjoint solve (collective).
 
     Exact for the discrete problem: the contact conditions are eliminated, not smoothed. With mortar on facets of hexahedra that warp, and
@@ -42,11 +44,11 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
             ``problem.u``: ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
         controls: Constants and Functions that F, J or the values of Dirichlet conditions are made of: moduli, loads, fields of moduli,
             prescribed displacements. A Function is taken by its degrees of freedom; ``ufl.SpatialCoordinate(mesh)`` stands for the places
-            of the nodes: the shape.
+            of the nodes: the shape; a ``ContactParameter`` is the offset of a contact, or the place or the turn of its rigid target.
 
     Returns:
-        For every control, in their order, the derivatives by its entries: an array of the shape of a Constant's value, a Function of
-        the control's space, or for the shape one of the displacement's space.
+        For every control, in their order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter, a
+        Function of the control's space, or for the shape one of the displacement's space.
 
     Raises:
         InputError, InputTypeError: for a problem whose gradient needs the history of all steps, one without a step, one without the
@@ -54,7 +56,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
             concave corners of the target, or of those whose equations conflict.
         LinearSolveError: if the united matrix is singular.
     """
-    some = _check(problem, "controls", [controls] if isinstance(controls, Control) else controls)
+    check_problem(problem, recorded=False)
+    some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
     with agreed(problem.comm):
         given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
         check_functional("J", J)
@@ -66,13 +69,13 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[Control] | 
         return [adjoint.by(m) for m in some]
 
 
-def tangent(problem: UnitedProblem, direction: Sequence[tuple[Control, Any]], of: fem.Function | None = None) -> fem.Function:
+def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]], of: fem.Function | None = None) -> fem.Function:
     """How the displacement, or a contact pressure, changes with parameters of the problem, by one solve (collective).
 
     Args:
         problem: as of :func:`gradient`.
-        direction: pairs of a control, as of :func:`gradient`, and its change: for a Constant an array of its shape, for a Function one
-            of its space, for the places of the nodes one of the displacement's space.
+        direction: pairs of a control, as of :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
+            shape, for a Function one of its space, for the places of the nodes one of the displacement's space.
         of: the ``pressure`` of a contact of the problem; None for the displacement.
 
     Returns:
@@ -81,7 +84,8 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[Control, Any]], of
     Raises:
         InputError, InputTypeError, LinearSolveError: see :func:`gradient`.
     """
-    pairs, contact = _check(problem, "direction", direction), None
+    check_problem(problem, recorded=False)
+    pairs, contact = check_controls(problem, "direction", direction), None
     if of is not None:
         pressures = [contact.pressure for contact in problem.contacts]
         with agreed(problem.comm):
@@ -112,31 +116,42 @@ def taylor_test(functional: Callable[[float], float], slope: float, size: float 
     return float(np.log2(left[:-1] / left[1:]).min())
 
 
-def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
-    """Refuse problems whose derivatives are not those of one state, and what are not controls or pairs with their changes (collective)."""
+def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
+    """Refuse problems whose equations do not tell derivatives, and those of all steps unless they are ``recorded`` (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
         refuse_other_fields(problem.config, "gradients", "take differences of two solutions")
         for present, history in (
             (problem.dynamics is not None, "a problem in time"),
-            (any(pair.frictional for pair in problem.pairs), "a contact with friction"),
             (bool(problem.materials), "a law with history"),
             (problem.bodies.dead is not None, "forces that a step has not released yet"),
         ):
             if present:
-                raise InputError(
-                    f"the gradient of {history} depends on all steps, of which the last alone is known: only statics have one"
-                )
+                raise InputError(f"the gradient of {history} depends on all steps, whose derivatives are not known")
+        if not recorded and any(pair.frictional for pair in problem.pairs):
+            raise InputError(
+                "the gradient of a contact with friction depends on all steps, of which the last alone is known: take the steps while "
+                "uem.recording(problem) keeps them, and ask that history"
+            )
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.tied for contact in problem.contacts):
             raise InputError("gradients do not know how a tie changes with what it ties: expected contacts that are not tied")
+        if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
+            raise InputError(
+                "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
+            )
         if problem.linear is not None or problem.bodies.points is not None:
             raise InputError("gradients do not know equations, forces and springs of nodes: expected a problem without them")
+
+
+def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
+    """Refuse problems without a step, and what are not controls or pairs with their changes (collective)."""
+    with agreed(problem.comm):
         if not problem.progress.steps:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         if what == "controls":
-            controls = found = given.items(what, handed, lambda one: isinstance(one, Control), A_CONTROL)
+            controls = found = given.items(what, handed, lambda one: isinstance(one, AnyControl), A_CONTROL)
         else:
             found = given.items(what, handed, _is_pair, f"a pair of {A_CONTROL} and its change")
             controls = [control for control, _ in found]
@@ -149,6 +164,8 @@ def _check(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
                 )
             if isinstance(control, ufl.SpatialCoordinate):
                 _check_shape(problem)
+            if isinstance(control, ContactParameter):
+                _check_parameter(problem, f"{what}[{i}]", control)
         for i, (control, change) in enumerate(found if what == "direction" else ()):
             _check_change(problem, f"the change in {what}[{i}]", control, change)
         return found
@@ -168,18 +185,43 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
     return [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
 
 
+def refuse_results(J: ufl.Form) -> None:
+    """Refuse a functional of results of contacts."""
+    for f in J.coefficients():
+        if _is_result(f):
+            raise InputError(
+                f"J holds '{f.name}', a result of a contact: functionals of histories hold the displacement; of forces take the residual"
+            )
+
+
 def _is_result(f: fem.Function) -> bool:
     return any(f.name.startswith(f"contact_{what}_") for what in RESULTS)
 
 
 def _is_pair(one: Any) -> bool:
-    return isinstance(one, (tuple, list)) and len(one) == 2 and isinstance(one[0], Control)
+    return isinstance(one, (tuple, list)) and len(one) == 2 and isinstance(one[0], AnyControl)
 
 
-def _check_change(problem: UnitedProblem, what: str, control: Control, change: Any) -> None:
+def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> None:
+    """Refuse parameters that the problem's equations do not depend on as they stand."""
+    known = any(contact is m.contact for contact in problem.contacts)
+    given.kind(what, m, known, "a parameter of a contact of the problem")
+    if m.parameter == "friction" and not m.contact.pair.frictional:
+        raise InputError(
+            f"{what} is the friction of contact '{m.contact.name}', which has none: expected a contact with friction"
+        )
+    if m.parameter == "offset" and not keeps_distance(m.contact):
+        raise InputError(f"{what} is the offset from a rigid surface: expected a plane, a sphere or a cylinder, or a mesh")
+    if m.contact.sliding != "finite" and m.parameter != "offset":
+        raise InputError(
+            f"{what} is a {m.parameter}, by which contacts of sliding='{m.contact.sliding}' have no gradient: expected 'finite'"
+        )
+
+
+def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change: Any) -> None:
     """Refuse a change that is not of the kind of its control."""
-    if isinstance(control, fem.Constant):
-        shape = np.shape(control.value)
+    if not isinstance(control, (fem.Function, ufl.SpatialCoordinate)):
+        shape = np.shape(control.value) if isinstance(control, fem.Constant) else control.shape(problem.config.gdim)
         try:
             values = np.asarray(change, dtype=float)
         except (TypeError, ValueError):

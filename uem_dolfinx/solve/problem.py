@@ -235,6 +235,8 @@ class UnitedProblem:
 
         self._before = Memory.of(self)
         self.led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
+        #: What keeps all steps for gradients; None for nothing.
+        self.history: Any = None
         for contact in self.contacts:
             contact.begin()
         from uem_dolfinx.solve.settings import Settings
@@ -371,11 +373,13 @@ class UnitedProblem:
         from uem_dolfinx.solve.memory import Memory
 
         self._before = Memory.of(self)
-        self.keep()
         self.progress.steps += 1
+        self.keep()
 
     def keep(self) -> None:
         """Make the present state the committed one; what the step began with stays what it was (collective)."""
+        if self.history is not None:
+            self.history.note(self._before, *self.led)
         self.committed = np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
         for material in self.materials:
