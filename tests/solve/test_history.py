@@ -5,6 +5,9 @@ Read first: ``test_of_second_order``, Taylor's test of steps in which some conta
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 from mpi4py import MPI
 
 import numpy as np
@@ -17,6 +20,7 @@ from helpers import blocks, clamp, linear, modulus, refused, run, slow
 import uem_dolfinx as uem
 
 COMM = MPI.COMM_WORLD
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("cell, rigid, law, names", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
@@ -111,3 +115,12 @@ def test_what_is_refused():
     refused(uem.InputTypeError, "J[0] = 1.0", lambda: history.gradient([1.0], []))
     pressure = new.contacts[0].pressure * ufl.ds
     refused(uem.InputError, "of forces take the residual", lambda: history.gradient(pressure, []))
+
+
+@pytest.mark.slow
+def test_page_of_optimisers():
+    """SciPy's optimiser and PETSc's find the modulus and the load that a displacement was computed with."""
+    page, known = (REPOSITORY / "demos" / "site" / "howto" / "optimise.md").read_text(encoding="utf-8"), {}
+    exec(compile("".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), "optimise.md", "exec"), known)
+    for name in ("by_scipy", "by_tao"):
+        assert known[name] == pytest.approx([1.0, 0.05], rel=1e-3), name
