@@ -151,7 +151,7 @@ def orders(s, functional, *names):
 
 DRAGGED = [
     ("triangle", None, "neo", ("friction", "X")),
-    ("triangle", "plane", "linear", ("E", "full", "top", "place", "turn")),
+    ("triangle", "plane", "linear", ("top", "full", "place")),
     ("tetrahedron", None, "linear", ("E", "friction")),
     ("hexahedron", "sphere", "linear", ("X", "place")),
 ]
