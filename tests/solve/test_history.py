@@ -113,7 +113,22 @@ def test_what_is_refused():
         run(new)
     refused(uem.InputError, "J has 2 items: expected one for each of the 1 recorded steps", lambda: history.gradient([J, J], []))
     refused(uem.InputTypeError, "J[0] = 1.0", lambda: history.gradient([1.0], []))
-    pressure = new.contacts[0].pressure * ufl.ds
+    with uem.recording(problem()) as history:
+        history.problem.contacts[0].friction = 0.0
+        run(history.problem)
+    mu = uem.ContactParameter(history.problem.contacts[0], "friction")
+    refused(uem.InputError, "expected a positive coefficient everywhere", lambda: history.gradient(J, mu))
+    led = fem.Constant(b.scene.mesh, 0.0)
+    contact = uem.Contact(b.high, b.low)
+    by_function = uem.UnitedProblem(
+        F - led * ufl.TestFunction(b.V)[0] * ufl.dx, b.u, contacts=[contact], load={led: lambda f: 0.0}, **options
+    )
+    with uem.recording(by_function) as other:
+        run(by_function)
+    refused(uem.InputError, "controls[0] is set by a function of the load factor", lambda: other.gradient(J, led))
+    with uem.recording(problem()) as history:
+        run(history.problem)
+    pressure = history.problem.contacts[0].pressure * ufl.ds
     refused(uem.InputError, "of forces take the residual", lambda: history.gradient(pressure, []))
 
 

@@ -121,6 +121,11 @@ def rubbed(pair: Interface) -> Array:
     """Change of the residual with the coefficient of friction ``(n_owned, gdim)`` (collective)."""
     sliding = pair.friction
     assert sliding is not None
+    if reduced(pair.config.comm, bool((sliding.value == 0.0).any()), op=MPI.LOR):
+        raise InputError(
+            f"{pair.name}: some contactors have no friction in a step, where the coefficient has a one-sided derivative: expected a "
+            "positive coefficient everywhere"
+        )
     share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.force_per_multiplier
     nodes, forces = sliding.frame.ties.handed_on(share[:, None] * sliding.directions(pair.trial))
     return pair.config.add_at_owners(nodes, forces)

@@ -147,6 +147,14 @@ class History:
         problem = self.problem
         some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
         functionals = self._functionals(J)
+        load = problem.load if isinstance(problem.load, Mapping) else {}
+        with agreed(problem.comm):
+            for k, m in enumerate(some):
+                if isinstance(m, fem.Constant) and callable(load.get(m)):
+                    raise InputError(
+                        f"controls[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
+                        "multiplied in the residual"
+                    )
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(_values(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
         offsets = [pair.discretisation.offset for pair in problem.pairs]
