@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
@@ -9,6 +10,7 @@ from mpi4py import MPI
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.checks import warn_of_sagging_facets, warn_of_slipped
 from uem_dolfinx.contact.results import ContactResults
+from uem_dolfinx.errors import UEMError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
@@ -81,3 +83,12 @@ class WatchedContact(ContactResults):
             self._entered = self.corner_inside(stiffness)
             if self._entered is not None:
                 logger.warning("%s: %s", self.name, self._entered)
+
+
+def name_corner(contacts: Sequence[WatchedContact], stiffness: Array | None, error: UEMError) -> None:
+    """Tell in an error of a convex corner of a target inside contactors, if there is one; ``stiffness`` as there (collective)."""
+    for contact in contacts:
+        corner = contact.corner_inside(stiffness)
+        if corner is not None:
+            error.amend(f"{contact.name}: {corner}")
+            return

@@ -16,6 +16,7 @@ from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.watched import name_corner
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.forms import in_all_cells
@@ -356,17 +357,9 @@ class UnitedProblem:
         except UEMError as error:
             self.restore()
             if isinstance(error, MENDABLE):
-                self._name_corner(error)
+                name_corner(self.contacts, self.bodies.stiffness, error)
             raise
         return history
-
-    def _name_corner(self, error: UEMError) -> None:
-        """Tell in an error of a convex corner of a target inside contactors, if there is one (collective)."""
-        for contact in self.contacts:
-            corner = contact.corner_inside(self.bodies.stiffness)
-            if corner is not None:
-                error.amend(f"{contact.name}: {corner}")
-                return
 
     def commit(self) -> None:
         """Keep the present displacement and contact state."""

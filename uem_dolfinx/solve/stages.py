@@ -55,6 +55,8 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
             raise InputError(
                 "the problem has a load, which its steps do not know of: leave load out, and give the steps their loads"
             )
+        if problem.history is not None:
+            raise InputError("the problem is being recorded, and Steps change what it is: record the load steps of one load")
         for i, step in enumerate(steps):
             _check(problem, step, f"step {i + 1}" + (f", '{step.name}'" if step.name else ""))
     told = [[step.name, step.n, step.ramp, -1 if step.bcs is None else len(step.bcs)] for step in steps]
