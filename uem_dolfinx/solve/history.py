@@ -378,6 +378,8 @@ def _friction_of(pair: Any) -> Array | None:
 def recording(problem: UnitedProblem) -> Iterator[History]:
     """Keep all steps that a problem takes in a ``with`` block, for gradients through their history (collective).
 
+    Example::
+
         with uem.recording(problem) as history:
             for step in uem.load_steps(problem, 10):
                 ...
