@@ -43,7 +43,7 @@ __all__ = [
     "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError", "PointLoad",
     "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid",
     "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Step", "Stribeck",
-    "SurfaceError", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
+    "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
     "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet",
     "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate",
     "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
@@ -132,6 +132,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
+    from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
     from uem_dolfinx.solve.history import History, recording
     from uem_dolfinx.solve.modes import Vibrations, modes
@@ -150,7 +151,7 @@ _LATER = {
     "ContactParameter": "contact.parameters",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
     "History": "solve.history", "recording": "solve.history",
-    "Step": "solve.step", "Vibrations": "solve.modes", "modes": "solve.modes",
+    "Step": "solve.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 
 
