@@ -66,6 +66,7 @@ def test_tutorial(folder, monkeypatch):
     assert max(known["balance"].force, known["balance"].moment) < 1e-14
 
 
+@pytest.mark.slow
 def test_viscoelastic_page():
     """A spring beside a spring and a dashpot, squeezed steadily: the force to the first order of the steps' length."""
     page = (REPO / "demos" / "site" / "howto" / "own_residuals.md").read_text(encoding="utf-8")

@@ -80,11 +80,12 @@ def order(ratio, sizes, **how):
     return found, measure.rate(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "contactor"),
     [
         (1.0, "lower"), (1e3, "upper"),
-        pytest.param(1.0, "upper", marks=pytest.mark.slow), pytest.param(1e3, "lower", marks=pytest.mark.slow),
+        (1.0, "upper"), (1e3, "lower"),
     ],
 )  # fmt: skip
 def test_order_in_energy(ratio, contactor):

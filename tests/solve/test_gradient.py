@@ -43,7 +43,7 @@ def test_forward_and_adjoint_agree(cell, degree, coupling, rigid, law):
     assert uem.integrate(ufl.algorithms.expand_derivatives(explicit)) == pytest.approx(adjoint, rel=1e-11)
 
 
-@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("coupling", [pytest.param("node_to_surface", marks=pytest.mark.slow), "mortar"])
 def test_a_body_that_contact_alone_holds(coupling):
     """A block that lies on another by its weight stays where it is across it: derivatives along that motion are zero, others right."""
     b = blocks(COMM, "triangle", 4, 6, overhang=0.25)
