@@ -15,7 +15,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.conditions.equation import Value, checked_value, values_of
 from uem_dolfinx.conditions.places import is_point, nodes_at
 from uem_dolfinx.conditions.rigid_set import RigidSet, moments
-from uem_dolfinx.errors import InputError, SpaceError, SurfaceError
+from uem_dolfinx.errors import InputError, InputTypeError, SpaceError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.tags import Part, name_of
 from uem_dolfinx.parallel import agreed, ask_together, reduced
@@ -27,6 +27,7 @@ class RigidCoupling:
         uem.RigidCoupling(tags["end"], (10.0, 0.5), force=(0.0, -3.0), moment=12.0)
         uem.RigidCoupling(tags["wheel"], (0.0, 0.0), motion=(0.0, 0.0, None))               # on a bearing, free to turn
         uem.RigidCoupling(tags["pad"], (0.0, 0.0, 2.0), force=(0.0, 0.0, -5.0), distribute=True)
+        uem.RigidCoupling(tags["flange"], (3.0, 0.0), mass=2.0, inertia=0.5)                # a motor, in dynamics
 
     It is handed to ``UnitedProblem(..., couplings=[...])``. The 3 unknowns in the plane and 6 in space are components of nodes of the
     part; all its other components are eliminated, without multipliers.
@@ -39,6 +40,10 @@ class RigidCoupling:
         motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
             None where it is free: ``(u_x, u_y, angle)`` in the plane, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in space, with r the rotation
             vector in radians. Numbers are approached along with the Dirichlet values. None leaves all free.
+        mass: of a rigid body that is fixed to the part and has its centre at the point, beside what the part has by its density. It
+            counts in dynamics and its gravity, and in ``modes``; statics does without it.
+        inertia: of that body about the point: a number in the plane, a number for all axes or a symmetric matrix ``(3, 3)`` in space, in
+            the axes of the drawing; it turns with the part.
         distribute: the force and the moment are shared by the nodes and nothing is stiffened; the point has their mean motion.
         rotations: ``"large"``, ``"small"``, or None for small ones where the residual is linear in the displacement.
 
@@ -46,8 +51,8 @@ class RigidCoupling:
         name: that of the part.
 
     Raises:
-        InputError, InputTypeError: for values of another form, or a motion of what is distributed. When the problem is made also a
-            TagError for parts that are none, and a SurfaceError for nodes on one line.
+        InputError, InputTypeError: for values of another form, an inertia that no body has, or a motion or a mass of what is distributed.
+            When the problem is made also a TagError for parts that are none, and a SurfaceError for nodes on one line.
     """
 
     def __init__(
@@ -58,6 +63,8 @@ class RigidCoupling:
         force: Value = 0.0,
         moment: Value = 0.0,
         motion: Sequence[Value | None] | None = None,
+        mass: float = 0.0,
+        inertia: npt.ArrayLike = 0.0,
         distribute: bool = False,
         rotations: str | None = None,
     ):
@@ -82,6 +89,16 @@ class RigidCoupling:
                 "motion of a RigidCoupling with distribute=True: the mean motion of a part that deforms cannot be prescribed; leave "
                 "distribute out, or prescribe displacements"
             )
+        self.mass = given.number("mass", mass, given.NOT_NEGATIVE)
+        #: About the point, in the drawing ``(n_turns, n_turns)``.
+        self.inertia = checked_inertia(inertia, self._sizes[1])
+        if self.distribute and (self.mass or self.inertia.any()):
+            raise InputError(
+                "mass or inertia of a RigidCoupling with distribute=True: only a part that moves rigidly carries them; leave distribute "
+                "out, or give the part more density"
+            )
+        #: The ``dynamics.added_mass.AddedMass`` that they are in a problem; None without any.
+        self.added: Any = None
         self._set: RigidSet | None = None
         self._asked: dict[Any, Any] = {}
 
@@ -209,6 +226,38 @@ class RigidCoupling:
         held = np.isin(np.arange(len(sums)), list(self.prescribed))
         sums = np.where(held, sums, 0.0)
         self.reactions = sums[: self._sizes[0]], sums[self._sizes[0] :]
+
+
+def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
+    """Inertia as a matrix ``(n_turns, n_turns)``.
+
+    Raises:
+        InputError, InputTypeError: if there is no body with it, whose principal moments are none of them more than the sum of the others.
+    """
+    if np.ndim(value) == 0:
+        return np.eye(n_turns) * given.number("inertia", value, given.NOT_NEGATIVE)
+    words = "a number" if n_turns == 1 else "a number, or a symmetric matrix of 3 rows"
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputTypeError(given.sentence("inertia", value, words)) from None
+    if n_turns == 1 or found.shape != (3, 3) or not np.isfinite(found).all():
+        raise InputError(given.sentence("inertia", value, words))
+    rounding = found.size * np.finfo(float).eps * np.abs(found).max()
+    if (np.abs(found - found.T) > rounding).any():
+        raise InputError(given.sentence("inertia", value, "a symmetric matrix"))
+    found = 0.5 * (found + found.T)
+    moments = np.linalg.eigvalsh(found)
+    if moments[0] < -rounding or 0.5 * moments.sum() - moments[-1] < -rounding:
+        raise InputError(
+            given.sentence(
+                "inertia",
+                value,
+                f"principal moments {moments} that are not negative, and none more than the sum of the others",
+                "no body has such an inertia",
+            )
+        )
+    return np.asarray(found)
 
 
 def nearest_turn(turn: Array, known: Array) -> Array:

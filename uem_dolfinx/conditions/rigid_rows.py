@@ -250,17 +250,35 @@ class RigidRows:
         Returns:
             Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None without any.
         """
-        s, config, g, basis = self.set, self._config, self._config.gdim, self._basis
-        if not s.large or basis is None or not len(basis.node):
+        s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
+        if not s.large or self._basis is None or not len(self._basis.node):
             return None
         f = forces[s.nodes] + self.coupling.nodal_forces()
+        if added is not None:
+            f = f - added.nodal_forces(added.loads())
         arms = s.X + config.displacement[s.nodes] - s.point - self._at.displacement(s.point[None])
         W = reduced(config.comm, arms.T @ f)
-        G = np.array([[-np.trace(W)]]) if g == 2 else W - np.trace(W) * np.eye(3)
+        if added is not None:
+            W = W + added.arms(self._at).T @ added.loads()
+        G = np.zeros((len(self._inverse), len(self._inverse)))
+        G[g:, g:] = -np.trace(W) if g == 2 else W - np.trace(W) * np.eye(3)
+        return self._at_basis(G)
+
+    def added_mass(self, factor: float | None = None) -> tuple[Ints, Array] | None:
+        """The mass at the point times a factor, by default that of the step in time, as ``curvature`` has it; None without any."""
+        added, basis = self.coupling.added, self._basis
+        if added is None or basis is None or not len(basis.node) or (factor is None and not added.factor):
+            return None
+        return self._at_basis((added.factor if factor is None else factor) * added.mass_of(self._at))
+
+    def _at_basis(self, G: Array) -> tuple[Ints, Array]:
+        """A matrix of motions ``(n_z, n_z)`` as global nodes ``(1, n)`` and block ``(1, n gdim, n gdim)`` of the basis, on one rank."""
+        config, g, basis = self._config, self._config.gdim, self._basis
+        assert basis is not None
         nodes, which = np.unique(basis.node, return_inverse=True)
-        turns = (self._inverse * self._scale[:, None])[g:, : len(which)]
+        T = (self._inverse * self._scale[:, None])[:, : len(which)]
         block = np.zeros((len(nodes), g, len(nodes), g))
-        block[which[:, None], basis.component[:, None], which, basis.component] = turns.T @ G @ turns
+        block[which[:, None], basis.component[:, None], which, basis.component] = T.T @ G @ T
         own = 1 if config.comm.rank == 0 else 0
         return np.tile(nodes, (own, 1)), np.tile(block.reshape(len(nodes) * g, -1), (own, 1, 1))
 
@@ -269,7 +287,7 @@ class RigidRows:
     def rates(self, M: PETSc.Mat, v: Array, a: Array) -> tuple[Array, Array]:
         """Velocity and acceleration that the set has as a rigid body, with the same momentum and its rate (collective).
 
-        Rules of integration that act on each node keep the distances of nodes, not their rates.
+        Rules of integration that act on each node keep the distances of nodes, not their rates. What is added at the point gets its own.
 
         Args:
             M: mass of all nodes.
@@ -277,36 +295,51 @@ class RigidRows:
             a: likewise, of their acceleration.
 
         Returns:
-            Those of the set's nodes ``(n, gdim)``, as they were where the set has no mass.
+            Those of the set's nodes ``(n, gdim)``, as they were where the set has no mass of its own.
         """
-        s, config, g = self.set, self._config, self._config.gdim
+        s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
         u, nodes, comm = config.displacement[: config.n_owned], s.nodes, self._config.comm
         at, C, _ = self._aim()
-        V, arms = velocities(at.arms(s.X)), at.arms(s.X)
-        everywhere = velocities(config.X[: config.n_owned] + u - s.middle - at.motion.translation)
+        arms, scale = at.arms(s.X), np.append(np.ones(g), np.full(C.shape[1] - g, 1.0 / s.radius))
+        V, C = velocities(arms) * scale, C * scale
+        everywhere = velocities(config.X[: config.n_owned] + u - s.middle - at.motion.translation) * scale
         W = np.stack([(M * like(M, field)).array_r.reshape(-1, g)[nodes] for field in np.moveaxis(everywhere, 2, 0)], axis=2)
         G, plain = (reduced(comm, np.einsum("ngz,ngy->zy", X, V)) for X in (W, V))
-        if not np.trace(G) > 0.0:
+        alone = not np.trace(G) > 0.0
+        if alone and added is None:
             return v[nodes], a[nodes]
-        basis = self._told_by(at, C * self._scale)
+        if added is not None:
+            G = G + added.mass_of(at) * np.outer(scale, scale)
+        basis = self._told_by(at, C)
         held = basis.halo.take(self._held_nodes.__getitem__)[np.arange(len(basis.node)), basis.component]
-        rows = np.concatenate([C, velocities(at.arms(basis.X))[np.arange(len(basis.node)), basis.component][held]])
+        rows = np.concatenate([C, self._rows_of(basis, at)[held]])
 
-        def rigid(field: Array) -> Array:
-            """The motion ``(n_z,)`` with the momentum of a field ``(n_owned, gdim)``, and with what is prescribed of it."""
+        def rigid(field: Array, of_point: Array) -> Array:
+            """The motion ``(n_z,)`` with the momentum of fields ``(n_owned, gdim)`` and at the point, and with what is prescribed of it."""
             momentum, sums = (reduced(comm, np.einsum("ngz,ng->z", X, field[nodes])) for X in (W, V))
+            if added is not None:
+                momentum = momentum + scale * added.momentum_of(at, of_point)
+            if alone:
+                # its own displacements tell what is prescribed
+                return scale * np.asarray(np.linalg.lstsq(G, momentum, rcond=None)[0], dtype=float)
             known = C @ np.linalg.solve(plain, sums)
             given = basis.halo.take(field.__getitem__)[np.arange(len(basis.node)), basis.component][held]
             k = len(rows)
             system = np.block([[G, rows.T], [rows, np.zeros((k, k))]])
             z: Array = np.asarray(np.linalg.lstsq(system, np.concatenate([momentum, known, given]), rcond=None)[0], dtype=float)
-            return z[: len(G)]
+            return scale * z[: len(G)]
 
-        z = rigid(v)
-        bend = turned(z[g:], turned(z[g:], arms))
-        left = a.copy()
+        none = np.zeros((0, g))
+        z = rigid(v, none if added is None else added.velocity)
+        turn = z[g:]
+        bend, left = turned(turn, turned(turn, arms)), a.copy()
         left[nodes] -= bend
-        return V @ z, V @ rigid(left) + bend
+        if added is None:
+            return velocities(arms) @ z, velocities(arms) @ rigid(left, none) + bend
+        at_point = added.bend(at, turn)
+        dz = rigid(left, added.acceleration - at_point)
+        added.change_rates(added.motions(at) @ z, added.motions(at) @ dz + at_point)
+        return (v[nodes], a[nodes]) if alone else (velocities(arms) @ z, velocities(arms) @ dz + bend)
 
     # -- what is left ------------------------------------------------------------------------------------------------------
 

@@ -104,11 +104,7 @@ class RigidSet:
         """Where a displacement ``(n_owned, gdim)`` takes it: the nearest rigid motion (collective)."""
         own, arms, g = u[self.nodes], self.X - self.middle, self.config.gdim
         if not self.large:
-            V = velocities(arms)
-            sums = self._mean(
-                np.concatenate([np.einsum("ngz,ngy->nzy", V, V), np.einsum("ngz,ng->nz", V, own)[:, :, None]], axis=2)
-            )
-            z: Array = np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
+            z = self.motion_of(self.drawn, u)
             return Placement(Motion(z[:g], np.eye(g), self.middle), z[g:])
         sums = self._mean(np.concatenate([own[:, :, None], own[:, :, None] * arms[:, None, :]], axis=2))
         spread = self._mean(arms[:, :, None] * arms[:, None, :])
@@ -117,6 +113,16 @@ class RigidSet:
         # sums over many nodes round where they come from: what is left of the displacement tells by how much
         near = Placement(Motion(sums[:, 0], left @ right, self.middle))
         return Placement(Motion(sums[:, 0] + self._mean(own - near.displacement(self.X)), left @ right, self.middle))
+
+    def motion_of(self, at: Placement, rates: Array) -> Array:
+        """Shift and turn about the middle nearest to rates of all owned nodes ``(n_owned, gdim)``: ``(gdim + n_turns,)`` (collective)."""
+        g, own = self.config.gdim, rates[self.nodes]
+        V = velocities(at.arms(self.X))
+        # unit turns move the nodes by as much as unit shifts do
+        scale = np.append(np.ones(g), np.full(V.shape[2] - g, 1.0 / self.radius))
+        V = V * scale
+        sums = self._mean(np.concatenate([np.einsum("ngz,ngy->nzy", V, V), np.einsum("ngz,ng->nz", V, own)[:, :, None]], axis=2))
+        return scale * np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
 
     def spread(self, u: Array, force: Array, moment: Array) -> Array:
         """Forces at the nodes that a force and a moment at the point are ``(n, gdim)`` (collective)."""

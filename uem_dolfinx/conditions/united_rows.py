@@ -193,6 +193,10 @@ class UnitedRows:
         """Nothing, likewise."""
         return []
 
+    def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
+        """Nothing, likewise."""
+        return []
+
     def settle(self, dynamics: Any) -> None:
         """Nothing, likewise."""
 

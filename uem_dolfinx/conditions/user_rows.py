@@ -52,6 +52,9 @@ class UserRows(Protocol):
     def curvature(self) -> list[tuple[Ints, Array]]:
         """What they add to the tangent, as a ``Contact`` does: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
 
+    def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
+        """Likewise what masses at points add, times a factor, by default that of the step in time (collective)."""
+
     def settle(self, dynamics: Any) -> None:
         """Give nodes the velocities and accelerations that equations that are not linear leave them (collective)."""
 
@@ -190,6 +193,10 @@ class JoinedRows:
         """As of ``UserRows``."""
         parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
         return [part for part in parts if part is not None]
+
+    def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
+        """As of ``UserRows``."""
+        return [part for part in (one.added_mass(factor) for one in self.each) if part is not None]
 
     def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
         """The couplings' forces at the owned nodes ``(n_owned, gdim)`` (collective)."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,12 +28,18 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
+if TYPE_CHECKING:
+    from uem_dolfinx.dynamics.added_mass import AddedMass
+
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
 MASSLESS = 1e-12
 #: Residual that the first acceleration is solved to.
 #: [bound; forces; -]
 ACCELERATED = 1e-13
+
+#: What a step in time begins with: time, length of the last step, energy given, displacement, fields, and masses at points.
+DynamicsMemory = tuple[float, float, float, Array, list[Array], list[list[Array]]]
 
 
 class Dynamics:
@@ -93,6 +99,8 @@ class Dynamics:
         self.dt = 0.0
         #: Factor of M in the tangent.
         self.factor = 0.0
+        #: Masses at points of rigid couplings.
+        self.added: list[AddedMass] = []
         #: Virtual work of the damping forces.
         self.damping_form: ufl.Form | None = None
 
@@ -198,6 +206,23 @@ class Dynamics:
         self.massy = self.mass.of_nodes > 0
         self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
 
+    def add(self, one: AddedMass) -> None:
+        """Let a mass at a point move along with the nodes of its coupling (collective)."""
+        one.start(self._of_nodes(self.velocity), self._down)
+        self.added.append(one)
+
+    @property
+    def inert(self) -> Bools:
+        """Components whose rigid motions have inertia: those with mass, and those of nodes that carry added ones (collective)."""
+        found = self.massy.copy()
+        for one in self.added:
+            found[one.inert] = True
+        return found
+
+    def _of_nodes(self, field: fem.Function) -> Array:
+        """Its values at the owned nodes ``(n_owned, gdim)``."""
+        return np.asarray(field.x.array[: self._n].reshape(-1, self.config.gdim))
+
     def _like(self, values: Array) -> PETSc.Vec:
         vector = self.mass.M.createVecRight()
         vector.array[:] = np.ravel(values)
@@ -205,17 +230,15 @@ class Dynamics:
 
     def begin(self, dt: float) -> None:
         """Begin a step of length ``dt`` from the committed state."""
-        s, u, v, a = self.scheme, self._u, self._velocity, self._acceleration
         self._until, self.moving, self.dt = self.time + dt, True, dt
-        # a(n+1) = rate (u - u(n)) + past, and likewise v(n+1); the difference of displacements keeps the digits
-        self._a_rate = 1.0 / (s.beta * dt**2)
-        self._a_past = -v / (s.beta * dt) - (0.5 / s.beta - 1.0) * a
-        self._v_rate = s.gamma * dt * self._a_rate
-        self._v_past = v + dt * ((1.0 - s.gamma) * a + s.gamma * self._a_past)
-        self.factor = (1.0 - s.alpha_m) / (1.0 - s.alpha_f) * self._a_rate
+        ends = self.scheme.ending(self._velocity, self._acceleration, dt)
+        self._a_rate, self._a_past, self._v_rate, self._v_past = ends
+        self.factor = self.scheme.factor(dt)
         if self.damping is not None:
             self._rate.value = self._v_rate
-            self._past.x.array[:] = self._v_past - self._v_rate * u
+            self._past.x.array[:] = self._v_past - self._v_rate * self._u
+        for one in self.added:
+            one.begin(self.scheme, dt)
 
     def _prescribed(self) -> tuple[Array, Array, Array]:
         """Velocity at the end, mean acceleration, and that in the equation of motion, of prescribed components, from what is prescribed.
@@ -243,23 +266,28 @@ class Dynamics:
         self._past.x.array[i] = self._prescribed()[0] - self._v_rate * self._displacement[i]
         self._past.x.scatter_forward()
 
-    def memory(self) -> tuple[float, float, float, Array, list[Array]]:
+    def memory(self) -> DynamicsMemory:
         """What the next step begins with."""
         fields = self.velocity, self.acceleration, self.mean_velocity, self.forces
-        return self.time, self._last, self.driven, self._u, [np.array(field.x.array) for field in fields]
+        kept, added = [np.array(field.x.array) for field in fields], [one.kept for one in self.added]
+        return self.time, self._last, self.driven, self._u, kept, added
 
-    def remember(self, memory: tuple[float, float, float, Array, list[Array]]) -> None:
+    def remember(self, memory: DynamicsMemory) -> None:
         """Go on from what ``memory`` returned."""
-        self.time, self._last, self.driven, displacement, kept = memory
+        self.time, self._last, self.driven, displacement, kept, added = memory
         for field, values in zip((self.velocity, self.acceleration, self.mean_velocity, self.forces), kept):
             field.x.array[:] = values
         self.restore()
         self._copy_committed()
         self._u = displacement
+        for one, own in zip(self.added, added):
+            one.kept = own
 
     def restore(self) -> None:
         """Leave a step that has begun; the forces are those of the committed state again."""
         self._until, self.moving = self.time, False
+        for one in self.added:
+            one.leave()
 
     @contextmanager
     def without_inertia(self) -> Iterator[None]:
@@ -280,7 +308,16 @@ class Dynamics:
         """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
         load = self._inertia() if self.moving else self._like(self.forces.x.array[: self._n])
         load.axpy(-1.0, self._weight)
+        if self.added:
+            load.array[:] += self.added_forces()
         return load
+
+    def added_forces(self, carried: bool = False) -> Array:
+        """Inertia minus weight of masses at points as nodes share them, or what couplings carried last ``(n,)`` (collective)."""
+        forces = np.zeros((self.config.n_owned, self.config.gdim))
+        for one in self.added:
+            forces[one.set.nodes] += one.nodal_forces(one.carried if carried else one.loads())
+        return forces.ravel()
 
     def _inertia(self) -> PETSc.Vec:
         """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
@@ -294,10 +331,11 @@ class Dynamics:
         inertia.scale(1.0 / (1.0 - s.alpha_f))
         return inertia
 
-    def accelerate(self, restriction: Restriction, F: PETSc.Vec) -> None:
+    def accelerate(self, restriction: Restriction, F: PETSc.Vec, added: PETSc.Mat | None = None) -> None:
         """Acceleration at the start, of bodies united by P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
 
-        A NotFiniteError refuses forces that are not finite, a LinearSolveError negative masses.
+        ``added`` is what masses at points add to M. A NotFiniteError refuses forces that are not finite, a LinearSolveError negative
+        masses.
         """
         if not np.isfinite(F.norm()):
             raise NotFiniteError(
@@ -306,6 +344,8 @@ class Dynamics:
         M = self.matrix.copy() if restriction.alone else self.matrix.PtAP(restriction.P)
         if restriction.alone:
             restriction.cross_out(M)
+        if added is not None:
+            M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         rhs = restriction.transpose(F)
         diagonal = M.getDiagonal()
         idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
@@ -326,6 +366,8 @@ class Dynamics:
         a = restriction.expand(q)
         self.acceleration.x.array[: self._n] = a.array_r[: self._n] * self.massy.ravel()
         self.acceleration.x.scatter_forward()
+        for one in self.added:
+            one.accelerate(a.array_r[: self._n].reshape(-1, self.config.gdim))
         self._acceleration = np.array(self.acceleration.x.array)
         self.forces.x.array[: self._n] = (self.mass.M * self._like(self._acceleration[: self._n])).array_r
         self.forces.x.scatter_forward()
@@ -350,6 +392,8 @@ class Dynamics:
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
             self.time, self._last, self.moving = self._until, dt, False
+        for one in self.added:
+            one.commit()
         self._copy_committed()
 
     def change_rates(self, velocity: Array, acceleration: Array) -> None:
@@ -370,14 +414,18 @@ class Dynamics:
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers that a run goes on from beside the Functions, by name."""
-        return {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
+        kept = {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
+        return kept | ({"masses at points": [np.array(one.kept).tolist() for one in self.added]} if self.added else {})
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Go on from the Functions as they are and what ``to_checkpoint`` returned; other numbers may stand beside it."""
-        self.time, self.start, self.accelerated, self._last = (kept[name] for name in self.to_checkpoint())
+        names = "time", "start", "accelerated", "last length"
+        self.time, self.start, self.accelerated, self._last = (kept[name] for name in names)
         self.resumed += 1
         self.restore()
         self._copy_committed()
+        for one, own in zip(self.added, kept.get("masses at points", [])):
+            one.kept = own
 
     @property
     def weight_of_one(self) -> Array:
@@ -391,9 +439,10 @@ class Dynamics:
     def momentum(self) -> Array:
         """Momentum ``(gdim,)``, of axisymmetric bodies that along the axis (collective)."""
         p = forms.product(self.mass.M, self._like(self.velocity.x.array[: self._n]))
-        return self.config.of_circles(reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0)))
+        sums = reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0))
+        return self.config.of_circles(sums + sum(one.momentum for one in self.added))
 
     def kinetic_energy(self) -> float:
-        """``v'Mv / 2`` (collective)."""
+        """``v'Mv / 2``, and that of masses at points (collective)."""
         v = self._like(self.velocity.x.array[: self._n])
-        return 0.5 * float(v.dot(forms.product(self.mass.M, v)))
+        return 0.5 * float(v.dot(forms.product(self.mass.M, v))) + sum(one.kinetic_energy for one in self.added)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError
 
 
@@ -42,6 +43,21 @@ class Scheme:
                 f"alpha_m = {self.alpha_m:g}, alpha_f = {self.alpha_f:g}: expected alpha_m <= alpha_f <= 1/2, since others make motions "
                 "grow; generalised_alpha(rho_inf) finds good ones"
             )
+
+    def factor(self, dt: float) -> float:
+        """Factor of M in the tangent of a step of length ``dt``."""
+        return (1.0 - self.alpha_m) / (1.0 - self.alpha_f) * (1.0 / (self.beta * dt**2))
+
+    def ending(self, v: Array, a: Array, dt: float) -> tuple[float, Array, float, Array]:
+        """How a step of length ``dt`` from velocity v and acceleration a ends.
+
+        Returns:
+            Rate and past, with ``a(n+1) = rate (u(n+1) - u(n)) + past``, then those of ``v(n+1)`` likewise; the difference of
+            displacements keeps the digits.
+        """
+        a_rate = 1.0 / (self.beta * dt**2)
+        a_past = -v / (self.beta * dt) - (0.5 / self.beta - 1.0) * a
+        return a_rate, a_past, self.gamma * dt * a_rate, v + dt * ((1.0 - self.gamma) * a + self.gamma * a_past)
 
 
 def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:

@@ -137,6 +137,11 @@ class EnergyBook(Closing):
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external) + linear
         if problem.bodies.points is not None:
             outer += problem.bodies.points.loads().ravel()
+        if added := self.dynamics.added:
+            # what masses at points do to their couplings, these do to them
+            outer -= self.dynamics.added_forces(carried=True)
+        #: Forces from outside on these masses, and their displacements.
+        self._at_points = [(one.pushed, one.places) for one in added]
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])
         self._resultants = np.array([c.resultant().force for c in problem.contacts]).reshape(-1, problem.config.gdim)
@@ -167,10 +172,13 @@ class EnergyBook(Closing):
             The new row.
         """
         u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
+        before = self._at_points
         self._read_forces()
         works = 0.5 * (forces + self._forces) @ (self._u - u)
         works[1] += self._driven - driven
         self._works += reduced(self.problem.comm, works)
+        pairs = zip(before, self._at_points)
+        self._works[1] += sum(0.5 * float(((push + pushed) * (place - was)).sum()) for (push, was), (pushed, place) in pairs)
         self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
         return self._append(self._energies())
 

@@ -142,8 +142,20 @@ class Bodies:
     def forces_at_work(self, F: PETSc.Vec) -> Any:
         """What residuals are small beside: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
         if self._fields is None:
-            return F.norm()
-        return np.maximum(self.unknowns.norms(F), self._fields.terms())
+            return self._beside(F.norm(), [one.size() for one in self._added])
+        return self._beside(np.maximum(self.unknowns.norms(F), self._fields.terms()), [one.size() for one in self._added])
+
+    @property
+    def _added(self) -> list[Any]:
+        """Masses at points."""
+        return [] if self.dynamics is None else self.dynamics.added
+
+    def _beside(self, norm: Any, more: Sequence[float]) -> Any:
+        """A norm of forces, or one for each field ``(n_fields,)``, with others of the displacement."""
+        if not more:
+            return norm
+        size = float(np.linalg.norm(more))
+        return np.hypot(norm, size if self._fields is None else self._first(size))
 
     @property
     def linear(self) -> bool:
@@ -180,7 +192,8 @@ class Bodies:
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         if self.config.moves:
             np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
-        of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
+        of_nodes = FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm()
+        of_displacement = float(np.linalg.norm([of_nodes, *(FORCE_ROUNDING * one.rounding() for one in self._added)]))
         return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
@@ -210,7 +223,7 @@ class Bodies:
         limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
         told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
         if self._fields is None:
-            return told
+            return self._beside(told, [one.size() for one in self._added])
         return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
 
     def strain_rounding(self) -> Any:

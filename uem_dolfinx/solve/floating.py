@@ -69,7 +69,7 @@ class FloatingBodies:
             self._at_rest = self._floating(self.rigid)
             if dynamics is not None:
                 # in a step in time, inertia holds what has mass
-                moving = RigidMotions(config, free & ~dynamics.massy, finite)
+                moving = RigidMotions(config, free & ~dynamics.inert, finite)
                 self._in_motion = self._floating(moving)
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.

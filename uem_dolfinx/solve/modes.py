@@ -21,7 +21,7 @@ from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import make_rows
 from uem_dolfinx.solve.system import BodySystem
-from uem_dolfinx.solve.tangent import curvature_of, together
+from uem_dolfinx.solve.tangent import added_mass, curvature_of, together
 
 #: Relative error of the eigenvalues.
 #: [bound; the eigenvalue; -]
@@ -55,7 +55,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
     Args:
         problem: in equilibrium.
         n: number of modes.
-        mass: of the bodies; None takes that of the problem's dynamics.
+        mass: of the bodies, beside which masses at points of rigid couplings count; None takes that of the problem's dynamics.
 
     Raises:
         MissingBackendError: without slepc4py.
@@ -89,7 +89,8 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         curvature = curvature_of(system.pairs, config.vector(), False, False) if system.consistent_tangent else None
         P = rows.frictionless
         with timed("united matrix"):
-            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, mass.M)
+            added = added_mass(system.linear, config.vector())
+            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, together(mass.M, added))
     return _solve(slepc, P, A, B, n)
 
 

@@ -200,6 +200,10 @@ class UnitedProblem:
         )
         for one in couplings:
             one.attach(self.config, not self.bodies.tangent.linear)
+        if couplings:
+            from uem_dolfinx.dynamics.added_mass import add_masses
+
+            add_masses(couplings, dynamics)
         self.solver = UnitedSolver(self.config.unknowns, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}

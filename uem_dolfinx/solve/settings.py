@@ -99,6 +99,8 @@ class Settings:
             }
             mass = " ".join(f"{m:.6g}" for m in d.mass.total)
             words["mass"] = f"{mass}, its matrix of norm {d.mass.M.norm():.6g}"
+            for i, one in enumerate(d.added, 1):
+                words[f"mass {i} at a point"] = " ".join(f"{m:.6g}" for m in one.masses)
         for name, extent in values.items():
             least, most = -comm.allreduce(-extent[0], op=MPI.MAX), comm.allreduce(extent[1], op=MPI.MAX)
             words[name] = "none" if least > most else f"{least:.6g}" + (f" to {most:.6g}" if most > least else "")

@@ -32,7 +32,7 @@ from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, read_forces, several_answers, unbalanced
-from uem_dolfinx.solve.tangent import curvature_of, slip_terms, together
+from uem_dolfinx.solve.tangent import added_mass, curvature_of, slip_terms, together
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
@@ -263,7 +263,8 @@ class BodySystem:
         gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
         united = sum(int(pair.united.sum()) for pair in self.pairs)
         told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        return trial, *slip_terms(self.pairs, self.unknowns.vector()), int(told[:, 0].sum()), float(told[:, 1].max())
+        terms = slip_terms(self.pairs, self.unknowns.vector(), self.linear)
+        return trial, *terms, int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
@@ -369,7 +370,8 @@ class BodySystem:
             self.place()
             self.bodies.assemble()
             self.floating.begin_motion()
-            dynamics.accelerate(self.restriction(), self.residual())
+            Q, F = self.restriction(), self.residual()
+            dynamics.accelerate(Q, F, added_mass(self.linear, F))
             if self.linear is not None:
                 self.linear.settle(dynamics)
 

@@ -168,21 +168,28 @@ def curvature_of(
     return contact_curvature(parts, du)
 
 
-def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
-    """What the directions of slip, and heat through contacts, add to the tangent, and slip to the residual; None for nothing (collective).
+def slip_terms(
+    pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None
+) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
+    """What the directions of slip, heat through contacts, and masses at points add to the tangent, and slip to the residual (collective).
 
     Args:
         pairs: of all contacts.
         du: a vector with the layout of all unknowns.
+        linear: equations of users; None for none.
+
+    Returns:
+        Either of them None for nothing.
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
     heat = [pair.heat.tangent() for pair in pairs if pair.heat is not None]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
-    if not (slips or passes):
+    masses = [] if linear is None else linear.added_mass()
+    if not (slips or passes or masses):
         return None, None
-    added = contact_curvature([*((nodes, blocks) for nodes, blocks, _ in parts), *heat], du)
+    added = contact_curvature([*((nodes, blocks) for nodes, blocks, _ in parts), *heat, *masses], du)
     if not slips:
         return added, None
     held = du.duplicate()
@@ -193,6 +200,12 @@ def slip_terms(pairs: Sequence[Interface], du: PETSc.Vec) -> tuple[PETSc.Mat | N
         held.setValues(index, forces.reshape(*nodes.shape, g)[there].ravel(), addv=PETSc.InsertMode.ADD)
     held.assemble()
     return added, held
+
+
+def added_mass(linear: UserRows | None, like: PETSc.Vec) -> PETSc.Mat | None:
+    """What masses at points of rigid couplings add to M, for vectors like this one; None without any (collective)."""
+    parts = [] if linear is None else linear.added_mass(1.0)
+    return contact_curvature(parts, like) if parts else None
 
 
 def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:
