@@ -42,6 +42,7 @@ class AddedMass:
         self.set, self._point = coupling.nodes, coupling.nodes.point
         J, self._axes = principal(coupling.inertia, len(self._point))
         self.masses: Array = np.append(coupling.mass, J)
+        self._on_bearing = set(range(len(self._point))) <= set(coupling.prescribed)
         self.places = self._now()
         self.velocity, self.acceleration, self.forces, self.carried = (np.zeros_like(self.places) for _ in range(4))
         self.factor = 0.0
@@ -92,9 +93,12 @@ class AddedMass:
 
     @property
     def inert(self) -> Indices:
-        """Owned nodes whose rigid motions it gives inertia: all of them, or that next to the point if it is a mass alone (collective)."""
-        s = self.set
-        if np.count_nonzero(self.masses[1:]) >= len(self._point) - 1:
+        """Owned nodes whose rigid motions it gives inertia (collective).
+
+        All of them, or of a mass alone the one next to the point, or none of an inertia alone on what may shift.
+        """
+        s, n_axes = self.set, np.count_nonzero(self.masses[1:])
+        if n_axes >= len(self._point) - 1 and (self.masses[0] > 0.0 or self._on_bearing):
             return s.nodes
         if not self.masses[0] > 0.0:
             return s.nodes[:0]

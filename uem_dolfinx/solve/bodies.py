@@ -192,8 +192,10 @@ class Bodies:
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         if self.config.moves:
             np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
-        of_nodes = FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm()
-        of_displacement = float(np.linalg.norm([of_nodes, *(FORCE_ROUNDING * one.rounding() for one in self._added)]))
+        of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
+        if self._added:
+            of_points = FORCE_ROUNDING * np.linalg.norm([one.rounding() for one in self._added])
+            of_displacement = float(np.hypot(of_displacement, of_points))
         return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
