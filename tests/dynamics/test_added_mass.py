@@ -30,6 +30,7 @@ class Block:
         self.V = compat.function_space(self.scene.mesh, 1, (g,))
         self.u = fem.Function(self.V, name="u")
         self.half = self.scene.tag("half", 0, lambda x: x[:, 0] >= 1.0 - 1e-9)
+        self.face = self.scene.tag("face", 0, at(0, 1.0))
         self.left = self.scene.tag("left", 0, at(0, 0.0))
         X = self.V.tabulate_dof_coordinates()[: self.V.dofmap.index_map.size_local, :g]
         m = self.masses(0.0, 3.0).of_nodes[:, 0]
@@ -59,12 +60,13 @@ class Block:
     ("cell", "turns"), [("quadrilateral", "large"), slow("quadrilateral", "small"), slow("hexahedron", "large")]
 )
 def test_as_if_it_were_meshed(cell, turns):
-    """A cantilever with a rigid end that falls askew: the same by the end's density, and by its mass and inertia."""
+    """A cantilever with a rigid end that falls askew: the same by the end's density, and by its mass and inertia far from a face."""
     found = []
     for meshed in (True, False):
         b = Block(cell)
         added = {} if meshed else {"mass": b.mass, "inertia": b.inertia}
-        end = uem.RigidCoupling(b.half, b.centre, rotations=turns, **added)
+        # without density and load the other half hangs at the face and is not strained
+        end = uem.RigidCoupling(b.half if meshed else b.face, b.centre, rotations=turns, **added)
         down = np.array([0.05, -0.3, 0.1][: b.g])
         v = b.moving([0.0] * b.g, 0.3 if b.g == 2 else (0.3, -0.2, 0.1))
         v.x.array.reshape(-1, b.g)[b.V.tabulate_dof_coordinates()[:, 0] < 0.9] = 0.0
@@ -77,7 +79,8 @@ def test_as_if_it_were_meshed(cell, turns):
         for step in uem.time_steps(problem, 0.25, 1.0):
             row = book.write(step)
             rows.append([*end.displacement, *np.atleast_1d(end.rotation), *dynamics.momentum(), row.kinetic, row.external])
-            rows[-1].append(step.newton_iterations)
+            r = [i.residual for i in step.iterations]
+            assert len(r) == 2 or any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-13 for a, after in zip(r, r[1:]))
         found.append(np.array(rows))
     assert np.abs(found[1][:, b.g]).max() > 0.1
     assert np.abs(found[1] - found[0]).max() <= 1e-10
