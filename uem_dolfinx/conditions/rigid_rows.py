@@ -310,6 +310,9 @@ class RigidRows:
             return v[nodes], a[nodes]
         if added is not None:
             G = G + added.mass_of(at) * np.outer(scale, scale)
+        # masses of the order of 1 beside rows
+        size = np.trace(G)
+        G = G / size
         basis = self._told_by(at, C)
         held = basis.halo.take(self._held_nodes.__getitem__)[np.arange(len(basis.node)), basis.component]
         rows = np.concatenate([C, self._rows_of(basis, at)[held]])
@@ -319,6 +322,7 @@ class RigidRows:
             momentum, sums = (reduced(comm, np.einsum("ngz,ng->z", X, field[nodes])) for X in (W, V))
             if added is not None:
                 momentum = momentum + scale * added.momentum_of(at, of_point)
+            momentum = momentum / size
             if alone:
                 # its own displacements tell what is prescribed
                 return scale * np.asarray(np.linalg.lstsq(G, momentum, rcond=None)[0], dtype=float)

@@ -433,7 +433,7 @@ class Dynamics:
         return self._down
 
     def weight(self) -> PETSc.Vec:
-        """Forces of gravity."""
+        """Forces of gravity on the mass of the nodes."""
         return self._weight.copy()
 
     def momentum(self) -> Array:
