@@ -40,7 +40,7 @@ __all__ = [
     "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity",
     "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError",
-    "MissingFileError", "NeoHooke", "NotFiniteError", "OrientationError", "OutputError", "PenetrationError", "PointLoad",
+    "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "PenetrationError", "PointLoad",
     "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid",
     "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff", "State", "Step", "Stribeck",
     "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
@@ -123,6 +123,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
+    from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.parameters import ContactParameter
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.geometry.mesh_files import read_mesh
@@ -140,7 +141,8 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
-    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "read_mesh": "geometry.mesh_files",
+    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
+    "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
     "RigidCoupling": "conditions.rigid_coupling",

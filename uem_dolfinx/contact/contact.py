@@ -27,6 +27,7 @@ from uem_dolfinx.contact.laws.law import (
     parameters,
     values_at,
 )
+from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.watched import WatchedContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -74,10 +75,10 @@ class Contact(WatchedContact):
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
             than this lies behind the body, not in it. None takes the body to have no back.
         friction: Coulomb's coefficient, a number, a function of place that is given points ``(3, n)`` of the reference configuration and
-            returns ``(n,)``, or a function of place and of the load factor, in time steps of the time, that counts for the step that
-            ends there; or a law of friction, made with any of these: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the
-            contact is the one without friction. It may be set anew between steps, of a contact that was made with friction, by the same
-            law; all else but ``offset`` is settled once a problem has been made.
+            returns ``(n,)``, a function of place and of the load factor, in time steps of the time, that counts for the step that
+            ends there, or an ``OfTemperature``; or a law of friction, made with any of these: ``Coulomb`` with a limit, ``Tresca``,
+            ``Stribeck``. With 0 the contact is the one without friction. It may be set anew between steps, of a contact that was made with
+            friction, by the same law; all else but ``offset`` is settled once a problem has been made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of place as of ``friction``: after every
             step the contactor has lost the volume ``wear N s`` under the force N that slips by s, with friction or without, and gaps
             are larger by its depth. :attr:`wear` and :attr:`worn_volume` tell it. The target does not wear.
@@ -204,11 +205,10 @@ class Contact(WatchedContact):
             return
         before = as_law(self._friction)
         with agreed(self.config.comm):
-            value = given_friction(value)
-            law = as_law(value)
+            law = as_law(value := given_friction(value))
             given.kind("friction", value, type(law) is type(before), f"a value for the law {type(before).__name__}")
         given.alike(self.config.comm, f"contact '{self.name}'", friction=parameters(law))
-        mu = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0, self._at)
+        mu = self._friction_at(law, self.pair.nodes, self._at)
         if mu is not None and not self.pair.frictional:
             raise InputError(
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
@@ -230,8 +230,7 @@ class Contact(WatchedContact):
         law = as_law(self._friction)
         if not follows_load(law):
             return
-        value = values_at(law, self.config, self.pair.nodes, self.name, self.contactor.dim > 0, at)
-        friction = self.pair.friction
+        value, friction = self._friction_at(law, self.pair.nodes, at), self.pair.friction
         assert value is not None and friction is not None
         if known:
             friction.set(law, value)
@@ -243,11 +242,18 @@ class Contact(WatchedContact):
         return np.zeros(0) if self.pair.friction is None else self.pair.friction.value
 
     def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
-        """Values of the law's parameter to begin with at contactors ``(n,)``; None if there is no friction (collective)."""
-        return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at)
+        """Values of a law's parameter at contactors ``(n,)``, where they have been placed; None if there is no friction (collective)."""
+        T = None
+        if isinstance(law.field, OfTemperature):
+            from uem_dolfinx.contact.sides import mean_temperatures
+
+            T = mean_temperatures(self.config, nodes, law.field.field, self.name, self._pair, self.heat)
+        return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at, T)
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values at contactors that have been placed ``(n,)``; None where they do not depend on that (collective)."""
+        law = as_law(self._friction)
+        return self._friction_at(law, self.pair.nodes, self._at) if isinstance(law.field, OfTemperature) else None
 
     @property
     def offset(self) -> Field:
@@ -317,7 +323,7 @@ class Contact(WatchedContact):
         """
         self.config, self._at, facets = config, at, config.tdim - 1
         # of a problem that could not be made
-        self._fields, _ = {}, self.__dict__.pop("surface", None)
+        self._pair, self._fields, _ = None, {}, self.__dict__.pop("surface", None)
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
@@ -408,7 +414,7 @@ class Contact(WatchedContact):
         return Sliding(
             self.config, nodes, discretisation, law=law, value=np.zeros(len(nodes)) if value is None else value,
             limits=Limits(lambda: self.surface.reference[nodes], duration), free=free, keeps_feet=self.sliding != "finite",
-            value_now=None if self._by_pairs is None else self._friction_now,
+            value_now=self._friction_now,
         )  # fmt: skip
 
     def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie:

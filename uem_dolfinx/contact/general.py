@@ -47,8 +47,8 @@ class _Part(Contact):
         return super().friction_values() if self._by_pairs is None else self._by_pairs.values.ravel()
 
     def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
-        """Values to begin with at contactors ``(n,)``; None if no pair has friction (collective)."""
-        if self._by_pairs is None:
+        """Values at contactors ``(n,)``, of pairs those to begin with; None if none has friction (collective)."""
+        if self._by_pairs is None or self._pair is not None:
             return super()._friction_at(law, nodes, at)
         if not reduced(self.config.comm, bool(self._by_pairs.at(nodes).any()), op=MPI.LOR):
             return None
@@ -78,12 +78,12 @@ class AmongContact(_Part):
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values by what contactors are on, or would touch ``(n,)``; None where friction is one for all (collective)."""
+        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
         from uem_dolfinx.contact.among_bodies import NothingNear
 
-        if self._by_pairs is None or isinstance(kinematics, NothingNear):
-            return None
-        return self._by_pairs.now(kinematics.projection.facet)
+        if self._by_pairs is None:
+            return super()._friction_now(kinematics)
+        return None if isinstance(kinematics, NothingNear) else self._by_pairs.now(kinematics.projection.facet)
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete (collective)."""

@@ -22,12 +22,12 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.conductance import Conductance, value
+from uem_dolfinx.contact.sides import Sides, sides_of
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 from uem_dolfinx.geometry.nodal_fields import NodalField
-from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
 
@@ -66,23 +66,13 @@ class Pair(Protocol):
 
 
 @dataclass(frozen=True)
-class Passage:
+class Passage(Sides):
     """What is opposite to contactors at one placement.
 
     Attributes:
-        projection: of the contactors there.
-        halo: of the nodes that count.
-        row: place of the contactor of each term ``(k,)``.
-        own: weights of the contactor's mean, zero in those of the target ``(k,)``.
-        theirs: weights of the target's mean ``(k,)``.
         areas: that heat passes through ``(n,)``.
     """
 
-    projection: Projection
-    halo: Halo
-    row: Ints
-    own: Array
-    theirs: Array
     areas: Array
 
     @property
@@ -90,29 +80,10 @@ class Passage:
         """By what the contactor's mean exceeds the target's ``(k,)``."""
         return self.own - self.theirs
 
-    def means(self, weights: Array, nodal: Array) -> Array:
-        """Of values at owned nodes ``(n_owned,)``, with the terms' weights ``(n,)`` (collective)."""
-        there = self.halo.take(nodal[:, None].__getitem__)[:, 0]
-        return np.asarray(np.bincount(self.row, weights * there, minlength=len(self.areas)), dtype=float)
-
-    def hand_on(self, weights: Array, amounts: Array) -> Array:
-        """The transpose of ``means``: amounts of contactors ``(n,)`` at owned nodes ``(n_owned,)`` (collective)."""
-        return np.asarray(self.halo.add((weights * amounts[self.row])[:, None])[:, 0])
-
 
 def passage(pair: Pair, areas: Array, current: bool) -> Passage:
     """What is opposite to contactors where they have been placed; ``areas`` and ``current`` as of ``Kinematics`` (collective)."""
-    k = pair.kinematics
-    (row, node, weight), (their_row, their_node, their_weight) = k.means()
-    none, others = np.zeros(len(row)), np.zeros(len(their_row))
-    return Passage(
-        k.projection,
-        Halo(pair.config, np.concatenate([node, their_node])),
-        np.concatenate([row, their_row]),
-        np.concatenate([weight, others]),
-        np.concatenate([none, their_weight]),
-        k.mean_areas(areas, current),
-    )
+    return Passage(**vars(sides_of(pair)), areas=pair.kinematics.mean_areas(areas, current))
 
 
 class HeatEquations(NamedTuple):

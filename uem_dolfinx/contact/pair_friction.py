@@ -35,7 +35,8 @@ class FrictionOfPairs:
         laws = [law for *_, law in self.pairs] + [self.others] * (None in friction)
         self.law = (laws or [self.others])[0]
         expected = (
-            f"values for one law, as {type(self.law).__name__}, that differ in its first parameter alone, and follow no load"
+            f"values for one law, as {type(self.law).__name__}, that differ in its first parameter alone, and follow no load or "
+            "temperature"
         )
         for law in laws:
             alike = type(law) is type(self.law) and parameters(law)[1:] == parameters(self.law)[1:]

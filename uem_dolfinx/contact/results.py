@@ -233,11 +233,11 @@ class ContactResults:
         given.kind("f", f, isinstance(f, fem.Function), "a scalar Function")
         if f.ufl_shape != () or not compat.is_on(f.function_space, self.config.mesh) or not meshed:
             raise InputError(f"contact '{self.name}': opposite needs a scalar Function on the mesh, and a target that is meshed")
-        from uem_dolfinx.contact.heat import passage
+        from uem_dolfinx.contact.sides import sides_of
 
         values = fem.Function(compat.function_space(self.config.mesh, self.config.degree))
         values.interpolate(f)
-        at = passage(self.pair, self._areas, False)
+        at = sides_of(self.pair)
         return self._field("opposite", at.means(at.theirs, values.x.array[: self.config.n_owned]))
 
     def heat_balance(self) -> float:

@@ -67,7 +67,7 @@ class Sliding:
         limits: Limits,
         free: Bools,
         keeps_feet: bool,
-        value_now: Callable[[Kinematics], Array | None] | None = None,
+        value_now: Callable[[Kinematics], Array | None],
     ):
         self.config, self.nodes, self.discretisation = config, nodes, discretisation
         self.free, self.keeps_feet = free, keeps_feet
@@ -101,7 +101,7 @@ class Sliding:
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
         self.limits.grow(kinematics)
-        if self._value_now is not None and (value := self._value_now(kinematics)) is not None:
+        if (value := self._value_now(kinematics)) is not None:
             self.discretisation.with_friction(self.limits.change(value))
         self.replace(kinematics)
 

@@ -15,6 +15,7 @@ from uem_dolfinx.contact.checks import check_initial
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
+from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.contact.tie import Tie
@@ -152,9 +153,15 @@ def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[
         contact: whose friction it is.
         to: friction at the end; a function of place and of the load factor is taken as it is.
         share: of the way that is done at a load factor, from 0 to 1.
+
+    Raises:
+        InputError: if it follows a temperature now, and is to be another that does not.
     """
     if follows_load(as_law(to)):
         return to
+    if isinstance(as_law(contact.friction).field, OfTemperature):
+        expected = "friction that follows a temperature as well, OfTemperature, which is not ramped"
+        raise InputError(given.sentence(f"friction of contact '{contact.name}'", to, expected))
     before, after = _frozen(as_law(contact.friction), contact._at), as_law(to).field
 
     def at(x: Array, s: float) -> Any:
@@ -178,6 +185,8 @@ def value_at(field: Field, x: Array) -> Any:
 def _frozen(law: FrictionLaw, at: float) -> Field:
     """The law's parameter as it is at a load factor."""
     f = law.field
+    if isinstance(f, OfTemperature):
+        return f.at(at)
     return (lambda x: np.broadcast_to(f(x, at), x.shape[1:])) if follows_load(law) and callable(f) else f
 
 

@@ -18,12 +18,13 @@ import numpy.typing as npt
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 #: A number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``; or one of place and of the load factor,
-#: in dynamics of the time, that returns ``(n,)`` or a number.
+#: in dynamics of the time, that returns ``(n,)`` or a number; or an ``OfTemperature``.
 Field: TypeAlias = float | Callable[..., npt.ArrayLike]
 
 
@@ -105,9 +106,9 @@ def parameters(law: FrictionLaw) -> list[Any]:
 
 
 def follows_load(law: FrictionLaw) -> bool:
-    """Whether the law's parameter is a function of place and of the load factor or time, of two arguments."""
-    if not callable(law.field):
-        return False
+    """Whether the law's parameter is a function of place and of the load factor or time, of two arguments, or of temperature as well."""
+    if not callable(law.field) or isinstance(law.field, OfTemperature):
+        return callable(law.field)
     try:
         arguments = signature(law.field).parameters.values()
     except (TypeError, ValueError):
@@ -117,7 +118,9 @@ def follows_load(law: FrictionLaw) -> bool:
     return len(asked) == 2
 
 
-def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool, at: float) -> Array | None:
+def values_at(
+    law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool, at: float, T: Array | None = None
+) -> Array | None:
     """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)`` (collective).
 
     Args:
@@ -127,6 +130,7 @@ def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str
         name: of the contact.
         areas: whether the contactors have any.
         at: load factor or time.
+        T: temperatures at the contactors ``(n,)``, for a law that follows them.
 
     Returns:
         The values; None if all are zero and stay so.
@@ -144,13 +148,13 @@ def values_at(law: FrictionLaw, config: Configuration, nodes: Indices, name: str
     n = len(nodes)
     if not callable(law.field):
         return np.full(n, law.field) if law.field > 0 else None
-    words, more = f"contact '{name}': friction", (at,) if follows_load(law) else ()
+    words, more = f"contact '{name}': friction", ((at,) if T is None else (at, T)) if follows_load(law) else ()
     value = asked_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
     return value if more or reduced(config.comm, int((value > 0).any())) else None
 
 
 def asked_at(
-    config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: float
+    config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: Any
 ) -> Array:
     """What a function of place, which ``words`` name, returns at the reference places of ``nodes (n,)``: ``(n,)`` (collective).
 
@@ -160,7 +164,7 @@ def asked_at(
         words: for messages.
         f: the function.
         within: values that it may have.
-        more: what else it is given, a load factor or time; a number then stands for all places.
+        more: what else it is given, a load factor or time, and temperatures ``(n,)``; a number then stands for all places.
 
     Raises:
         InputError, UserFunctionError: if it returns anything else than so many numbers of the range, or raises.
@@ -173,6 +177,6 @@ def asked_at(
         value = np.full(n, value)
     with agreed(config.comm):
         if value.shape != (n,) or not within.holds(value).all():
-            called = f"{words}({', '.join(['x', *(f'{one:.6g}' for one in more)])})"
+            called = f"{words}({', '.join(['x', *('T' if np.ndim(one) else f'{one:.6g}' for one in more)])})"
             raise InputError(f"{called} has shape {value.shape}: expected {n} numbers, {within.words.replace('a ', '')}")
     return value
