@@ -47,8 +47,8 @@ __all__ = [
     "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet",
     "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate",
     "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
-    "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "tangent", "taylor_test", "time_steps",
-    "timing", "timings", "write_checkpoint",
+    "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test",
+    "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -64,7 +64,7 @@ except ImportError as _error:
         f"uem_dolfinx needs mpi4py and DOLFINx ({_error}): install python3-dolfinx-real on Debian, or pip install 'uem_dolfinx[wheel]'"
     ) from _error
 
-from uem_dolfinx.algebra.options import multigrid_options
+from uem_dolfinx.algebra.options import multigrid_options, saddle_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact

@@ -166,17 +166,20 @@ def near_null_space(space: Nodes, A: PETSc.Mat, restriction: Restriction) -> PET
     """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
 
     Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
-    across a contact would lock its sliding.
+    across a contact would lock its sliding. Among other fields they are of the displacement's unknowns alone.
     """
-    body, n_bodies = find_bodies(space)
-    body = body[: space.n_owned]
+    nodes: Nodes = getattr(space, "config", space)
+    body, n_bodies = find_bodies(nodes)
+    body, n = body[: nodes.n_owned], nodes.block * nodes.n_owned
     own = range(n_bodies - 1) if n_bodies <= MODES_OF_THEIR_OWN else ()
-    joint = list(space.modes().transpose(1, 0, 2))
+    joint = list(nodes.modes().transpose(1, 0, 2))
     vectors: list[PETSc.Vec] = []
     for mode in [*joint, *(m * (body == i)[:, None] for i in own for m in joint)]:
         full = A.createVecLeft()
-        full.array[:] = mode.ravel()
+        full.array[:n] = mode.ravel()
         q = restriction.reduce(full)
+        if space.mixed:
+            q = PETSc.Vec().createWithArray(np.array(q.array_r[:n]), comm=space.comm)
         before = q.norm()
         # twice is enough
         for other in [*vectors, *vectors]:

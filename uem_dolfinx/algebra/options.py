@@ -75,6 +75,23 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     return {"pc_type": "hypre", "pc_hypre_type": "boomeramg"} | {f"pc_hypre_boomeramg_{k}": v for k, v in boomeramg.items()}
 
 
+def saddle_options(field: int = 1, amg: str = "") -> dict[str, Any]:
+    """PETSc options of GMRES for a displacement and a pressure: multigrid on the displacement's part of the united matrix.
+
+    The pressure's Schur complement is replaced by the diagonal of that with the diagonal of the displacement's part, which is as large
+    as the pressure's mass over the shear modulus, wherever that changes.
+
+    Args:
+        field: number of the pressure's part of the mixed space.
+        amg: as of ``multigrid_options``.
+    """
+    schur = {"type": "schur", "schur_fact_type": "lower", "schur_precondition": "selfp"}
+    parts = {"u_ksp_type": "preonly", f"{field}_ksp_type": "preonly", f"{field}_pc_type": "jacobi"}
+    parts |= {f"u_{key}": value for key, value in multigrid_options(amg).items()}
+    outer = {"ksp_type": "gmres", "ksp_gmres_restart": 200, "ksp_max_it": 1000, "ksp_pc_side": "right", "pc_type": "fieldsplit"}
+    return outer | {f"pc_fieldsplit_{k}": v for k, v in schur.items()} | {f"fieldsplit_{k}": v for k, v in parts.items()}
+
+
 def check_options(options: Any, prefix: Any) -> None:
     """Refuse options and a prefix that PETSc could not read, and types of KSP and PC that it does not know.
 

@@ -182,6 +182,8 @@ class Unknowns(Nodes):
         self.n_fields = W.num_sub_spaces
         field, kind = np.full((2, len(self.numbers)), -1)
         order = [self.config.part, *(i for i in range(self.n_fields) if i != self.config.part)]
+        #: Of the parts in solvers' options, the displacement's first.
+        self.names = ["u", *map(str, order[1:])]
         count = 0
         for number, i in enumerate(order):
             dofs = compat.part_dofs(W, i)

@@ -14,6 +14,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import NotFiniteError
@@ -320,3 +321,12 @@ def configured(u: fem.Function, displacement: int | None) -> Configuration:
     from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 
     return ConfigurationAmongFields(u, displacement)
+
+
+def solver_of(config: Configuration, prefix: str, options: Any) -> UnitedSolver:
+    """Solver of the united system, which knows of other fields where there are any; arguments as of ``UnitedSolver`` (collective)."""
+    if config.unknowns.mixed:
+        from uem_dolfinx.algebra.field_split import SolverOfFields
+
+        return SolverOfFields(config.unknowns, prefix, options)
+    return UnitedSolver(config.unknowns, prefix, options)

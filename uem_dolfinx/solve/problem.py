@@ -11,7 +11,6 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact, parts_of
@@ -29,7 +28,7 @@ from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.bodies import Bodies, configured
+from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.checks import (
     check_conditions,
     check_fields,
@@ -204,7 +203,7 @@ class UnitedProblem:
             from uem_dolfinx.dynamics.added_mass import add_masses
 
             add_masses(couplings, dynamics)
-        self.solver = UnitedSolver(self.config.unknowns, petsc_options_prefix, petsc_options)
+        self.solver = solver_of(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         pairs = [contact.attach(self.config, free, **clock) for contact in self.contacts]
