@@ -313,6 +313,11 @@ def free_petsc_garbage(comm: MPI.Comm) -> None:
     PETSc.garbage_cleanup(comm)
 
 
+def values_of(m: fem.Constant | fem.Function) -> Any:
+    """Values of a Constant, or of a Function with its ghosts (a view)."""
+    return m.x.array if isinstance(m, fem.Function) else m.value
+
+
 def in_all_cells(F: ufl.Form, u: fem.Function) -> ufl.Form:
     """A residual that couples unknowns in all cells, by nothing where it is not integrated: its tangent then has their diagonal."""
     if any(i.integral_type() == "cell" and i.subdomain_id() == "everywhere" for i in F.integrals()):

@@ -5,12 +5,14 @@ The test to read first is ``test_a_billet_is_upset_without_friction``.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from helpers import box, highest, run, scene, slow
-from plastic_scenes import FY, NU, E, H, deform, spread, tangent_in_flow
+from plastic_scenes import FY, NU, E, H, deform, spread, tangent_in_flow, to_flow
 from revolved_scenes import COMM, Revolved, rectangle
 
 import uem_dolfinx as uem
@@ -119,10 +121,5 @@ def test_tangent_by_differences(cell, degree):
     """In a state of flow after a history of large strains, from the axis on; the tangent is symmetric."""
     s = Revolved(rectangle((0, 0), (1, 1), (2, 2), cell), cell=cell, degree=degree, pose=oblique)
     law = metal(s, E, NU, FY, H, kinematic_hardening=25.0)
-    for size in (0.2, 0.3):
-        bent(s, size)
-        law.update()
-        law.commit()
-    bent(s, 0.35)
-    law.update()
+    to_flow(law, partial(bent, s))
     tangent_in_flow(law, s.u)

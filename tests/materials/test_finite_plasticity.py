@@ -5,6 +5,8 @@ The test to read first is ``test_uniaxial_tension``.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import ufl
@@ -22,6 +24,7 @@ from plastic_scenes import (
     skewed,
     spread,
     tangent_in_flow,
+    to_flow,
     vector,
     wiggle,
 )
@@ -180,12 +183,7 @@ def test_tangent_by_differences(comm, cell, degree, kind, law):
     """In a state of flow after a history of large strains and turns; the tangent is symmetric."""
     _, u = block(comm, cell, 1 if degree == 2 else 2, degree=degree, pose=skewed)
     material = uem.FinitePlasticity(u, E, NU, *LAWS[law][0], kind=kind)
-    for size in (0.2, 0.3):
-        wiggle(u, size)
-        material.update()
-        material.commit()
-    wiggle(u, 0.35)
-    material.update()
+    to_flow(material, partial(wiggle, u))
     tangent_in_flow(material, u)
 
 

@@ -5,12 +5,14 @@ The test to read first is ``test_a_bar_drawn_and_pushed``.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from helpers import at, clamp, raised, refused, rotation, slow
-from plastic_scenes import FY, MU, NU, E, H, block, deform, reaction, spread, tangent_in_flow, wiggle
+from plastic_scenes import FY, MU, NU, E, H, block, deform, reaction, spread, tangent_in_flow, to_flow, wiggle
 from scipy.optimize import brentq
 
 import uem_dolfinx as uem
@@ -67,12 +69,7 @@ def test_tangent_by_differences(comm, cell, kind):
     """In a state of flow after a history of large strains and turns; the tangent is symmetric."""
     _, u = block(comm, cell, 2)
     material = uem.FinitePlasticity(u, E, NU, FY, H, kinematic_hardening=K, kind=kind)
-    for size in (0.2, 0.3):
-        wiggle(u, size)
-        material.update()
-        material.commit()
-    wiggle(u, 0.35)
-    material.update()
+    to_flow(material, partial(wiggle, u))
     tangent_in_flow(material, u)
 
 

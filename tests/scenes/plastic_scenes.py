@@ -83,6 +83,16 @@ def wiggle(u: fem.Function, size: float) -> None:
     u.x.array[:] = size * np.stack([np.sin(2 * X[:, i] + i) * np.cos(X[:, (i + 1) % g]) for i in range(g)], axis=1).ravel()
 
 
+def to_flow(material: Any, bend: Callable[[float], None]) -> None:
+    """Take a law to a state of flow after a history of large strains and turns, by what bends the body by a size."""
+    for size in (0.2, 0.3):
+        bend(size)
+        material.update()
+        material.commit()
+    bend(0.35)
+    material.update()
+
+
 def vector(form: ufl.Form, V: Any) -> np.ndarray:
     """Assembled owned entries."""
     b = compat.create_vector(V)

@@ -80,6 +80,10 @@ class UnitingEquations:
         kept += [place[self.row[terms]].astype(np.int64), self.followed[terms], self.coefficients[terms]]
         return UnitingEquations(*kept)
 
+    def forces(self, multipliers: Array) -> Array:
+        """Forces with which they act by their multipliers ``(m,)``, on their own nodes, then on those followed ``(m + k, block)``."""
+        return np.concatenate([multipliers[:, None] * self.direction, -multipliers[self.row, None] * self.coefficients])
+
     def by_node(self) -> Iterator[tuple[Indices, Ints]]:
         """Nodes ``(n,)`` with k active equations each, and these equations ``(n, k)``, for every k."""
         which = np.flatnonzero(self.active)

@@ -10,14 +10,14 @@ and every other component follows them. Components with Dirichlet conditions are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
-from petsc4py import PETSc
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.algebra.rings import DEPENDENT
@@ -54,6 +54,12 @@ class Basis:
     X: Array
     told: float
     halo: Halo
+
+    @cached_property
+    def nodes(self) -> tuple[Ints, Ints]:
+        """Each node once, ascending, and the place of each component's among these ``(k,)``."""
+        nodes, which = np.unique(self.node, return_inverse=True)
+        return nodes, which
 
 
 class RigidRows:
@@ -170,9 +176,7 @@ class RigidRows:
         """The equations, linearised at the present displacement and with its gaps (collective)."""
         s, config, g = self.set, self._config, self._config.gdim
         at, C, lacking = self._aim()
-        # unit turns move the nodes by as much as unit shifts do
-        self._scale = np.append(np.ones(g), np.full(C.shape[1] - g, 1.0 / s.radius))
-        C = C * self._scale
+        C = C * s.scale
         lengths = np.linalg.norm(C, axis=1)
         C, lacking = C / lengths[:, None], lacking / lengths
         basis = self._told_by(at, C)
@@ -181,9 +185,9 @@ class RigidRows:
         u = config.displacement[: config.n_owned]
         off = basis.halo.take(u.__getitem__)[np.arange(k), basis.component]
         off = off - at.displacement(basis.X)[np.arange(k), basis.component]
-        V = velocities(at.arms(s.X)) * self._scale
+        V = velocities(at.arms(s.X)) * self.set.scale
         gap = u[s.nodes] - at.displacement(s.X) - V @ (inverse @ np.append(off, lacking))
-        nodes, which = np.unique(basis.node, return_inverse=True)
+        nodes, which = basis.nodes
         coefficients = np.zeros((m, g, len(nodes), g))
         coefficients[:, :, which, basis.component] = V @ inverse[:, :k]
         row, followed = np.repeat(np.arange(m * g), len(nodes)), np.tile(nodes, m * g)
@@ -220,8 +224,8 @@ class RigidRows:
         X, gone, gap = there[mine, 1 : 1 + g], there[mine, 1 + g : 1 + 2 * g], there[mine, 1 + 2 * g :]
         rows, taken = row[mine], terms[mine] * gone
         terms[mine] -= taken
-        nodes, which = np.unique(basis.node, return_inverse=True)
-        V = np.einsum("kg,kgz->kz", taken, velocities(self._at.arms(X)) * self._scale) @ self._inverse[:, : len(which)]
+        nodes, which = basis.nodes
+        V = np.einsum("kg,kgz->kz", taken, velocities(self._at.arms(X)) * self.set.scale) @ self._inverse[:, : len(which)]
         added = np.zeros((m, len(nodes), g))
         np.add.at(added.reshape(m, len(nodes) * g), (rows[:, None], which * g + basis.component), V)
         i, k = np.nonzero(np.abs(added).max(axis=2, initial=0.0) > NEGLIGIBLE)
@@ -275,8 +279,8 @@ class RigidRows:
         """A matrix of motions ``(n_z, n_z)`` as global nodes ``(1, n)`` and block ``(1, n gdim, n gdim)`` of the basis, on one rank."""
         config, g, basis = self._config, self._config.gdim, self._basis
         assert basis is not None
-        nodes, which = np.unique(basis.node, return_inverse=True)
-        T = (self._inverse * self._scale[:, None])[:, : len(which)]
+        nodes, which = basis.nodes
+        T = (self._inverse * self.set.scale[:, None])[:, : len(which)]
         block = np.zeros((len(nodes), g, len(nodes), g))
         block[which[:, None], basis.component[:, None], which, basis.component] = T.T @ G @ T
         own = 1 if config.comm.rank == 0 else 0
@@ -284,13 +288,13 @@ class RigidRows:
 
     # -- motion in time ----------------------------------------------------------------------------------------------------
 
-    def rates(self, M: PETSc.Mat, v: Array, a: Array) -> tuple[Array, Array]:
+    def rates(self, times_mass: Callable[[Array], Array], v: Array, a: Array) -> tuple[Array, Array]:
         """Velocity and acceleration that the set has as a rigid body, with the same momentum and its rate (collective).
 
         Rules of integration that act on each node keep the distances of nodes, not their rates. What is added at the point gets its own.
 
         Args:
-            M: mass of all nodes.
+            times_mass: multiplies a field at the owned nodes by the mass ``(n_owned, gdim)`` (collective).
             v: velocity of the owned nodes ``(n_owned, gdim)``.
             a: likewise, of their acceleration.
 
@@ -300,10 +304,10 @@ class RigidRows:
         s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
         u, nodes, comm = config.displacement[: config.n_owned], s.nodes, self._config.comm
         at, C, _ = self._aim()
-        arms, scale = at.arms(s.X), np.append(np.ones(g), np.full(C.shape[1] - g, 1.0 / s.radius))
+        arms, scale = at.arms(s.X), s.scale
         V, C = velocities(arms) * scale, C * scale
         everywhere = velocities(config.X[: config.n_owned] + u - s.middle - at.motion.translation) * scale
-        W = np.stack([(M * like(M, field)).array_r.reshape(-1, g)[nodes] for field in np.moveaxis(everywhere, 2, 0)], axis=2)
+        W = np.stack([times_mass(field)[nodes] for field in np.moveaxis(everywhere, 2, 0)], axis=2)
         G, plain = (reduced(comm, np.einsum("ngz,ngy->zy", X, V)) for X in (W, V))
         alone = not np.trace(G) > 0.0
         if alone and added is None:
@@ -349,7 +353,7 @@ class RigidRows:
 
     def _rows_of(self, basis: Basis, at: Placement) -> Array:
         """Rows B of the components that are left ``(k, n_z)``."""
-        return (velocities(at.arms(basis.X)) * self._scale)[np.arange(len(basis.node)), basis.component]
+        return (velocities(at.arms(basis.X)) * self.set.scale)[np.arange(len(basis.node)), basis.component]
 
     def _told_by(self, at: Placement, C: Array) -> Basis:
         """Components that tell the motion together with C, those of before as long as they do so well enough (collective)."""
@@ -369,7 +373,7 @@ class RigidRows:
             SurfaceError: if there are too few.
         """
         s, config, g = self.set, self._config, self._config.gdim
-        across = velocities(at.arms(s.X)) * self._scale
+        across = velocities(at.arms(s.X)) * self.set.scale
         chosen: list[Array] = []
         for c in np.linalg.qr(C.T)[0].T:
             across = _without(across, c)
@@ -407,13 +411,6 @@ def _without(rows: Array, row: Array) -> Array:
     """Rows ``(..., n)`` without what they have along another one."""
     q = row / np.linalg.norm(row)
     return rows - (rows @ q)[..., None] * q
-
-
-def like(M: PETSc.Mat, values: Array) -> PETSc.Vec:
-    """A vector that M acts on, with values at the owned nodes ``(n_owned, gdim)``."""
-    vector = M.createVecRight()
-    vector.array[:] = values.ravel()
-    return vector
 
 
 def _told(rows: Array) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array, Indices, cross_products
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion, rotation_vector
 from uem_dolfinx.parallel import reduced
@@ -29,14 +29,14 @@ def velocities(arms: Array) -> Array:
 def turned(turns: Array, arms: Array) -> Array:
     """``turns x arms`` of vectors ``(..., n_turns)`` and ``(..., gdim)``; in the plane a turn is one number."""
     if arms.shape[-1] == 3:
-        return np.cross(turns, arms)
+        return cross_products(turns, arms)
     return np.asarray(turns * np.stack([-arms[..., 1], arms[..., 0]], axis=-1))
 
 
 def moments(arms: Array, forces: Array) -> Array:
     """``arms x forces (..., gdim)``; one number each in the plane, ``(..., n_turns)``."""
     if arms.shape[-1] == 3:
-        return np.cross(arms, forces)
+        return cross_products(arms, forces)
     return np.asarray(arms[..., :1] * forces[..., 1:] - arms[..., 1:] * forces[..., :1])
 
 
@@ -90,6 +90,12 @@ class RigidSet:
         self.middle = self._mean(self.X)
         self.radius = float(np.sqrt(self._mean(((self.X - self.middle) ** 2).sum(axis=1, keepdims=True))[0]))
 
+    @property
+    def scale(self) -> Array:
+        """Of shifts and turns, by which unit turns move the nodes by as much as unit shifts do ``(gdim + n_turns,)``."""
+        g = self.config.gdim
+        return np.append(np.ones(g), np.full(1 if g == 2 else 3, 1.0 / self.radius))
+
     def _mean(self, values: Array) -> Array:
         """Mean of values ``(n, ...)`` at the nodes over all ranks (collective)."""
         return np.asarray(reduced(self.config.comm, values.sum(axis=0))) / max(self.count, 1)
@@ -116,13 +122,10 @@ class RigidSet:
 
     def motion_of(self, at: Placement, rates: Array) -> Array:
         """Shift and turn about the middle nearest to rates of all owned nodes ``(n_owned, gdim)``: ``(gdim + n_turns,)`` (collective)."""
-        g, own = self.config.gdim, rates[self.nodes]
-        V = velocities(at.arms(self.X))
-        # unit turns move the nodes by as much as unit shifts do
-        scale = np.append(np.ones(g), np.full(V.shape[2] - g, 1.0 / self.radius))
-        V = V * scale
+        own = rates[self.nodes]
+        V = velocities(at.arms(self.X)) * self.scale
         sums = self._mean(np.concatenate([np.einsum("ngz,ngy->nzy", V, V), np.einsum("ngz,ng->nz", V, own)[:, :, None]], axis=2))
-        return scale * np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
+        return self.scale * np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
 
     def spread(self, u: Array, force: Array, moment: Array) -> Array:
         """Forces at the nodes that a force and a moment at the point are ``(n, gdim)`` (collective)."""

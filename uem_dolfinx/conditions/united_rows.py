@@ -242,10 +242,12 @@ class UnitedRows:
         Args:
             multipliers: forces along what they eliminate ``(m,)``.
         """
-        eq, config = self.equations, self._config
-        nodes = np.concatenate([config.to_global(eq.node), eq.followed])
-        own, theirs = multipliers[:, None] * eq.direction, -multipliers[eq.row, None] * eq.coefficients
-        return config.add_at_owners(nodes, np.concatenate([own, theirs]))
+        return forces_of(self._config, self.equations, multipliers)
+
+
+def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -> Array:
+    """Forces of equations by their multipliers ``(m,)`` at the owned nodes ``(n_owned, gdim)`` (collective)."""
+    return config.add_at_owners(np.concatenate([config.to_global(eq.node), eq.followed]), eq.forces(multipliers))
 
 
 def unite(

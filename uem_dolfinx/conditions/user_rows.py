@@ -11,7 +11,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, constants_of
 from uem_dolfinx.conditions.rigid_rows import RigidRows
-from uem_dolfinx.conditions.united_rows import UnitedRows, unite
+from uem_dolfinx.conditions.united_rows import UnitedRows, forces_of, unite
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agree
@@ -208,12 +208,11 @@ class JoinedRows:
 
     def settle(self, dynamics: Any) -> None:
         """As of ``UserRows``."""
-        for one in self.each if self.turning else ():
-            if one.set.large:
-                n, g = self._config.n_owned, self._config.gdim
-                v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
-                v[one.set.nodes], a[one.set.nodes] = one.rates(dynamics.mass.M, v, a)
-                dynamics.change_rates(v.ravel(), a.ravel())
+        n, g = self._config.n_owned, self._config.gdim
+        for one in (one for one in self.each if one.set.large):
+            v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
+            v[one.set.nodes], a[one.set.nodes] = one.rates(dynamics.mass.times, v, a)
+            dynamics.change_rates(v.ravel(), a.ravel())
 
     def check(self) -> None:
         """As of ``UserRows``."""
@@ -226,13 +225,6 @@ class JoinedRows:
     def forces(self, multipliers: Array) -> Array:
         """As of ``UserRows``."""
         return forces_of(self._config, self.equations, multipliers)
-
-
-def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -> Array:
-    """Forces of equations by their multipliers ``(m,)`` at the owned nodes ``(n_owned, gdim)`` (collective)."""
-    nodes = np.concatenate([config.to_global(eq.node), eq.followed])
-    own, theirs = multipliers[:, None] * eq.direction, -multipliers[eq.row, None] * eq.coefficients
-    return config.add_at_owners(nodes, np.concatenate([own, theirs]))
 
 
 def _refuse_shared(coupling: RigidCoupling, taken: Bools) -> None:

@@ -27,7 +27,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-from uem_dolfinx.geometry.nodal_fields import NodalField
+from uem_dolfinx.geometry.nodal_fields import nodal_field
 from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
 
@@ -130,7 +130,7 @@ class Heat:
             raise InputError(
                 f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
             )
-        self.law, self.field, self._pair = law, NodalField(config, law.field, words), pair
+        self.law, self.field, self._pair = law, nodal_field(config, law.field, words), pair
         self._areas, self._current, self._pressures = areas, current, pressures
         if law.perfect and self.field.weights.shape[1] > 1:
             raise SpaceError(

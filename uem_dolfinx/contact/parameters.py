@@ -9,7 +9,9 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array, cross_products
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.rigid_set import turned
+from uem_dolfinx.conditions.united_rows import forces_of
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.mortar import Mortar
@@ -66,14 +68,12 @@ def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:
     if m.parameter == "place":
         return np.tile(np.eye(x.shape[1])[entry[0]], (len(x), 1))
     target = m.contact.pair.target
-    return turned(x - target.reference(x.shape[1]), entry)
+    return turned_by(entry, x - target.reference(x.shape[1]))
 
 
-def turned(v: Array, entry: tuple[int, ...]) -> Array:
+def turned_by(entry: tuple[int, ...], v: Array) -> Array:
     """How vectors ``(n, gdim)`` change with an angle of turn."""
-    if v.shape[1] == 2:
-        return np.column_stack([-v[:, 1], v[:, 0]])
-    return cross_products(np.broadcast_to(np.eye(3)[entry[0]], v.shape), v)
+    return turned(np.eye(3)[entry[0]] if entry else np.ones(1), v)
 
 
 def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
@@ -111,10 +111,7 @@ def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tupl
         pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
     own, config = pair.equations(), pair.config
     longer = (_lengths(pair) / length)[own.contactor]
-    test, by = own.test, multipliers * longer
-    nodes = np.concatenate([config.to_global(test.node), test.followed])
-    forces = np.concatenate([test.direction * by[:, None], -test.coefficients * by[test.row, None]])
-    return own.trial.gap * longer, config.add_at_owners(nodes, forces)
+    return own.trial.gap * longer, forces_of(config, own.test, multipliers * longer)
 
 
 def rubbed(pair: Interface) -> Array:

@@ -13,7 +13,7 @@ from uem_dolfinx.contact.laws.conductance import value
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-from uem_dolfinx.geometry.nodal_fields import NodalField
+from uem_dolfinx.geometry.nodal_fields import nodal_field
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import Projection
 
@@ -90,7 +90,7 @@ def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: s
             f"{words} follows a temperature, and there is none among the unknowns: expected a mixed Function with displacement= its "
             "displacement's part"
         )
-    T = NodalField(config, field, words).values
+    T = nodal_field(config, field, words).values
     if not hasattr(pair, "kinematics"):
         return np.asarray(T[nodes])
     at = sides_of(pair)

@@ -184,9 +184,8 @@ class TiedRows:
 
     def handed_on(self, equations: UnitingEquations, multipliers: Array) -> tuple[Ints, Array]:
         """Global nodes ``(k,)`` and forces ``(k, gdim)`` on both bodies of ``multipliers (n, gdim)`` of the equations."""
-        mu = multipliers[self.has]
         nodes = np.concatenate([self.config.to_global(equations.node), equations.followed])
-        return nodes, np.concatenate([mu[:, None] * equations.direction, -mu[equations.row, None] * equations.coefficients])
+        return nodes, equations.forces(multipliers[self.has])
 
     def curvature(self, multipliers: Array) -> list[tuple[Ints, Array]]:
         """Blocks of minus the derivatives of the rows times ``multipliers (n, gdim)``, as of ``Kinematics`` (collective)."""

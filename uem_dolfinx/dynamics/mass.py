@@ -77,7 +77,7 @@ class Mass:
     @cached_property
     def _row_sums(self) -> Array:
         """Share of each owned node in the total ``(n_owned, gdim)`` (collective)."""
-        return self._times(np.ones((self.config.n_owned, self.config.gdim)))
+        return self.times(np.ones((self.config.n_owned, self.config.gdim)))
 
     @property
     def total(self) -> Array:
@@ -232,7 +232,7 @@ class Mass:
         ``xi (n_owned, gdim, k)`` are functions at the nodes, ``s (n_owned, gdim)`` factors.
         """
         fields = s[..., None] * xi
-        momenta = np.stack([self._times(fields[..., k]) for k in range(xi.shape[2])], axis=2)
+        momenta = np.stack([self.times(fields[..., k]) for k in range(xi.shape[2])], axis=2)
         return self._products(fields, momenta), momenta
 
     def _unable(self, here: Bools, needed: Bools, distance: Array | None) -> MassError:
@@ -302,7 +302,7 @@ class Mass:
         sums = [left[here].transpose(1, 2, 0) @ right[here].transpose(1, 0, 2) for here in self._nodes_of_bodies]
         return np.asarray(reduced(self.config.comm, np.array(sums)))
 
-    def _times(self, field: Array) -> Array:
+    def times(self, field: Array) -> Array:
         """M times a field at the owned nodes ``(n_owned, gdim)`` (collective)."""
         x, y = self.M.createVecs()
         x.array[:] = field.ravel()

@@ -31,6 +31,8 @@ class Configuration(Nodes):
 
     #: Whether nodes are where the unknowns take them; a scalar field takes them nowhere.
     moves = True
+    #: What results and checkpoints call what is solved for.
+    name = "displacement"
 
     def __init__(self, u: fem.Function):
         #: The Function with all unknowns, and the displacement in UFL; one and the same unless there are other fields.
@@ -91,15 +93,15 @@ class Configuration(Nodes):
 
     def functions(self) -> dict[str, fem.Function]:
         """The displacement, and other fields, as Functions of spaces of their own by name, up to date (first call: collective)."""
-        return {"displacement": self.whole}
+        return {self.name: self.whole}
 
     def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
         """Write values of all unknowns, ghosts included ``(n,)``, to Functions that are like those of ``functions``."""
-        functions["displacement"].x.array[:] = values
+        functions[self.name].x.array[:] = values
 
     def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
         """Values of all unknowns, ghosts included ``(n,)``, from Functions that are like those of ``functions``."""
-        return np.array(functions["displacement"].x.array)
+        return np.array(functions[self.name].x.array)
 
     @property
     def displacement(self) -> Array:

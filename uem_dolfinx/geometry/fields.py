@@ -51,6 +51,8 @@ class ConfigurationAmongFields(Configuration):
         self.dofs: Ints = np.zeros((self.n_local, self.gdim), dtype=np.int64)
         if len(nodes):
             self.dofs[nodes.ravel()] = own.reshape(-1, self.gdim)
+        #: ``NodalField`` of other parts by their number, as far as these were asked for.
+        self.nodal_fields: dict[int, Any] = {}
         self._unknowns = Unknowns(self)
         first = np.append(self._first_nodes[:-1], np.iinfo(np.int64).max)
         numbers = super().to_global(np.arange(self.n_local))

@@ -67,6 +67,14 @@ class NodalField:
         return np.asarray(self.config.rows(sent.x.array[: len(self.config.unknowns.place)]).ravel())
 
 
+def nodal_field(config: ConfigurationAmongFields, part: int, what: str) -> NodalField:
+    """The field of a part at nodes, made once; arguments and errors as of ``NodalField``."""
+    if part not in config.nodal_fields:
+        config.nodal_fields[part] = NodalField(config, part, what)
+    found: NodalField = config.nodal_fields[part]
+    return found
+
+
 def _degree(config: Any, part: int, what: str) -> int:
     """Degree of the field, which must be one that nodes of the displacement tell."""
     W = config.whole.function_space

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
-from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
@@ -23,7 +19,7 @@ class ScalarConfiguration(Configuration):
         SpaceError: if ``u`` is in no Lagrange space of degree 1 or 2, or on a surface in space.
     """
 
-    moves = False
+    moves, name = False, "field"
 
     def _take(self, V: Any) -> None:
         degree, self.tdim = compat.lagrange_degree(V), V.mesh.topology.dim
@@ -39,18 +35,6 @@ class ScalarConfiguration(Configuration):
     def place_of(self, unknown: int) -> str:
         """Where the node of a local unknown is, for error messages."""
         return f"the value at {self.describe(unknown)}"
-
-    def functions(self) -> dict[str, fem.Function]:
-        """The field alone."""
-        return {"field": self.whole}
-
-    def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
-        """As of ``Configuration``."""
-        functions["field"].x.array[:] = values
-
-    def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
-        """As of ``Configuration``."""
-        return np.array(functions["field"].x.array)
 
     @property
     def x(self) -> Array:

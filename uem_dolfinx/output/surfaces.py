@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uem_dolfinx import given
+from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, MissingBackendError, OutputError
 from uem_dolfinx.files import given_path, keep_aside, on_rank_0
@@ -22,10 +21,9 @@ from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.time_steps import TimeStep
 
-#: VTK's number of a facet's kind, and the order of its nodes there, by its dimension and number of nodes.
-KINDS = {
-    (1, 2): (3, [0, 1]), (1, 3): (21, [0, 1, 2]), (2, 3): (5, [0, 1, 2]), (2, 6): (22, [0, 1, 2, 5, 3, 4]),
-    (2, 4): (9, [0, 1, 3, 2]), (2, 9): (28, [0, 1, 3, 2, 4, 6, 7, 5, 8]),
+#: VTK's numbers of facets by their cell and degree.
+VTK_TYPES = {
+    ("interval", 1): 3, ("interval", 2): 21, ("triangle", 1): 5, ("triangle", 2): 22, ("quadrilateral", 1): 9, ("quadrilateral", 2): 28,
 }  # fmt: skip
 
 
@@ -104,27 +102,25 @@ class SurfaceWriter(Closing):
                         )
             on_rank_0(comm, f"{self._index} cannot be written", self._write_index)
 
-    def _fields(self, contact: Any) -> dict[str, Callable[[Any], Array]]:
+    def _fields(self, contact: Any) -> dict[str, Array]:
         """Values at local nodes by name (collective)."""
-        g, found = self.problem.config.gdim, {}
-        for name in ("pressure", "gap", "active", "force"):
-            values = getattr(contact, name).x.array
-            found[name] = values.reshape(-1, g) if name == "force" else values
-        found["displacement"] = self.problem.config.displacement
-        return found
+        config = self.problem.config
+        found = {name: getattr(contact, name).x.array for name in ("pressure", "gap", "active")}
+        return found | {"force": contact.force.x.array.reshape(-1, config.gdim), "displacement": config.displacement}
 
-    def _write(self, path: Path, surface: TargetFacets, fields: dict[str, Any]) -> None:
+    def _write(self, path: Path, surface: TargetFacets, fields: dict[str, Array]) -> None:
         """This rank's facets of one surface, if there are any (collective)."""
         import pyvista
 
         config = self.problem.config
-        kind, order = KINDS[surface.shape.dim, surface.dofs.shape[1]]
+        shape = surface.shape
         nodes, cells = np.unique(surface.dofs, return_inverse=True)
         points = np.zeros((len(nodes), 3))
         points[:, : config.gdim] = config.x[nodes]
         error = None
         if len(nodes):
-            grid = pyvista.UnstructuredGrid({kind: cells.reshape(surface.dofs.shape)[:, order]}, points)
+            cells = compat.vtk_nodes(shape.cell, cells.reshape(surface.dofs.shape))
+            grid = pyvista.UnstructuredGrid({VTK_TYPES[shape.cell, shape.degree]: cells}, points)
             for name, values in fields.items():
                 own = values[nodes]
                 grid.point_data[name] = np.pad(own, ((0, 0), (0, 3 - config.gdim))) if own.ndim > 1 else own

@@ -40,7 +40,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.parameters import ContactParameter, motion_of, rubbed, thickened, turned
+from uem_dolfinx.contact.parameters import ContactParameter, motion_of, rubbed, thickened, turned_by
 from uem_dolfinx.contact.pressure_slopes import PressureSlopes
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
@@ -215,7 +215,7 @@ class Linearised:
         gaps[own] = np.bincount(rows.row, there, len(rows)) - np.einsum("mg,mg->m", rows.direction, b[rows.node])
         if m.parameter == "turn":
             nodes, force = pair.nodal_forces(pair.trial)
-            pushed = config.add_at_owners(nodes, turned(force, entry))
+            pushed = config.add_at_owners(nodes, turned_by(entry, force))
         if (stiffness := self.stiffness_of([k])) is not None:
             pushed = pushed + forms.product(stiffness, config.vector(b)).array_r.reshape(-1, config.gdim)
         return gaps, -pushed
@@ -273,13 +273,13 @@ class Linearised:
     def prescribed_by(self, m: Any, values: Array) -> Array:
         """What the ``values`` of a control make of the Dirichlet values of the owned components, zero where free ``(n_owned, gdim)``."""
         bodies, config, found = self.problem.bodies, self.config, []
-        before = np.array(m.x.array if isinstance(m, fem.Function) else m.value)
+        before = np.array(forms.values_of(m))
         for now in (values, 0.0 * values):
             out = np.zeros(len(self.problem.u.x.array))
-            _set(m, now)
+            forms.values_of(m)[...] = now
             compat.set_bc_values(out, bodies.bcs)
             found.append(out)
-        _set(m, before)
+        forms.values_of(m)[...] = before
         return np.where(bodies.free, 0.0, (found[0] - found[1]).reshape(-1, config.gdim))[: config.n_owned]
 
 
@@ -413,11 +413,3 @@ def _along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.F
         parts = [float(np.asarray(change)[i]) * (by[i] if i else by) for i in np.ndindex(shape) if np.asarray(change)[i] != 0.0]
         integrals += [integral.reconstruct(integrand=sum(parts[1:], parts[0]))] if parts else []
     return forms.expanded(ufl.Form(integrals))
-
-
-def _set(m: Any, values: npt.ArrayLike) -> None:
-    """Give a Constant or a Function other values."""
-    if isinstance(m, fem.Function):
-        m.x.array[:] = values
-    else:
-        m.value[...] = values

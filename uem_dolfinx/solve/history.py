@@ -106,7 +106,7 @@ class History:
         # values that a ramp began with: of the step before, or of that before the first step of the ramp
         began = [r for r in records if start is None or r.call != call]
         ramp = factor + (1.0 - factor) * (began[-1].ramp if began else 0.0)
-        inputs = [np.array(_values(m)) for m in self._inputs]
+        inputs = [np.array(forms.values_of(m)) for m in self._inputs]
         self._records.append(
             Record(
                 before=before,
@@ -156,7 +156,7 @@ class History:
                         "multiplied in the residual"
                     )
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
-        values, friction = [np.array(_values(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
+        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
         offsets = [pair.discretisation.offset for pair in problem.pairs]
         found: list[Any] = [None] * len(some)
         by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
@@ -221,7 +221,7 @@ class History:
     def _put(self, values: Sequence[Array], friction: Sequence[Array | None], offsets: Sequence[Array | None]) -> None:
         """Let the problem be made of these (collective)."""
         for m, value in zip(self._inputs, values):
-            _values(m)[...] = value
+            forms.values_of(m)[...] = value
         for pair, mu, offset in zip(self.problem.pairs, friction, offsets):
             if pair.friction is not None and mu is not None:
                 pair.discretisation.with_friction(pair.friction.limits.change(mu))
@@ -363,11 +363,6 @@ def _transposed(A: PETSc.Mat) -> PETSc.Mat:
     out = PETSc.Mat()
     A.transpose(out)
     return out
-
-
-def _values(m: Any) -> Array:
-    """Values of a Constant or a Function, a view."""
-    return m.x.array if isinstance(m, fem.Function) else m.value
 
 
 def _friction_of(pair: Any) -> Array | None:

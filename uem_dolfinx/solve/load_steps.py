@@ -66,7 +66,7 @@ def load_steps(
         from uem_dolfinx.solve.stages import check_stages
 
         check_stages(problem, steps)
-    begin_checkpoint(checkpoint, problem.state, next(iter(problem.config.functions().values())))
+    begin_checkpoint(checkpoint, problem.state, problem.config.functions()[problem.config.name])
     if isinstance(steps, Sequence):
         made, total = _in_stages(problem, steps), sum(step.n for step in steps)
     else:

@@ -81,7 +81,7 @@ class Tangent:
 
     def update(self) -> None:
         """Assemble K unless nothing it depends on has changed (collective)."""
-        values = [np.array(c.x.array if isinstance(c, fem.Function) else c.value) for c in self._inputs]
+        values = [np.array(forms.values_of(c)) for c in self._inputs]
         factor = self._dynamics.factor if self._dynamics is not None else 0.0
         same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
         same &= factor == self._factor

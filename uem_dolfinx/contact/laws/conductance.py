@@ -50,8 +50,7 @@ class Conductance:
         dt: float | fem.Constant = 1.0,
     ):
         self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
-        whole = isinstance(field, (int, np.integer)) and not isinstance(field, bool)
-        self.field = int(given.kind("field", field, whole, "the number of the part of the mixed space that is the temperature"))
+        self.field = part_number(field)
         self.temperature = temperature if temperature is None else _number("temperature", temperature, given.FINITE)
         self.friction_share = friction_share if friction_share is None else given.number("friction_share", friction_share, SHARE)
         self.dt = _number("dt", dt, given.POSITIVE)
@@ -93,3 +92,9 @@ def _number(what: str, number: Any, within: given.Range) -> float | fem.Constant
         given.number(what, number.value, within)
         return number
     return given.number(what, number, within)
+
+
+def part_number(field: Any) -> int:
+    """Which part of a mixed space is the temperature; InputTypeError for what is no whole number."""
+    whole = isinstance(field, (int, np.integer)) and not isinstance(field, bool)
+    return int(given.kind("field", field, whole, "the number of the part of the mixed space that is the temperature"))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.conductance import part_number
 
 
 class OfTemperature:
@@ -30,8 +30,7 @@ class OfTemperature:
 
     def __init__(self, f: Callable[[Array, float, Array], npt.ArrayLike], *, field: int):
         self.f = given.kind("f", f, callable(f), "a function of places, load factor and temperatures, f(x, t, T)")
-        whole = isinstance(field, (int, np.integer)) and not isinstance(field, bool)
-        self.field = int(given.kind("field", field, whole, "the number of the part of the mixed space that is the temperature"))
+        self.field = part_number(field)
 
     def __call__(self, x: Array, t: float, T: Array) -> Any:
         """Its values ``(n,)``."""
