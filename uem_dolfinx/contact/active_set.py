@@ -55,6 +55,12 @@ class Violations:
     release: Bools
     violation: Array
 
+    @classmethod
+    def none(cls, n: int) -> Violations:
+        """Nothing is wrong with n contactors."""
+        right = np.zeros(n, dtype=bool)
+        return cls(right, right, np.zeros(n))
+
     @property
     def count(self) -> int:
         """Number of wrong contactors."""

@@ -55,6 +55,11 @@ class NothingNear(NodalKinematics):
     """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
 
     @property
+    def idle(self) -> bool:
+        """Yes: nothing is near."""
+        return True
+
+    @property
     def movable(self) -> Bools:  # type: ignore[override]
         """None can close its gap ``(n,)``."""
         return np.zeros(len(self.gap), bool)

@@ -54,11 +54,11 @@ def anchors_of(f: FrictionState, target: Target, terms: bool) -> tuple[Array, tu
         terms: whether contactors, global nodes and weights ``(k,)`` of a mesh are asked for.
     """
     if isinstance(target, MeshTarget):
-        N, own = target.shape.tabulate(f.xi).N, target.facets.current()
-        here = np.einsum("na,nag->ng", N, target.of_facets(f.facet, own.x)) + f.anchor
+        N, facets = target.shape.tabulate(f.xi).N, target.facets
+        here = np.einsum("na,nag->ng", N, target.of_facets(f.facet, facets.x)) + f.anchor
         if not terms:
             return here, None
-        nodes = target.of_facets(f.facet, own.nodes)
+        nodes = target.of_facets(f.facet, facets.nodes)
         row, a = np.nonzero(nodes >= 0)
         return here, (row.astype(np.int64), nodes[row, a], N[row, a])
     motion: Motion | None = target.motion

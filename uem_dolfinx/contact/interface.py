@@ -98,6 +98,7 @@ class Interface(Told):
         """
         if self.tie is not None and not self.tie.begin_placement():
             return
+        first = not hasattr(self, "kinematics")
         self.kinematics = self.discretisation.place(self.points, self.trial)
         p = self.projection
         bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
@@ -108,6 +109,10 @@ class Interface(Told):
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
             )
         agree(self.config.comm, error)
+        if first or not self.kinematics.idle:
+            self._place_friction()
+
+    def _place_friction(self) -> None:
         if self.friction is not None:
             assert self.trial.friction is not None
             self.friction.place(self.kinematics, self.trial.friction)
@@ -117,8 +122,8 @@ class Interface(Told):
         # values that are the same on one rank are so on all
         if kinematics is not self.kinematics:
             self.kinematics = kinematics
-            if self.friction is not None:
-                self.friction.replace(kinematics)
+            if self.acting is not None:
+                self.acting.replace(kinematics)
 
     def stiffness_across(self, stiffness: Array | None) -> Array:
         """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
@@ -137,8 +142,8 @@ class Interface(Told):
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
         correction = self.kinematics.return_vectors(self.trial)
-        if self.friction is not None:
-            correction = correction + self.friction.return_vectors(self.trial)
+        if self.acting is not None:
+            correction = correction + self.acting.return_vectors(self.trial)
         correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
         return correction
 
@@ -162,6 +167,8 @@ class Interface(Told):
 
     def activate_touching(self) -> None:
         """Start with the contactors that touch without force as active, where they stick (collective)."""
+        if self.kinematics.idle:
+            return
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
         self._set_active(replace(state, at_end=self._at_end(self.trial)))
@@ -184,6 +191,8 @@ class Interface(Told):
 
     def follow(self) -> bool:
         """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
+        if self.kinematics.idle:
+            return False
         off = self.off
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
@@ -215,6 +224,8 @@ class Interface(Told):
             swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
             du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
         """
+        if self.kinematics.idle:
+            return active_set.Violations.none(len(self.nodes))
         off = self.off
         if swept and self.thickness < np.inf:
             off = off | (self.trial.at_end & self.trial.passed)
@@ -238,6 +249,8 @@ class Interface(Told):
             self._set_active(active_set.exchange(state, violated))
             return self.trial
 
+        if self.kinematics.idle:
+            return False
         if self.friction is None:
             enter(self.trial)
             return False
@@ -255,13 +268,13 @@ class Interface(Told):
 
     def meet(self, others: Sequence[Interface]) -> None:
         """Take what other contacts with rigid surfaces do to the same contactors (collective)."""
-        if self.friction is None:
+        if self.acting is None:
             return
         normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
         for k, other in enumerate(others):
             _, own, theirs = np.intersect1d(self.nodes, other.nodes, return_indices=True)
             normals[own, k] = np.where(other.trial.active[theirs, None], other.projection.normal[theirs], 0.0)
-        self.friction.meet(self.kinematics, normals)
+        self.acting.meet(self.kinematics, normals)
 
     def place_again(self) -> None:
         """Put contactors whose equations have changed where they now belong (collective)."""
@@ -305,8 +318,8 @@ class Interface(Told):
         if lacks:
             self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
-        if self.friction is not None:
-            own = self.friction.equations(own, self.trial, self.kinematics)
+        if self.acting is not None:
+            own = self.acting.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
@@ -317,8 +330,8 @@ class Interface(Told):
         normal = (equations.kind == NORMAL) & (equations.tangent < 0)
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
         self.redundant[equations.contactor[normal]] = redundant[normal]
-        if self.friction is not None:
-            self.friction.set_redundant(equations, redundant)
+        if self.acting is not None:
+            self.acting.set_redundant(equations, redundant)
 
     def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces from the multipliers of the equations ``(m,)`` (collective).
@@ -327,10 +340,10 @@ class Interface(Told):
         """
         contact = equations.contact
         of, trial, kinematics = multipliers[: len(contact)], self.trial, self.kinematics
-        if self.friction is None:
+        if self.acting is None:
             found = kinematics.forces(trial, contact, of)
         else:
-            found = self.friction.forces(contact, of, trial, kinematics, du)
+            found = self.acting.forces(contact, of, trial, kinematics, du)
         return found if self.tie is None else self.tie.with_forces(found, equations, multipliers)
 
     @property
@@ -358,23 +371,23 @@ class Interface(Told):
 
     def known_forces(self) -> tuple[Ints, Array] | None:
         """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)``; None without any."""
-        return None if self.friction is None else self.friction.known_forces(self.trial, self.kinematics)
+        return None if self.acting is None else self.acting.known_forces(self.trial, self.kinematics)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
         parts = self.kinematics.curvature(self.trial)
-        if self.friction is not None:
-            parts = parts + self.friction.curvature(self.trial, self.kinematics)
+        if self.acting is not None:
+            parts = parts + self.acting.curvature(self.trial, self.kinematics)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:
         """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
-        if self.friction is not None:
-            self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
+        if self.acting is not None:
+            self.trial = self.acting.turn(self.trial, self.kinematics, stiffness)
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """What sliding friction adds to tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
-        return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
+        return None if self.acting is None else self.acting.slip_terms(self.trial, self.kinematics)
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 
@@ -388,6 +401,8 @@ class Interface(Told):
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
         if self.friction is not None:
+            if self.kinematics.idle:
+                self._place_friction()
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
         self.barred = self.barred & (self.projection.gap < 0)
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))

@@ -100,6 +100,10 @@ class Kinematics(Protocol):
     """Where contactors stand relative to their target, in one state and at one displacement: a value."""
 
     @property
+    def idle(self) -> bool:
+        """Whether no contactor of any rank has anything near."""
+
+    @property
     def points(self) -> Array:
         """Of the contactors ``(n, gdim)``."""
 

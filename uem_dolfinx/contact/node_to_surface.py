@@ -151,6 +151,11 @@ class NodalKinematics:
     left: Bools | None = None
 
     @property
+    def idle(self) -> bool:
+        """No: the target is one for all."""
+        return False
+
+    @property
     def normal(self) -> Array:
         """The normals at the feet ``(n, gdim)``."""
         return self.projection.normal

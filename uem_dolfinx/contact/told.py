@@ -43,6 +43,11 @@ class Told:
         return self.friction is not None
 
     @property
+    def acting(self) -> Sliding | None:
+        """Friction, where it can act: None also where no contactor of any rank has anything near."""
+        return None if self.kinematics.idle else self.friction
+
+    @property
     def target(self) -> Target:
         """What the contactors may touch."""
         return self.discretisation.target
@@ -76,8 +81,8 @@ class Told:
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
-        if self.friction is not None:
-            here = max(here, self.friction.largest_distance(self.trial, self.redundant))
+        if self.acting is not None:
+            here = max(here, self.acting.largest_distance(self.trial, self.redundant))
         return here if self.tie is None else max(here, self.tie.largest_gap_here())
 
     def largest_gap(self) -> float:

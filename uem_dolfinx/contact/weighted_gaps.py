@@ -124,6 +124,11 @@ class MortarKinematics:
     movable: Bools
 
     @property
+    def idle(self) -> bool:
+        """No: the target is one for all."""
+        return False
+
+    @property
     def corners(self) -> None:
         """No corner holds a facet."""
         return None

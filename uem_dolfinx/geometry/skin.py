@@ -46,6 +46,9 @@ class Skin(TargetFacets):
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")
+        #: Facets where they were asked for last, and their spread there if it was asked for.
+        self._placed: FacetData | None = None
+        self._spread: Array | None = None
         label, self.n_bodies = find_bodies(config)
         first = np.full(self.n_bodies, np.iinfo(np.int64).max)
         cells = compat.cell_dofs(config.V)
@@ -144,19 +147,27 @@ class Skin(TargetFacets):
         return (facet[exchange.rows], node[exchange.rows]), sums
 
     def current(self, corners: bool = False) -> FacetData:
-        """Facets where they are now; at sharp edges normals are averaged over facets of one face alone (collective)."""
-        data = super().current(corners)
-        normals = data.nodal_normals.copy()
-        there, sums = self._of_one_face(self._area_vectors(data.x))
-        normals[there] = unit(sums)
-        return replace(data, nodal_normals=normals)
+        """Facets where they are now; at sharp edges normals are averaged over facets of one face alone (collective).
+
+        What was made where no node has moved since is kept: all contacts among bodies ask for the same.
+        """
+        x = self.x
+        if self._placed is None or reduced(self.config.comm, not np.array_equal(x, self._placed.x), op=MPI.LOR):
+            data = super().current(corners=True)
+            normals = data.nodal_normals.copy()
+            there, sums = self._of_one_face(self._area_vectors(x))
+            normals[there] = unit(sums)
+            self._placed, self._spread = replace(data, nodal_normals=normals), None
+        return self._placed
 
     def spread(self) -> Array:
         """See ``TargetFacets``; at sharp edges of facets of one face alone (collective)."""
-        spread = super().spread()
-        there, sums = self._of_one_face(self._areas_beside())
-        spread[there] = spread_of(sums)
-        return spread
+        self.current()
+        if self._spread is None:
+            self._spread = super().spread()
+            there, sums = self._of_one_face(self._areas_beside())
+            self._spread[there] = spread_of(sums)
+        return self._spread
 
     def middles(self, x: Array) -> tuple[Array, Array]:
         """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
