@@ -5,6 +5,7 @@ Three tests to read first: ``test_as_declared_by_hand``, ``test_discs_in_motion`
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import product
 
 from mpi4py import MPI
@@ -16,6 +17,7 @@ from dolfinx import fem
 from helpers import M, blocks, box, clamp, highest, linear, modulus, run, slow, st_venant
 
 import uem_dolfinx as uem
+from uem_dolfinx.contact.sliding import Sliding
 
 COMM = MPI.COMM_WORLD
 
@@ -74,6 +76,18 @@ def test_discs_in_motion(rows, columns, end):
     (u, one), (v, other) = found
     assert one == other and max(n for _, _, n in one) >= 2
     close(u, v)
+
+
+def test_lists_with_nothing_on_them_cost_nothing(monkeypatch):
+    """Two discs and a floor meet each other one by one: of a node's three lists two stay empty, and ask friction once a step."""
+    discs, placed = Discs(2, 1), Counter()
+    problem = discs.problem(discs.contacts(True))
+    place = Sliding.place
+    monkeypatch.setattr(Sliding, "place", lambda self, *args: (placed.update([id(self)]), place(self, *args)))
+    steps = sum(1 for _ in uem.time_steps(problem, 0.01, 0.12))
+    first, *others = (pair for pair in problem.pairs if hasattr(pair.target, "neighbours"))
+    assert [placed[id(pair.friction)] for pair in others] == [steps] * len(others)
+    assert placed[id(first.friction)] >= 3 * steps
 
 
 # -- closed forms ----------------------------------------------------------------------------------------------------------

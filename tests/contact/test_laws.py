@@ -134,7 +134,7 @@ def test_a_proportional_limit_has_no_rest():
 
     plain, _ = dragged("quadrilateral", 0.3)
     contact, _ = dragged("quadrilateral", Rounded(0.3))
-    assert contact.pair.known_forces() is None
+    assert not contact.pair.has_known_forces
     np.testing.assert_allclose(np.array(contact.resultant().force), np.array(plain.resultant().force), rtol=1e-9)
 
 

@@ -79,6 +79,8 @@ def check_prescribed(pair: Interface) -> None:
     Raises:
         ConflictError: naming the deepest or farthest such node of the first rank that has one.
     """
+    if pair.kinematics.idle:
+        return
     left_out = pair.trial.active & pair.redundant
     depth = -pair.projection.gap / pair.config.size
     inside = ~pair.off & ((~pair.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))

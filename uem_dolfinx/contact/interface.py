@@ -100,6 +100,8 @@ class Interface(Told):
             return
         first = not hasattr(self, "kinematics")
         self.kinematics = self.discretisation.place(self.points, self.trial)
+        if self.kinematics.idle and not first:
+            return
         p = self.projection
         bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
         error = None
@@ -109,8 +111,7 @@ class Interface(Told):
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
             )
         agree(self.config.comm, error)
-        if first or not self.kinematics.idle:
-            self._place_friction()
+        self._place_friction()
 
     def _place_friction(self) -> None:
         if self.friction is not None:
@@ -124,11 +125,6 @@ class Interface(Told):
             self.kinematics = kinematics
             if self.acting is not None:
                 self.acting.replace(kinematics)
-
-    def stiffness_across(self, stiffness: Array | None) -> Array:
-        """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
-        assert stiffness is not None
-        return np.asarray(np.einsum("ng,ng->n", self.projection.normal**2, np.abs(stiffness[self.nodes])))
 
     @property
     def off(self) -> Bools:
@@ -314,9 +310,10 @@ class Interface(Told):
 
         Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
         """
-        lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
-        if lacks:
-            self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
+        if not self.kinematics.idle:
+            lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
+            if lacks:
+                self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
         if self.acting is not None:
             own = self.acting.equations(own, self.trial, self.kinematics)
@@ -346,12 +343,6 @@ class Interface(Told):
             found = self.acting.forces(contact, of, trial, kinematics, du)
         return found if self.tie is None else self.tie.with_forces(found, equations, multipliers)
 
-    @property
-    def traction(self) -> Traction:
-        """Contact forces of the trial state."""
-        t = self.trial
-        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
-
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The contact forces of a state at nodes of both bodies; see ``Kinematics.nodal_forces``."""
         own = self.kinematics.nodal_forces
@@ -369,9 +360,15 @@ class Interface(Told):
         state = self.with_forces(found)
         self.trial = state if active is None else replace(state, active=active)
 
-    def known_forces(self) -> tuple[Ints, Array] | None:
-        """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)``; None without any."""
-        return None if self.acting is None else self.acting.known_forces(self.trial, self.kinematics)
+    @property
+    def has_known_forces(self) -> bool:
+        """Whether friction of contactors of this rank may not grow with the force along the normal."""
+        return self.acting is not None and self.acting.has_known_forces(self.trial)
+
+    def known_forces(self) -> tuple[Ints, Array]:
+        """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)`` (collective)."""
+        assert self.acting is not None
+        return self.acting.known_forces(self.trial, self.kinematics)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""

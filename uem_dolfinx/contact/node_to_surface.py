@@ -193,7 +193,7 @@ class NodalKinematics:
         """What facets push with, over their force along the contactor's normal: more on an edge ``(n,)`` (first time: collective)."""
         cone, target, p = np.ones(len(self.points)), self.of.target, self.projection
         if self.of.frictional and target.faceted and isinstance(target, MeshTarget) and isinstance(p, FacetProjection):
-            averaged = (p.averaged == p.normal).all(axis=1)
+            averaged = (p.facet >= 0) & (p.averaged == p.normal).all(axis=1)
             if reduced(self.of.config.comm, bool(averaged.any()), op=MPI.LOR):
                 cone = np.where(averaged, target.spread(p), 1.0)
         if self.corners is not None:

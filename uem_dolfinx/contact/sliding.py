@@ -339,11 +339,13 @@ class Sliding:
             tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
         return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
 
-    def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array] | None:
-        """Friction of contactors that does not grow with the force along the normal: nodes and forces; None without any (collective)."""
+    def has_known_forces(self, state: PairState) -> bool:
+        """Whether friction of contactors of this rank may not grow with the force along the normal."""
+        return bool(self._cone(state)[0].any())
+
+    def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array]:
+        """Friction of contactors that does not grow with the force along the normal: nodes and forces (collective)."""
         rest, _ = self._cone(state)
-        if not reduced(self.config.comm, bool(rest.any()), op=MPI.LOR):
-            return None
         size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
         return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
 

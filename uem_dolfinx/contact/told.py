@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
+from uem_dolfinx.contact.kinematics import Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
@@ -77,6 +77,17 @@ class Told:
         """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
         told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
         return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
+
+    def stiffness_across(self, stiffness: Array | None) -> Array:
+        """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
+        assert stiffness is not None
+        return np.asarray(np.einsum("ng,ng->n", self.projection.normal**2, np.abs(stiffness[self.nodes])))
+
+    @property
+    def traction(self) -> Traction:
+        """Contact forces of the trial state."""
+        t = self.trial
+        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
 
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""

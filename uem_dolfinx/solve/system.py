@@ -32,7 +32,7 @@ from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, read_forces, several_answers, unbalanced
-from uem_dolfinx.solve.tangent import added_mass, curvature_of, slip_terms, together
+from uem_dolfinx.solve.tangent import added_mass, curvature_of, known_forces, slip_terms, together
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
@@ -166,7 +166,7 @@ class BodySystem:
     def residual(self) -> PETSc.Vec:
         """Forces of the bodies less loads of contacts, and friction that does not grow with the force along the normal (collective)."""
         F = self.bodies.residual
-        for nodes, forces in filter(None, (known() for pair in self.pairs for known in (pair.known_forces, pair.applied_forces))):
+        for nodes, forces in filter(None, (*known_forces(self.pairs), *(pair.applied_forces() for pair in self.pairs))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         for heat in self._heats:
             F.array[:] += heat.residual()

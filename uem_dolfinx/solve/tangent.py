@@ -6,7 +6,10 @@ A part of the seventh step on the data's way; K is assembled only when something
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
 import ufl
@@ -166,6 +169,14 @@ def curvature_of(
     if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
         return None
     return contact_curvature(parts, du)
+
+
+def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
+    """Forces of friction that do not grow with those along the normal, of pairs of which any rank has some (collective)."""
+    if not any(pair.frictional for pair in pairs):
+        return []
+    told = reduced(pairs[0].config.comm, np.array([pair.has_known_forces for pair in pairs]), op=MPI.LOR)
+    return [pair.known_forces() for pair in compress(pairs, told)]
 
 
 def slip_terms(

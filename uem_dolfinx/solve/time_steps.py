@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
+
+from mpi4py import MPI
 
 import numpy as np
 
@@ -205,8 +208,9 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     assert problem.dynamics is not None
     if problem.dynamics.contactors != "massless":
         return []
-    still = [c for c in problem.contacts if not c.pair.works]
-    return [np.array(c.force.x.array[: problem.config.gdim * problem.config.n_owned]) for c in still if c.n_active]
+    touching = compress(problem.contacts, _touching(problem))
+    own = slice(problem.config.gdim * problem.config.n_owned)
+    return [np.array(c.force.x.array[own]) for c in touching if not c.pair.works]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
@@ -267,7 +271,10 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
 
 def _touching(problem: UnitedProblem) -> list[bool]:
     """Which contacts have active contactors (collective)."""
-    return [contact.n_active > 0 for contact in problem.contacts]
+    if not problem.contacts:
+        return []
+    active = np.array([bool(contact.pair.united.any()) for contact in problem.contacts])
+    return list(map(bool, reduced(problem.comm, active, op=MPI.LOR)))
 
 
 def _not_before(start: float) -> given.Range:
