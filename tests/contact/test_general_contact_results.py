@@ -5,6 +5,8 @@ Two tests to read first: ``test_forces_and_moments_balance`` and ``test_going_on
 
 from __future__ import annotations
 
+import csv
+
 from mpi4py import MPI
 
 import numpy as np
@@ -194,6 +196,27 @@ def test_written_as_one(folder):
     own = slice(problem.config.n_owned)
     most = COMM.allreduce(float(contact.active.x.array[own].max(initial=0.0)), op=MPI.MAX)
     assert most >= 1 and COMM.allreduce(float(contact.gap.x.array[own].min(initial=0.0)), op=MPI.MIN) > -1e-12
+
+
+def test_pairs_in_a_table(folder):
+    """Every step has a row for each pair that touches then, whose moment is about the origin; a run that goes on keeps those before."""
+    _, (contact,), problem = pressed(lambda b: [uem.GeneralContact(bodies={"base, below": cells_of(b, 0)})])
+    pairs = contact.forces_of_pairs()
+    assert [(t.first, t.second) for t, _ in pairs] == [("base, below", "body 2")]
+    for (first, second, _, force), moment in pairs:
+        told = contact.between(first, second)
+        assert np.array_equal(told.force, force) and np.array_equal(told.moment, moment) and np.abs(moment).max() > 0
+    for resume in (False, True, False):
+        with uem.HistoryWriter(folder / "run.csv", problem, resume=resume) as writer:
+            writer.write(1.0)
+    if COMM.rank == 0:
+        with open(folder / "run_pairs.csv", newline="") as file:
+            columns, *rows = csv.reader(file)
+        assert columns == ["factor", "step", "first", "second", "active", "force_x", "force_y", "moment_z"]
+        step = str(problem.progress.steps)
+        wanted = [["1.0", step, t.first, t.second, f"{t.n_active}", *(repr(float(f)) for f in (*t.force, *m))] for t, m in pairs]
+        assert rows == wanted
+        assert (folder / "run_pairs.1" / "run_pairs.csv").read_text() == (folder / "run_pairs.csv").read_text()
 
 
 def test_names():

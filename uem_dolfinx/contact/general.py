@@ -7,7 +7,7 @@ ring. A node may touch as many bodies at once as others meet it in a corner of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -21,12 +21,12 @@ from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.results import Resultant, moments, sum_up
+from uem_dolfinx.contact.results import Resultant, sum_up
+from uem_dolfinx.contact.touching import Touch, forces_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
@@ -93,22 +93,6 @@ class AmongContact(_Part):
 
     def look_at_ends(self) -> None:
         """Contactors come and go past the edges of bodies."""
-
-
-class Touch(NamedTuple):
-    """Two bodies that touch, or a body and a rigid surface.
-
-    Attributes:
-        first: name of the one.
-        second: name of the other.
-        n_active: number of contactors that touch.
-        force: on the first ``(gdim,)``.
-    """
-
-    first: str
-    second: str
-    n_active: int
-    force: Array
 
 
 class GeneralContact:
@@ -333,7 +317,17 @@ class GeneralContact:
 
     def touching(self) -> list[Touch]:
         """Bodies that touch now, and rigid surfaces with them, sorted by their numbers in the mesh's input (collective)."""
-        return [Touch(self._names[a], b, n, force) for (a, _, b), (n, force, _) in sorted(self._touching().items())]
+        return [touch for touch, _ in self.forces_of_pairs()]
+
+    def forces_of_pairs(self, about: npt.ArrayLike | None = None) -> list[tuple[Touch, Array]]:
+        """What ``touching`` tells, each with the moment on the first, a vector, in 2D ``(1,)`` (collective).
+
+        Args:
+            about: point that moments are taken about ``(gdim,)``; None is the origin.
+        """
+        g, rigid = self._config.gdim, [self._rigid_name(part) for part in self.parts]
+        centre = np.zeros(g) if about is None else given.vector("about", about, g)
+        return forces_of_pairs(self.parts, self._skin, self._names, rigid, centre)
 
     def between(self, first: str, second: str | None = None, about: Any = None) -> Resultant:
         """Force and moment on a body from another one or from a rigid surface (collective).
@@ -346,46 +340,18 @@ class GeneralContact:
         Raises:
             InputError: for an unknown name.
         """
-        g = self._config.gdim
         names = (*self._names, *(self._rigid_name(part) for part in self.parts if isinstance(part, RigidContact)))
         given.word("first", first, names)
         if second is not None:
             given.word("second", second, names)
-        centre = np.zeros(g) if about is None else given.vector("about", about, g)
-        total = sum_up(self._config.comm, np.zeros((0, g)), np.zeros((0, g)))
-        force, moment = total.force * np.ones(g), total.moment * 1.0
-        for (a, _, b), (_, f, m) in self._touching(centre).items():
-            if first == self._names[a] and second in (None, b):
+        total = sum_up(self._config.comm, np.zeros((0, self._config.gdim)), np.zeros((0, self._config.gdim)))
+        force, moment = total.force * 1.0, total.moment * 1.0
+        for (a, b, _, f), m in self.forces_of_pairs(about):
+            if first == a and second in (None, b):
                 force, moment = force + f, moment + m
-            elif first == b and second in (None, self._names[a]):
+            elif first == b and second in (None, a):
                 force, moment = force - f, moment - m
         return Resultant(force, moment)
-
-    def _touching(self, centre: Array | None = None) -> dict[tuple[int, int, str], tuple[int, Array, Array]]:
-        """Numbers of contactors that touch, forces and moments on the first, by number of the first, and number and name of the second."""
-        config, skin = self._config, self._skin
-        found: dict[tuple[int, int, str], tuple[int, Array, Array]] = {}
-        centre = np.zeros(config.gdim) if centre is None else centre
-        for k, part in enumerate(self.parts):
-            pair = part.pair
-            i = np.flatnonzero(pair.trial.active)
-            target = pair.target
-            second = np.full(len(i), skin.n_bodies + k)
-            if isinstance(target, MeshTarget):
-                second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
-            first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
-            rows = np.column_stack([np.ones(len(i)), force, moments(config.of_circles(pair.points[i]) - centre, force)])
-            keys, inverse = np.unique(first * (skin.n_bodies + len(self.parts)) + second, return_inverse=True)
-            sums = np.zeros((len(keys), rows.shape[1]))
-            np.add.at(sums, inverse.ravel(), rows)
-            for key, row in (item for own in config.comm.allgather(list(zip(keys.tolist(), sums))) for item in own):
-                a, b = divmod(key, skin.n_bodies + len(self.parts))
-                # nodes of either of two bodies may follow the other
-                a, b, sign = (a, b, 1.0) if a <= b else (b, a, -1.0)
-                name = self._names[b] if b < skin.n_bodies else self._rigid_name(part)
-                n, f, m = found.get((a, b, name), (0, 0.0, 0.0))
-                found[a, b, name] = n + int(row[0]), f + sign * row[1 : 1 + config.gdim], m + sign * row[1 + config.gdim :]
-        return found
 
     def _rigid_name(self, part: Contact) -> str:
         """What ``touching`` calls the rigid surface of one of the contacts."""

@@ -19,6 +19,7 @@ from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_expression
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.output.columns import Columns
+from uem_dolfinx.output.pair_tables import PairTables
 from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_step import LoadStep
@@ -37,6 +38,8 @@ class HistoryWriter(Closing):
     by the contact's name where there are several; then what is asked for, in this order::
 
         uem.HistoryWriter("out/run.csv", problem, reaction=tags["foot"], columns={"heat": lambda: uem.integrate(q * ufl.dx)})
+
+    Of a ``GeneralContact`` the bodies that touch, with the forces between them, stand in ``run_pairs.csv`` beside it, a row for each pair.
 
     Args:
         path: name of the file; its folder is made.
@@ -67,11 +70,16 @@ class HistoryWriter(Closing):
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
-        for suffix in contact_suffixes(problem.declared):
-            names += [f"active{suffix}", f"max_gap{suffix}"]
-            names += [f"force_{a}{suffix}" for a in axes] + [f"moment_{a}{suffix}" for a in turns]
+        suffixes, resultant = contact_suffixes(problem.declared), [f"force_{a}" for a in axes] + [f"moment_{a}" for a in turns]
+        for suffix in suffixes:
+            names += [f"{name}{suffix}" for name in ("active", "max_gap", *resultant)]
         self._progress, self._asked = problem.progress, Columns(problem, reaction, columns)
         self.table = CsvTable(path, problem.comm, names + self._asked.names, problem.progress if resume else None, key="step")
+        try:
+            self._pairs = PairTables(self.table.path, problem, suffixes, names[0], resultant, resume)
+        except Exception:
+            self.table.close()
+            raise
         #: Time of the last row.
         self._last = self.table.last.get(names[0], -np.inf)
         #: Steps of the problem that the file knew all about when it was gone on with.
@@ -116,19 +124,21 @@ class HistoryWriter(Closing):
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
         self.table.write(row + self._asked.row())
+        self._pairs.write(time, self._progress.steps)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the files."""
         self.table.close()
+        self._pairs.close()
 
 
 class ResultsWriter(Closing):
     """Time series of everything there is to see: fields for ParaView and the history.
 
-    Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv``, and where DOLFINx has ADIOS2 ``PATH_vectors.bp`` and
-    ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``; for every contact its pressure, gap,
-    status and force, and the heat that passes; and whatever ``fields`` names. XDMF holds nodal values at the nodes of the mesh only: a
-    displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
+    Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` as ``HistoryWriter`` does, ``PATH_pairs.csv`` too, and where
+    DOLFINx has ADIOS2 ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``;
+    for every contact its pressure, gap, status and force, and the heat that passes; and whatever ``fields`` names. XDMF holds nodal
+    values at the nodes of the mesh only: a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
     ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
@@ -204,6 +214,7 @@ class ResultsWriter(Closing):
             own = [self._name(ending) for ending in (".xdmf", ".bin", ".h5", ".csv")]
             begin = tuple(f"{self._stem.name}_{ending}." for ending in ENDINGS)
             own += [f for f in sorted(self._stem.parent.iterdir()) if f.name.startswith(begin) and f.suffix == ".bp"]
+            own += [self._name(f"_pairs{suffix}.csv") for suffix in contact_suffixes(self.problem.declared)]
             xdmf, csv = self._name(".xdmf"), self._name(".csv")
             written = (xdmf.is_file() and b"<Time " in xdmf.read_bytes()) or (csv.is_file() and csv.read_bytes().count(b"\n") > 1)
             if written or in_use(xdmf) or in_use(csv):

@@ -55,7 +55,8 @@ class CsvTable(Closing):
         columns: their names.
         resume_at: keep the rows of a file that is there up to this value of the column ``key``, and go on after them; of a clock, up
             to its present time. None begins a new file.
-        key: column that grows from row to row, by default the first.
+        key: column that does not fall from row to row, by default the first.
+        words: columns that hold no numbers.
 
     Raises:
         OutputError: of rank 0, on all ranks, if the file cannot be written, or another run writes the one to go on with.
@@ -70,6 +71,7 @@ class CsvTable(Closing):
         resume_at: float | Clock | None = None,
         *,
         key: str | None = None,
+        words: Sequence[str] = (),
     ):
         self.columns, self.comm, self.path = list(columns), comm, given_path("path", path, comm)
         self._key = 0 if key is None else self.columns.index(key)
@@ -82,7 +84,7 @@ class CsvTable(Closing):
         #: Where in the file the rows kept end, and whether later ones follow that would be lost.
         self._end, self._later = 0, False
         kept = self._on_rank_0(lambda: self._begin(until))
-        numbers = [{name: float(value) for name, value in zip(self.columns, row) if value} for row in kept]
+        numbers = [{name: float(value) for name, value in zip(self.columns, row) if value and name not in words} for row in kept]
         #: First and last row kept, by column, as numbers; empty in a new file.
         self.first: dict[str, float] = numbers[0] if kept else {}
         self.last: dict[str, float] = numbers[-1] if kept else {}
@@ -131,10 +133,10 @@ class CsvTable(Closing):
         self._end = end
         return kept
 
-    def _put(self, row: Sequence[Any]) -> None:
-        """Write a row behind the rows kept."""
+    def _put(self, *rows: Sequence[Any]) -> None:
+        """Write rows behind the rows kept, all at once."""
         text = io.StringIO(newline="")
-        csv.writer(text).writerow([repr(float(v)) if isinstance(v, float) else v for v in row])
+        csv.writer(text).writerows([[repr(float(v)) if isinstance(v, float) else v for v in row] for row in rows])
         data = text.getvalue().encode()
         assert self._file is not None
         self._file.replace_end(self._end, data)
@@ -151,8 +153,8 @@ class CsvTable(Closing):
             )
 
     @timed("write table")
-    def write(self, row: Sequence[Any]) -> None:
-        """Append a row; floats are written to the last bit (collective).
+    def write(self, *rows: Sequence[Any]) -> None:
+        """Append a row, or several at once; floats are written to the last bit (collective).
 
         Raises as the table itself, and if it is closed (ValueError) or a checkpoint was read after it had been made to go on with its
         file, which stays as it was (CheckpointError).
@@ -168,7 +170,7 @@ class CsvTable(Closing):
             self._later = False
             if self._end == 0:
                 self._put(self.columns)
-            self._put(row)
+            self._put(*rows)
 
         self._on_rank_0(append)
 
