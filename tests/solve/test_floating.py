@@ -335,6 +335,25 @@ def test_ball_on_a_slope():
     assert np.abs(f.moved()).max() == 0.0
 
 
+def test_supports_carry_nothing():
+    """A state of statics in which supports carry more than rounding is refused, and the bodies are where they were."""
+    f = falling("triangle", traction=[0.0, -0.02])
+    problem = f.problem(clamp(f.V, f.base), [uem.Contact(f.high, f.low)])
+    end_step = problem.system.floating.end_step
+    for carried in (3e-6, 3e-7):
+
+        def carry(carried=carried):
+            problem.system.floating.motions.share = carried
+            end_step()
+
+        problem.system.floating.end_step = carry
+        if carried > 1e-6:
+            raised(uem.FloatingBodyError, "driven sideways by 3e-06 of the forces", problem.solve)
+            assert np.abs(f.moved()).max() == 0.0
+        else:
+            problem.solve()
+
+
 def test_error_restores_the_committed_state():
     """Pressed in the first step and pulled away in the second: the state is that of the first, and the third can follow it."""
     f = Falling("quadrilateral", [groove(1.5, 1.5), half_disc(4, (0.0, 1.4))], "finite", nu=0.3)

@@ -19,6 +19,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
@@ -110,12 +111,20 @@ class FloatingBodies:
         self.motions = self._in_motion
 
     def end_step(self) -> None:
-        """Say so if supports carry more than rounding."""
-        if self.motions is not None and self.motions.share > LOADED:
-            logger.warning(
-                "a body that only contact holds is driven sideways by %.1g of the forces, and is held where it is: its contact does "
-                "not tell its place", self.motions.share,
-            )  # fmt: skip
+        """Refuse a state in which supports carry more than rounding; in a step in time, say so.
+
+        Raises:
+            FloatingBodyError: in statics.
+        """
+        if self.motions is None or self.motions.share <= LOADED:
+            return
+        told = (
+            f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held where it is: its "
+            "contact does not tell its place"
+        )
+        if self._bodies.dynamics is None:
+            raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest against a drag that fades")
+        logger.warning(told)
 
     def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
         """Free components ``(n_rows, gdim)`` without those that hold neutral motions (collective).
