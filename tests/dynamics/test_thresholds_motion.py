@@ -165,7 +165,7 @@ def test_on_the_yield_surface(outside, flows):
         strain = np.zeros((1, k))
         strain[0, -1] = shear
         elastic = (0.5 * one,) if k > 3 else (one, zero)
-        assert (kernel(strain, np.zeros((1, k)), zero, *elastic, 2 * one, zero).peeq[0] > 0) == flows
+        assert (kernel(strain, np.zeros((1, k)), zero, *elastic, 2 * one, zero, zero).peeq[0] > 0) == flows
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])

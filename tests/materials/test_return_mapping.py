@@ -13,6 +13,8 @@ from scipy.optimize import root
 from uem_dolfinx.materials import von_mises as plasticity
 
 KINDS = {3: "plane_stress", 4: "plane_strain", 6: "3d"}
+#: Of the yield stress and of the back stress.
+HARDENING = [(0.0, 0.0), (0.5 * H, 0.5 * H), (H, 0.0)]
 ONE = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
@@ -24,9 +26,9 @@ def kernel(k: int):
     law = plasticity.plane_stress_return if k == 3 else plasticity.radial_return
     elastic = (E, NU) if k == 3 else (MU,)
 
-    def returned(strain, plastic_strain, peeq, hardening=H):
+    def returned(strain, plastic_strain, peeq, hardening=(H, 0.0)):
         n = len(strain)
-        return law(strain, plastic_strain, peeq, *(np.full(n, x) for x in (*elastic, FY, hardening)))
+        return law(strain, plastic_strain, peeq, *(np.full(n, x) for x in (*elastic, FY, *hardening)))
 
     return returned
 
@@ -45,8 +47,9 @@ def slow_return(strain, plastic, peeq, hardening):
     """Stress, plastic strain and peeq of one point from the equations of plasticity in 3D, by a general root finder.
 
     Unknown are the stress over FY, the strain across the plane where there is one, and the increment of peeq over the yield strain.
+    The back stress grows along the normal: by ``kinematic`` times this increment in the von Mises measure.
     """
-    k, unit = len(strain), FY / E
+    k, unit, (isotropic, kinematic) = len(strain), FY / E, hardening
     inside = {3: [0, 1, 5], 4: [0, 1, 2, 5], 6: list(range(6))}[k]
     eps, before = np.zeros(6), np.zeros(6)
     eps[inside], before[inside] = strain, plastic
@@ -61,14 +64,15 @@ def slow_return(strain, plastic, peeq, hardening):
         s, across, dp = FY * x[:6], unit * x[6], unit * x[7] * flowing
         total = eps.copy()
         total[2] += across
-        normal = 1.5 * (s - ONE * s[:3].mean()) / max(mises(s), 1e-300)
+        over = s - 2 / 3 * kinematic * before
+        normal = 1.5 * (over - ONE * over[:3].mean()) / max(mises(over), 1e-300)
         return s, total, before + dp * normal, peeq + dp
 
     def equations(x, flowing):
         s, total, ep, p = state(x, flowing)
         hooke = (compliance @ s - total + ep) / unit
         plane = x[2] if k == 3 else x[6]
-        surface = (mises(s) - FY - hardening * p) / FY if flowing else x[7]
+        surface = (mises(s - 2 / 3 * kinematic * ep) - FY - isotropic * p) / FY if flowing else x[7]
         return [*hooke, plane, surface]
 
     guess = np.zeros(8)
@@ -76,18 +80,19 @@ def slow_return(strain, plastic, peeq, hardening):
         solution = root(equations, guess, args=(flowing,), method="hybr", options={"xtol": 1e-13})
         s, _, ep, p = state(solution.x, flowing)
         assert np.abs(equations(solution.x, flowing)).max() < 1e-9
-        if mises(s) <= FY + hardening * p + 1e-9 * FY:
+        driving, flow = mises(s - 2 / 3 * kinematic * ep), FY + isotropic * p
+        if driving <= flow + 1e-9 * FY:
             break
         # start the flow from the elastic stress scaled back
         guess = solution.x.copy()
-        guess[:6] *= (FY + hardening * p) / mises(s)
-        guess[7] = 0.5 * (mises(s) / FY - 1)
+        guess[:6] *= flow / driving
+        guess[7] = 0.5 * (driving / FY - 1)
     if k != 3:
         s = s - ONE * s[:3].mean()
     return s[inside], ep[inside], p
 
 
-@pytest.mark.parametrize("hardening", [0.0, H])
+@pytest.mark.parametrize("hardening", HARDENING)
 @pytest.mark.parametrize("k", KINDS)
 def test_return_solves_the_equations_of_plasticity(k, hardening):
     given = states(k)
@@ -99,7 +104,7 @@ def test_return_solves_the_equations_of_plasticity(k, hardening):
         assert np.abs(values - np.array(reference)).max() < 1e-7 * scale
 
 
-@pytest.mark.parametrize("hardening", [0.0, H])
+@pytest.mark.parametrize("hardening", HARDENING)
 @pytest.mark.parametrize("k", KINDS)
 def test_tangent_is_derivative_of_the_stress(k, hardening):
     strain, *before = states(k)
@@ -126,7 +131,7 @@ def test_plane_stress_return_converges_from_every_state():
     strain = rng.standard_normal((n, 3)) * (size * 10 ** rng.uniform(0, 6, n))[:, None]
     strain[: n // 3] *= [1.0, 1.0, 0.0]
     strain[: n // 6, 1] = strain[: n // 6, 0]
-    new = plasticity.plane_stress_return(strain, 0 * strain, np.zeros(n), scale, nu, scale * size, hardening)
+    new = plasticity.plane_stress_return(strain, 0 * strain, np.zeros(n), scale, nu, scale * size, hardening, 0 * hardening)
     s = new.stress
     mises = np.sqrt(s[:, 0] ** 2 - s[:, 0] * s[:, 1] + s[:, 1] ** 2 + 1.5 * s[:, 2] ** 2)
     flows = new.peeq > 0

@@ -74,9 +74,10 @@ def ramped(comm: MPI.Comm) -> Ramps:
 
 
 def plastic(comm: MPI.Comm) -> Ramps:
-    """Bodies that yield, with a modified Newton method that keeps its tangent."""
+    """Bodies of layers that yield, with a modified Newton method that keeps its tangent."""
     b = blocks(comm, "quadrilateral", 2, 3)
-    steel = uem.VonMises(b.u, E=100.0, nu=0.3, yield_stress=1.0, hardening=2.0, kind="plane_strain")
+    table = [(0.0, 0.0), (0.002, 0.5), (0.1, 1.0)]
+    steel = uem.VonMises(b.u, E=100.0, nu=0.3, yield_stress=1.0, kinematic_hardening=table, kind="plane_strain")
     F = steel.residual(ufl.TestFunction(b.V))
     contact = uem.Contact(b.high, b.low)
     problem = uem.UnitedProblem(

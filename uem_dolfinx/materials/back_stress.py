@@ -37,17 +37,8 @@ def kinematic_return(
     tensors, in which such a sum is convex. It depends on C and C_p alone, and so neither on rotations nor on how F_p is turned. Where
     all principal axes agree it is the radial return.
 
-    Args:
-        gradient: of the displacement ``(n, 3, 3)``.
-        plastic_strain: committed ``(n, k)``, as in ``Flowed``.
-        peeq: committed ``(n,)``.
-        mu: shear modulus ``(n,)``.
-        curve: yield stress over ``peeq``.
-        modulus: increase of the back stress in uniaxial tension per plastic strain ``(n,)``.
-        components: rows and columns of F that may vary, each ``(c,)``.
-
-    Returns:
-        As ``logarithmic_return``, NaN also where no return was found; ``energy`` includes that of the back stress.
+    Arguments are those of ``logarithmic_return``, and ``modulus (n,)``, the increase of the back stress in uniaxial tension per plastic
+    strain. So is what it returns, with NaN also where no return was found, and the back stress's part in ``energy``.
     """
     F, one = gradient + np.eye(3), np.eye(3)
     C, committed = F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
-from uem_dolfinx.materials.elastic import POISSON
-from uem_dolfinx.materials.hardening import Linear, Saturating, Voce, YieldCurve, read_table
+from uem_dolfinx.materials.hardening import Linear, Saturating, Voce, YieldCurve, is_table, read_table
 from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return, to_components, to_tensors
 from uem_dolfinx.materials.von_mises import VonMises
 
@@ -37,13 +35,15 @@ class FinitePlasticity(VonMises):
     ``det F_p = 1`` to rounding, so that the radial return of small strains acts on the logarithmic strain; the result is hyperelastic
     in ``F_e``, and no rigid rotation changes it. In small strains it is ``VonMises``, to second order in the strain.
 
-    With kinematic hardening the yield surface has its centre at a back stress, in the axes of F_p and V_e
+    With a number as ``kinematic_hardening`` the yield surface has its centre at a back stress, in the axes of F_p and V_e
 
         q(2 mu dev(ln U_e) - 2/3 kinematic_hardening ln V_p) <= yield stress at peeq
 
     with ``U_e^2 = F_e^T F_e`` and ``V_p^2 = F_p F_p^T``: Prager's rule, derived from an energy of ``V_p``. No plastic spin is assumed,
     and beside ``peeq`` the plastic strain is all that the law remembers. In simple shear the back stress grows up to a shear of 3
-    and falls slowly beyond, as the logarithm of the stretch does, without oscillations.
+    and falls slowly beyond, as the logarithm of the stretch does, without oscillations. A table stands for layers that share F, as in
+    ``VonMises``, each with a plastic strain of its own: tension follows the table over the logarithmic plastic strain exactly, and
+    cycles follow Masing's rule.
 
     Volumes are treated as there, so that the same cells do not lock: what resists their change is integrated by a rule of its own,
     with one point in quadrilaterals and hexahedra of degree 1; there, in axisymmetry, ``J`` is the ratio of the volumes of the cell's
@@ -56,7 +56,8 @@ class FinitePlasticity(VonMises):
         yield_stress: in uniaxial tension, force per present area times J; infinite where the body is elastic. Or a table: pairs
             (equivalent plastic strain, yield stress), the strains from 0 upwards, with straight lines between.
         hardening: increase of the yield stress per equivalent plastic strain, with a table beyond its last point; or ``Voce``.
-        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none.
+        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs
+            (logarithmic plastic strain, back stress), as ``VonMises`` has it, without isotropic hardening.
         kind: ``"3d"``, ``"plane_strain"``, or ``"axisymmetric"`` on a mesh that has been declared so.
         cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
         quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
@@ -64,7 +65,7 @@ class FinitePlasticity(VonMises):
     Attributes:
         stress: Cauchy stress at quadrature points, as of the last ``update``, with the components of ``Returned``.
         plastic_strain: ``(1 - C_p^-1) / 2`` there, as committed; ``cell_averages`` give ``ln(C_p) / 2``.
-        peeq: equivalent plastic strain there, as committed.
+        peeq: equivalent plastic strain there, as committed; with a table both are those of the layers, as in ``VonMises``.
         history: the committed Functions by name, all that the material remembers.
 
     Raises:
@@ -86,32 +87,21 @@ class FinitePlasticity(VonMises):
         quadrature_degree: int | None = None,
     ):
         given.word("kind", kind, tuple(VARYING))
-        self._kinematic_hardening = kinematic_hardening
-        super().__init__(u, E, nu, yield_stress, hardening, kind=kind, cells=cells, quadrature_degree=quadrature_degree)
-
-    def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
-        """Take the parameters of every cell, and repeat them for its points."""
-        E, nu, count = self._cellwise("E", E, given.POSITIVE), self._cellwise("nu", nu, POISSON), len(self._points.points)
-        self._E, self._nu, self._bulk = np.repeat(E, count), np.repeat(nu, count), E / (3 * (1 - 2 * nu))
-        self._mu = self._E / (2 * (1 + self._nu))
-        self._modulus = np.repeat(self._cellwise("kinematic_hardening", self._kinematic_hardening, given.NOT_NEGATIVE), count)
         #: Outcome of the last update.
         self._trial: Flowed
-        #: Yield stress over peeq.
-        self._curve: YieldCurve
-        if isinstance(yield_stress, (Sequence, np.ndarray)) and not isinstance(yield_stress, str):
-            self._curve = read_table(yield_stress, hardening)
-            return
-        first = np.repeat(self._cellwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE), count)
-        if isinstance(hardening, Voce):
-            self._curve = Saturating(first, hardening)
-        else:
-            self._curve = Linear(first, np.repeat(self._cellwise("hardening", hardening, given.NOT_NEGATIVE), count))
+        super().__init__(
+            u, E, nu, yield_stress, hardening, kinematic_hardening=kinematic_hardening, kind=kind, cells=cells,
+            quadrature_degree=quadrature_degree,
+        )  # fmt: skip
 
-    @property
-    def parameters(self) -> dict[str, Array]:
-        """Parameters at this rank's quadrature points ``(n_points,)``, and those of its yield curve, by name."""
-        return {"E": self._E, "nu": self._nu, "kinematic_hardening": self._modulus, **self._curve.parameters}
+    def _read_curve(self, yield_stress: Any, hardening: Any) -> YieldCurve:
+        """Yield stress over peeq."""
+        if is_table(yield_stress):
+            return read_table(yield_stress, hardening)
+        first = self._pointwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE)
+        if isinstance(hardening, Voce):
+            return Saturating(first, hardening)
+        return Linear(first, self._pointwise("hardening", hardening, given.NOT_NEGATIVE))
 
     def _create_functions(self) -> None:
         """Functions at the quadrature points, zero outside of this material's cells."""
@@ -191,8 +181,7 @@ class FinitePlasticity(VonMises):
                 values = self._points.evaluate(self._strain)
                 gradient = np.zeros((len(values), 3, 3))
                 gradient[:, varying[0], varying[1]] = values
-                before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
-                flowed = self._return(gradient, *before)
+                flowed = self._return(gradient, *self._committed())
                 logarithm = self._volume_changes() @ self._spread.T
                 stress = flowed.stress.copy()
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
@@ -205,29 +194,18 @@ class FinitePlasticity(VonMises):
             self._points.write(self.stress, stress)
 
     def _return(self, gradient: Array, plastic_strain: Array, peeq: Array) -> Flowed:
-        varying = VARYING[self.kind]
+        before, varying = (gradient, plastic_strain, peeq, self._mu), VARYING[self.kind]
+        if self._layers is not None:
+            return self._layers.logarithmic_return(*before, varying)
         if not self._modulus.any():
-            return logarithmic_return(gradient, plastic_strain, peeq, self._mu, self._curve, varying)
+            return logarithmic_return(*before, self._curve, varying)
         from uem_dolfinx.materials.back_stress import kinematic_return
 
-        return kinematic_return(gradient, plastic_strain, peeq, self._mu, self._curve, self._modulus, varying)
-
-    def energy(self) -> float:
-        """Elastic energy stored at the present displacement, and that of the back stress (collective)."""
-        self.update()
-        pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
-        return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
-
-    def dissipation(self) -> float:
-        """Plastic work done since the start, as committed, less that against the back stress (collective).
-
-        What isotropic hardening stores is part of it; the work against the back stress comes back, and is part of ``energy``.
-        """
-        return self._points.integrate(self._curve.work(self._points.read(self.peeq)[:, 0]))
+        return kinematic_return(*before, self._curve, self._modulus, varying)
 
     def _plastic_strains(self) -> Array:
         """``ln(C_p) / 2`` as committed ``(n_points, size)``."""
-        values = self._points.read(self.plastic_strain)
+        values, _ = self._committed()
         change, axes = np.linalg.eigh(to_tensors(values))
         strains = -np.log1p(-2 * change) / 2
-        return to_components((axes * strains[:, None, :]) @ axes.transpose(0, 2, 1), values.shape[1])
+        return self._mean(to_components((axes * strains[:, None, :]) @ axes.transpose(0, 2, 1), values.shape[1]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -153,14 +154,18 @@ class Tabulated:
         return until[j] + (self.stresses[j] + self._slopes[j] * beyond / 2) * beyond
 
 
-def read_table(points: Any, slope: Any) -> Tabulated:
-    """A table of equivalent plastic strain against yield stress, and the slope behind its last point.
+def is_table(value: Any) -> bool:
+    """Whether a parameter is given by points, and not as a number, a Function or a word."""
+    return isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, (str, bytes))
+
+
+def read_pairs(what: str, points: Any, expected: str) -> tuple[Array, Array]:
+    """Plastic strains from 0 upwards and stresses that do not fall, each ``(m,)``.
 
     Raises:
-        InputTypeError, InputError: if it is none, with what was expected.
+        InputTypeError, InputError: if they are none, with what was expected.
     """
-    expected = "pairs (plastic strain, yield stress), strains from 0 upwards, stresses positive and not falling"
-    words = given.sentence("yield_stress", points, expected)
+    words = given.sentence(what, points, expected)
     try:
         table = np.array(points, dtype=float)
     except (TypeError, ValueError):
@@ -168,6 +173,19 @@ def read_table(points: Any, slope: Any) -> Tabulated:
     if table.ndim != 2 or table.shape[1:] != (2,) or not len(table) or not np.isfinite(table).all():
         raise InputError(words)
     strains, stresses = table.T
-    if strains[0] != 0.0 or (np.diff(strains) <= 0).any() or (np.diff(stresses) < 0).any() or stresses[0] <= 0:
+    if strains[0] != 0.0 or (np.diff(strains) <= 0).any() or (np.diff(stresses) < 0).any():
         raise InputError(words)
+    return strains, stresses
+
+
+def read_table(points: Any, slope: Any) -> Tabulated:
+    """A table of equivalent plastic strain against yield stress, and the slope behind its last point.
+
+    Raises:
+        InputTypeError, InputError: if it is none, with what was expected.
+    """
+    expected = "pairs (plastic strain, yield stress), strains from 0 upwards, stresses positive and not falling"
+    strains, stresses = read_pairs("yield_stress", points, expected)
+    if stresses[0] <= 0:
+        raise InputError(given.sentence("yield_stress", points, expected))
     return Tabulated(strains, stresses, given.number("hardening", slope, given.NOT_NEGATIVE))

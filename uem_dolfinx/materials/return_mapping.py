@@ -31,7 +31,9 @@ class Returned:
         stress: the stress in plane stress, otherwise its deviator, ``(n, k)``.
         plastic_strain: ``(n, k)``.
         peeq: equivalent plastic strain ``(n,)``.
-        a, c, m: the tangent ``a I + c 1 x 1 - m x m``, with the unit tensor 1 of the normal components, ``(n,)``, ``(n,)``, ``(n, k)``.
+        a, c, m: the tangent ``a I + c 1 x 1 - sum of m x m``, with the unit tensor 1 of the normal components and vectors m side by
+            side, ``(n,)``, ``(n,)``, ``(n, k)`` or a multiple of k.
+        energy: stored by ``stress`` and by the back stress, per volume ``(n,)``.
     """
 
     stress: Array
@@ -40,52 +42,58 @@ class Returned:
     a: Array
     c: Array
     m: Array
+    energy: Array
 
     @property
     def tangent(self) -> Array:
         """Derivative of ``stress`` by the strain ``(n, k, k)``."""
-        k = self.m.shape[1]
+        n, k = self.stress.shape
+        m = self.m.reshape(n, self.m.shape[1] // k, k)
         one = (np.arange(k) < (2 if k == 3 else 3)).astype(float)
         plain = self.a[:, None, None] * np.eye(k) + self.c[:, None, None] * np.outer(one, one)
-        return plain - self.m[:, :, None] * self.m[:, None, :]
+        return plain - m.transpose(0, 2, 1) @ m
 
 
 def radial_return(
-    strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array
+    strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array, modulus: Array
 ) -> Returned:
-    """Return of the deviator along its own direction, except in plane stress (Simo and Hughes, Computational Inelasticity, box 3.2).
+    """Return of the deviator along its own direction, except in plane stress (Simo and Hughes, Computational Inelasticity, box 3.1).
 
     Strains ``(n, k)``, ``plastic_strain`` and ``peeq (n,)`` the committed ones, have components as in ``Returned``, here k = 4 or 6;
-    parameters are ``(n,)``: shear modulus, ``yield_stress`` at no plastic strain, infinite where elastic, and ``hardening``, its
-    slope over ``peeq``. The tangent is the deviator's.
+    parameters are ``(n,)``: shear modulus, ``yield_stress`` at no plastic strain, infinite where elastic, ``hardening``, its slope
+    over ``peeq``, and ``modulus``, 3/2 of the back stress over the plastic strain. The tangent is the deviator's.
     """
     s = strain - plastic_strain
     s[:, :3] -= s[:, :3].mean(axis=1, keepdims=True)
     s *= 2 * mu[:, None]
-    q = np.sqrt(1.5) * np.linalg.norm(s, axis=1)
+    over = s - 2 / 3 * modulus[:, None] * plastic_strain
+    q = np.sqrt(1.5) * np.linalg.norm(over, axis=1)
     flow = yield_stress + hardening * peeq
     plastic_strain, peeq, a, m = plastic_strain.copy(), peeq.copy(), 2 * mu, np.zeros_like(s)
     i = np.flatnonzero(q > (1 + ON_SURFACE) * flow)
-    stiff = 3 * mu[i] + hardening[i]
+    harder = hardening[i] + modulus[i]
+    stiff = 3 * mu[i] + harder
     dp = (q[i] - flow[i]) / stiff
-    direction = s[i] / q[i, None]
+    direction = over[i] / q[i, None]
     # 1 - 3 mu dp / q without the difference of equals
-    kept = (flow[i] + hardening[i] * dp) / q[i]
+    kept = (flow[i] + harder * dp) / q[i]
     peeq[i] += dp
     plastic_strain[i] += 1.5 * dp[:, None] * direction
-    s[i] *= kept[:, None]
+    s[i] += kept[:, None] * over[i] - over[i]
     a[i] *= kept
     m[i] = np.sqrt(9 * mu[i] ** 2 / stiff * flow[i] / q[i])[:, None] * direction
-    return Returned(s, plastic_strain, peeq, a, -a / 3, m)
+    energy = (s**2).sum(axis=1) / (4 * mu) + modulus / 3 * (plastic_strain**2).sum(axis=1)
+    return Returned(s, plastic_strain, peeq, a, -a / 3, m, energy)
 
 
 def plane_stress_return(
-    strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array
+    strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array, modulus: Array
 ) -> Returned:
     """Return within the plane of stress (Simo and Taylor, Int. J. Numer. Meth. Engng 22 (1986) 649-670).
 
-    Elasticity and yield surface share the eigenmodes s11 + s22, s11 - s22 and s12, which shrink by 1 / (1 + r x) and 1 / (1 + x);
-    x is the consistency parameter times 2 mu and the root of
+    Elasticity, back stress and yield surface share the eigenmodes s11 + s22, s11 - s22 and s12. What they have beyond the back stress
+    shrinks by 1 / (1 + (r + k) x) and 1 / (1 + (1 + k) x) with k = modulus / (3 mu); x is the consistency parameter times 2 mu and the
+    root of
 
         h(x) = flow / q(x) + 2 H x / (6 mu) - 1.
 
@@ -94,31 +102,39 @@ def plane_stress_return(
     Young's modulus and Poisson's ratio ``(n,)`` in place of mu.
     """
     shear, area = E / (1 + nu), E / (1 - nu)
+    of_normal = np.array([[3.0], [1.0], [1.0]])
     modes = _MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])
-    flow = yield_stress + hardening * peeq
-    i = np.flatnonzero(_plane_mises(modes[0] ** 2, modes[1] ** 2 + modes[2] ** 2) > (1 + ON_SURFACE) * flow)
-    b, flow, H, r = shear[i], flow[i], hardening[i], (area / shear)[i] / 3
-    ss, dd = modes[0, i] ** 2, modes[1, i] ** 2 + modes[2, i] ** 2
-    slope, x = 2 * H / (3 * b), np.zeros(len(i))
+    back = of_normal * (_MODES @ plastic_strain.T) * (2 / 3 * modulus)
+    over, flow = modes - back, yield_stress + hardening * peeq
+    i = np.flatnonzero(_plane_mises(over[0] ** 2, over[1] ** 2 + over[2] ** 2) > (1 + ON_SURFACE) * flow)
+    b, flow, H, K, r = shear[i], flow[i], hardening[i], modulus[i], (area / shear)[i] / 3
+    ss, dd = over[0, i] ** 2, over[1, i] ** 2 + over[2, i] ** 2
+    slope, k, x = 2 * H / (3 * b), 2 * K / (3 * b), np.zeros(len(i))
     for _ in range(MAX_STEPS):
-        y, z = 1 / (1 + r * x), 1 / (1 + x)
+        y, z = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x)
         q = _plane_mises(ss * y**2, dd * z**2)
-        step = (1 - slope * x - flow / q) / (flow / q**3 * (0.5 * r * ss * y**3 + 1.5 * dd * z**3) + slope)
+        falls = flow / q**3 * (0.5 * (r + k) * ss * y**3 + 1.5 * (1 + k) * dd * z**3)
+        step = (1 - slope * x - flow / q) / (falls + slope)
         x += step
         if (np.abs(step) <= RETURNED * (1 + x)).all():
             break
-    y, z = 1 / (1 + r * x), 1 / (1 + x)
-    modes[:, i] *= np.stack([y, z, z])
-    q = _plane_mises(modes[0, i] ** 2, modes[1, i] ** 2 + modes[2, i] ** 2)
+    y, z, moved = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x), 1 + k * x
+    over[:, i] *= np.stack([y, z, z])
+    q = _plane_mises(over[0, i] ** 2, over[1, i] ** 2 + over[2, i] ** 2)
     plastic_strain, peeq, m = plastic_strain.copy(), peeq.copy(), np.zeros_like(strain)
-    normal = modes[:, i] / np.array([[3.0], [1.0], [1.0]])
+    normal = over[:, i] / of_normal
     plastic_strain[i] += (_MODES.T @ (normal * x / b)).T
     peeq[i] += x / b * q / 1.5
-    area[i] *= y
-    shear[i] *= z
+    modes[:, i] = back[:, i] + moved * over[:, i]
+    area[i] *= moved * y
+    shear[i] *= moved * z
     pushed = normal * np.stack([area[i], shear[i], shear[i]])
-    m[i] = (_MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + 4 / 9 * q**3 * H / flow))).T
-    return Returned((_MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m)
+    resisted = 4 / 9 * q**2 * moved * (K + moved * H * q / flow)
+    m[i] = (_MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + resisted))).T
+    stress, across = (_MODES.T @ modes).T, plastic_strain[:, :2].sum(axis=1)
+    energy = ((1 + nu) * (stress**2).sum(axis=1) - nu * stress[:, :2].sum(axis=1) ** 2) / (2 * E)
+    energy += modulus / 3 * ((plastic_strain**2).sum(axis=1) + across**2)
+    return Returned(stress, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
 
 
 #: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.

@@ -26,9 +26,13 @@ from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, 
 from uem_dolfinx.parallel import agree
 
 if TYPE_CHECKING:
+    from uem_dolfinx.materials.hardening import YieldCurve
+    from uem_dolfinx.materials.layers import Layers
     from uem_dolfinx.materials.logarithmic import Flowed
 
 STRAINS = ("small", "green_lagrange")
+#: What is expected of a back stress.
+SLOPE_OR_TABLE = given.Range("0 or a positive number, or a table", given.NOT_NEGATIVE.holds)
 #: Degrees of the quadrature of stress and of pressure, by the displacement's degree, on simplices and on tensor-product cells;
 #: 0 is the cell's centre.
 SIMPLEX_DEGREES = {1: (1, 1), 2: (2, 2)}
@@ -36,13 +40,20 @@ TENSOR_DEGREES = {1: (2, 0), 2: (4, 2)}
 
 
 class VonMises:
-    """Elasto-plasticity with the yield surface of von Mises, associated flow and linear isotropic hardening.
+    """Elasto-plasticity with the yield surface of von Mises, associated flow, isotropic and kinematic hardening.
 
-        S = C : (E - E_p),    q(S) <= yield_stress + hardening * peeq
+        S = C : (E - E_p),    q(S - 2/3 kinematic_hardening E_p) <= yield_stress + hardening * peeq
 
     ``update`` returns the stresses at the present displacement from the *committed* history, ``commit`` makes the outcome the
     history; what iterates did in between counts as neither loading nor unloading [UEM, 3]. The form is
     ``residual(v)``; its tangent is ``ufl.derivative(residual(v), u) + stiffness(du, v)``.
+
+    A number as ``kinematic_hardening`` is Prager's rule. A table stands for parallel layers that share the strain, each perfectly
+    plastic, with weights and yield stresses of their own [Besseling, Journal of Applied Mechanics 25 (1958) 529-536; Owen, Prakash and
+    Zienkiewicz, Computers and Structures 4 (1974) 1251-1267]; codes call it multilinear kinematic hardening, sublayer or overlay model.
+    In uniaxial tension the stress follows the table exactly, and in cycles Masing's rule: after a reversal the curve of first loading
+    twice as large, until a loop closes and the curve before it goes on. A table of one straight line is Prager's rule. Each of its
+    bends is a layer, with a history of its own.
 
     Plastic flow keeps the volume, and cells that cannot follow it lock. But in plane stress the pressure, elastic in this law, is
     therefore integrated by a rule of its own. With the error of the limit load of Prandtl's punch in plane strain, perfectly plastic
@@ -66,7 +77,10 @@ class VonMises:
         E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
         nu: Poisson's ratio.
         yield_stress: in uniaxial tension; infinite where the body is elastic.
-        hardening: increase of the yield stress per equivalent plastic strain; 0 is perfect plasticity.
+        hardening: increase of the yield stress per equivalent plastic strain; 0 is none.
+        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs (plastic
+            strain, back stress in uniaxial tension) from (0, 0), with straight lines between, whose slopes do not rise, and a constant
+            beyond the last; then ``hardening`` is 0, and in plane stress ``nu`` below 1/2.
         kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh that has been declared so.
         strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange
             strain, with the second Piola-Kirchhoff stress in the yield surface; for large rotations and moderate strains.
@@ -75,11 +89,12 @@ class VonMises:
 
     Attributes:
         stress, plastic_strain, peeq: at quadrature points, with the components of ``Returned``; ``stress`` as of the last
-            ``update``, the others committed; zero outside of ``cells``.
+            ``update``, the others committed; zero outside of ``cells``. With a table those of the layers, one after another
+            (in plane stress with the components of plane strain); ``cell_averages`` give those of the body, by the layers' weights.
         history: the committed Functions by name, all that the material remembers.
 
     Raises:
-        InputError, InputTypeError: for an unknown word, or a parameter out of its range.
+        InputError, InputTypeError: for an unknown word, a parameter out of its range, or isotropic hardening beside a table.
         SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or the mesh of ``cells`` is another.
         TagError: if ``cells`` are not cells, or none on any rank.
     """
@@ -92,6 +107,7 @@ class VonMises:
         yield_stress: Any,
         hardening: Any = 0.0,
         *,
+        kinematic_hardening: Any = 0.0,
         kind: str = "3d",
         strain: str = "small",
         cells: Part | None = None,
@@ -106,7 +122,10 @@ class VonMises:
         self.cells = owned_cells(self.mesh, cells)
         degrees = self._degrees(quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
-        self._read_parameters(E, nu, yield_stress, hardening)
+        #: Yield stress over peeq; of layers where a table is handed over, which then are all that hardens.
+        self._curve: YieldCurve
+        self._layers: Layers | None = None
+        self._read_parameters(E, nu, yield_stress, hardening, kinematic_hardening)
         self._create_functions()
         self._compile()
         self._spread = self._spreading()
@@ -152,21 +171,52 @@ class VonMises:
         spread = at @ np.linalg.pinv(known)
         return spread / spread.sum(axis=1, keepdims=True)
 
-    def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any) -> None:
+    def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any, kinematic_hardening: Any) -> None:
         """Take the parameters of every cell, and repeat them for its points."""
-        E = self._cellwise("E", E, given.POSITIVE)
-        nu = self._cellwise("nu", nu, given.between(-1.0, 1.0) if self.kind == "plane_stress" else POISSON)
-        yield_stress = self._cellwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE)
-        hardening = self._cellwise("hardening", hardening, given.NOT_NEGATIVE)
-        self._E, self._nu, self._yield_stress, self._hardening = (
-            np.repeat(values, len(self._points.points)) for values in (E, nu, yield_stress, hardening)
-        )
-        self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
+        from uem_dolfinx.materials.hardening import is_table
 
-    @property
-    def parameters(self) -> dict[str, Array]:
-        """Parameters at this rank's quadrature points, by name, each ``(n_points,)``."""
-        return {"E": self._E, "nu": self._nu, "yield_stress": self._yield_stress, "hardening": self._hardening}
+        layered, count = is_table(kinematic_hardening), len(self._points.points)
+        E = self._cellwise("E", E, given.POSITIVE)
+        nu = self._cellwise("nu", nu, given.between(-1.0, 1.0) if self.kind == "plane_stress" and not layered else POISSON)
+        self._E, self._nu = np.repeat(E, count), np.repeat(nu, count)
+        self._mu = self._E / (2 * (1 + self._nu))
+        self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
+        self._curve = self._read_curve(yield_stress, hardening)
+        #: Parameters at this rank's points, by name, each ``(n_points,)``; of tables their points.
+        self.parameters = {"E": self._E, "nu": self._nu, **self._curve.parameters}
+        if layered:
+            self._read_layers(kinematic_hardening)
+            return
+        #: Increase of the back stress in uniaxial tension per plastic strain.
+        self._modulus = self._pointwise("kinematic_hardening", kinematic_hardening, SLOPE_OR_TABLE)
+        self.parameters["kinematic_hardening"] = self._modulus
+
+    def _read_curve(self, yield_stress: Any, hardening: Any) -> YieldCurve:
+        """Yield stress over peeq."""
+        from uem_dolfinx.materials.hardening import Linear
+
+        first = self._pointwise("yield_stress", yield_stress, given.POSITIVE_OR_INFINITE)
+        return Linear(first, self._pointwise("hardening", hardening, given.NOT_NEGATIVE))
+
+    def _read_layers(self, points: Any) -> None:
+        """Take the layers that a table of back stresses stands for; they are all that hardens (collective)."""
+        from uem_dolfinx.materials.hardening import Linear
+        from uem_dolfinx.materials.layers import BackTable, Layers
+
+        table, curve, error = BackTable.read(points), self._curve, None
+        if not isinstance(curve, Linear) or curve.slope.any():
+            error = InputError(
+                "isotropic hardening beside a table of back stresses: expected hardening = 0 and yield_stress as a number or a DG0 "
+                "Function; or give kinematic_hardening as a number, which goes with any isotropic hardening"
+            )
+        agree(self.comm, error)
+        self._layers = Layers.of(table, curve.at(np.zeros_like(self._mu), np.arange(len(self._mu)))[0], self._mu)
+        self._curve = self._layers.curve
+        self.parameters |= {"kinematic_hardening": table.stresses, "plastic strains of kinematic_hardening": table.strains}
+
+    def _pointwise(self, name: str, value: Any, within: given.Range) -> Array:
+        """Values of a parameter at this rank's points; see ``_cellwise`` (collective)."""
+        return np.repeat(self._cellwise(name, value, within), len(self._points.points))
 
     def _cellwise(self, name: str, value: Any, within: given.Range) -> Array:
         """Values of a parameter in ``cells``, refused on all ranks if they are out of range on any (collective)."""
@@ -187,11 +237,13 @@ class VonMises:
         return values
 
     def _create_history(self) -> int:
-        """Stress and history at the quadrature points, zero outside of this material's cells: the number of their components."""
+        """Stress and history at the quadrature points, zero outside of this material's cells: the number of the stress's components."""
         size, at = {"3d": 6, "plane_strain": 4, "plane_stress": 3, "axisymmetric": 4}[self.kind], self._points
+        # layers in plane stress are not free of stress across it each
+        layers, of_each = (1, size) if self._layers is None else (self._layers.count, max(size, 4))
         self.stress = at.create_function("stress", size)
-        self.plastic_strain = at.create_function("plastic_strain", size)
-        self.peeq = at.create_function("peeq")
+        self.plastic_strain = at.create_function("plastic_strain", layers * of_each)
+        self.peeq = at.create_function("peeq", layers)
         self.history: dict[str, fem.Function] = {f.name: f for f in (self.plastic_strain, self.peeq)}
         self._kappa = fem.Function(compat.function_space(self.mesh, ("DG", 0)), name="bulk_modulus")
         self._kappa.x.array[compat.cell_dofs(self._kappa.function_space)[self.cells, 0]] = self._bulk
@@ -202,7 +254,9 @@ class VonMises:
         size, at = self._create_history(), self._points
         # what the forms hold: the deviator where the pressure goes its own way, and the tangent
         self._s = self.stress if self.kind == "plane_stress" else at.create_function("deviator", size)
-        self._a, self._c, self._m = at.create_function("a"), at.create_function("c"), at.create_function("m", size)
+        self._a, self._c = at.create_function("a"), at.create_function("c")
+        vectors = 1 if self._layers is None else self._layers.count + (self.kind == "plane_stress")
+        self._m = at.create_function("m", vectors * size)
         self._own(self.stress, self._s, self._a, self._c, self._m, *self.history.values())
 
     def _own(self, *functions: fem.Function) -> None:
@@ -263,19 +317,18 @@ class VonMises:
             The form.
         """
         A, B = self._variation(du), self._variation(v)
-        plain = self._a * ufl.inner(A, B) + self._c * ufl.tr(A) * ufl.tr(B)
-        return (plain - ufl.dot(self._m, self._vector(A)) * ufl.dot(self._m, self._vector(B))) * self._points.dx
+        tangent = self._a * ufl.inner(A, B) + self._c * ufl.tr(A) * ufl.tr(B)
+        size = self.stress.function_space.dofmap.index_map_bs
+        for first in range(0, self._m.function_space.dofmap.index_map_bs, size):
+            m = ufl.as_vector([self._m[first + i] for i in range(size)])
+            tangent -= ufl.dot(m, self._vector(A)) * ufl.dot(m, self._vector(B))
+        return tangent * self._points.dx
 
     def update(self) -> None:
         """Stress and tangent at the present displacement, from the committed history; NotFiniteError if they are not (collective)."""
         with timed("return mapping"):
             with np.errstate(over="ignore", invalid="ignore"):
-                E, nu, law, strain = self._E, self._nu, (self._yield_stress, self._hardening), self._points.evaluate(self._strain)
-                before = self._points.read(self.plastic_strain), self._points.read(self.peeq)[:, 0]
-                if self.kind == "plane_stress":
-                    trial = plane_stress_return(strain, *before, E, nu, *law)
-                else:
-                    trial = radial_return(strain, *before, E / (2 * (1 + nu)), *law)
+                trial = self._return(self._points.evaluate(self._strain), *self._committed())
                 stress = trial.stress.copy()
                 if self.kind != "plane_stress":
                     stress[:, :3] += (self._bulk[:, None] * (self._volume_changes() @ self._spread.T)).reshape(-1, 1)
@@ -284,6 +337,26 @@ class VonMises:
             for f, values in ((self._s, trial.stress), (self._a, trial.a), (self._c, trial.c), (self._m, trial.m)):
                 self._points.write(f, values)
             self._points.write(self.stress, stress)
+
+    def _return(self, strain: Array, plastic_strain: Array, peeq: Array) -> Any:
+        """Stress, history and tangent at strains ``(n_points, size)``, from a committed history as ``_committed`` has it."""
+        plane, E, nu = self.kind == "plane_stress", self._E, self._nu
+        if self._layers is not None:
+            before = strain, plastic_strain, peeq
+            return self._layers.plane_stress_return(*before, E, nu) if plane else self._layers.radial_return(*before, self._mu)
+        law = *self._curve.parameters.values(), self._modulus
+        if plane:
+            return plane_stress_return(strain, plastic_strain, peeq, E, nu, *law)
+        return radial_return(strain, plastic_strain, peeq, self._mu, *law)
+
+    def _committed(self) -> tuple[Array, Array]:
+        """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, of layers one after another."""
+        strains, peeq = self._points.read(self.plastic_strain), self._points.read(self.peeq)
+        return strains.reshape(peeq.size, strains.shape[1] // peeq.shape[1]), peeq.ravel()
+
+    def _mean(self, values: Array) -> Array:
+        """Of the layers of each point; values ``(n, ...)`` themselves where there are none."""
+        return values if self._layers is None else self._layers.mean(values)
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""
@@ -308,23 +381,18 @@ class VonMises:
             f.x.scatter_forward()
 
     def energy(self) -> float:
-        """Elastic energy stored at the present displacement (collective)."""
+        """Elastic energy stored at the present displacement, and that of the back stress (collective)."""
         self.update()
-        stress = self._trial.stress
-        twice = (stress**2).sum(axis=1) * (1 + self._nu) / self._E
-        if self.kind == "plane_stress":
-            twice -= stress[:, :2].sum(axis=1) ** 2 * self._nu / self._E
         pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
-        return self._points.integrate(twice) / 2 + self._pressure_points.integrate(pressed) / 2
+        return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
 
     def dissipation(self) -> float:
-        """Plastic work done since the start, as committed (collective).
+        """Plastic work done since the start, as committed, less that against the back stress (collective).
 
-        On the yield surface ``S : dE_p = (yield_stress + hardening * peeq) d(peeq)``, so it follows from ``peeq`` alone.
+        What isotropic hardening stores is part of it; the work against the back stress comes back, and is part of ``energy``. It
+        follows from ``peeq`` alone.
         """
-        peeq = self._points.read(self.peeq)[:, 0]
-        yield_stress = np.where(peeq > 0, self._yield_stress, 0.0)
-        return self._points.integrate((yield_stress + self._hardening * peeq / 2) * peeq)
+        return self._points.integrate(self._mean(self._curve.work(self._committed()[1])))
 
     def cell_averages(self) -> dict[str, fem.Function]:
         """Means over the cells for output: ``stress`` and ``plastic_strain (3, 3)``, ``peeq`` and ``von_mises``, zero elsewhere.
@@ -343,15 +411,15 @@ class VonMises:
             full[name] = values * [1, 1, 1, root, root, root]
         deviator = full["stress"] - np.array([1, 1, 1, 0, 0, 0]) * full["stress"][:, :3].mean(axis=1, keepdims=True)
         fields = {name: values[:, [0, 5, 4, 5, 1, 3, 4, 3, 2]] for name, values in full.items()}
-        fields["peeq"] = self._points.read(self.peeq)
+        fields["peeq"] = self._mean(self._committed()[1])[:, None]
         fields["von_mises"] = np.sqrt(1.5 * (deviator**2) @ [1, 1, 1, 2, 2, 2])[:, None]
         for name, values in fields.items():
             self._points.average(values, self._averages[name])
         return dict(self._averages)
 
     def _plastic_strains(self) -> Array:
-        """Committed plastic strains for output ``(n_points, size)``."""
-        return self._points.read(self.plastic_strain)
+        """Committed plastic strains for output ``(n_points, k)``."""
+        return self._mean(self._committed()[0])
 
     @cached_property
     def _averages(self) -> dict[str, fem.Function]:

@@ -1,0 +1,166 @@
+"""Tabulated kinematic hardening: at every point parallel layers that share the strain, each perfectly plastic at its own yield stress.
+
+[Besseling, Journal of Applied Mechanics 25 (1958) 529-536; Owen, Prakash and Zienkiewicz, Computers and Structures 4 (1974) 1251-1267]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.materials.hardening import Linear, read_pairs
+from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return
+from uem_dolfinx.materials.return_mapping import MAX_STEPS, RETURNED, Returned, radial_return
+
+#: Slopes of a table that differ by less than this part are one straight line.
+#: [convention; slope; test_tabulated_back_stress.py::test_points_on_a_straight_line]
+SAME_SLOPE = 1e-9
+
+
+@dataclass(frozen=True)
+class BackTable:
+    """Back stress over the plastic strain in uniaxial tension, both ``(j,)`` from 0: straight lines, and a constant beyond the last point.
+
+    ``slopes (j,)`` follow the points, and fall.
+    """
+
+    strains: Array
+    stresses: Array
+
+    @property
+    def slopes(self) -> Array:
+        """Behind each point."""
+        return np.append(np.diff(self.stresses) / np.diff(self.strains), 0.0)
+
+    @staticmethod
+    def read(points: Any) -> BackTable:
+        """Of pairs (plastic strain, back stress); points on a straight line are left out.
+
+        Raises:
+            InputTypeError, InputError: if they are none, naming what was expected.
+        """
+        expected = "pairs (plastic strain, back stress) from (0, 0), strains rising, stresses not falling, slopes not rising"
+        strains, stresses = read_pairs("kinematic_hardening", points, expected)
+        if len(strains) < 2 or stresses[0] != 0:
+            remedy = "the back stress begins at 0; what the yield stress is at first is yield_stress"
+            raise InputError(given.sentence("kinematic_hardening", points, expected, remedy))
+        table = BackTable(strains, stresses)
+        before, behind = table.slopes[:-1], table.slopes[1:]
+        rising = np.flatnonzero(behind > (1 + SAME_SLOPE) * before)
+        if len(rising):
+            i = rising[0]
+            why = f"behind the plastic strain {strains[i + 1]:g} the slope rises from {before[i]:g} to {behind[i]:g}"
+            remedy = f"{why}: leave points out, or put that part of the hardening into a table as yield_stress"
+            raise InputError(given.sentence("kinematic_hardening", points, expected, remedy))
+        kept = np.append(True, behind < (1 - SAME_SLOPE) * before)
+        return BackTable(strains[kept], stresses[kept])
+
+
+@dataclass(frozen=True)
+class Layers:
+    """j layers at each of n points. Arrays of layers have n j rows, those of one point one after another.
+
+    Layers have the elasticity of the body and, as flow keeps the volume, its pressure. Their deviators in uniaxial tension are parallel:
+    with the yield stress Y a layer flows from the strain ``p_i + (Y + X_i) / (3 mu)`` of the deviator on, at which the tabulated curve
+    ``Y + X(p)`` has its i-th bend. Its slope over this strain is ``3 mu`` times the weights of all layers that do not flow yet, so that
+
+        yield stress i = Y + X_i + 3 mu p_i,    sum of the weights up to i = 3 mu / (3 mu + slope behind i).
+
+    Attributes:
+        weights: parts of the body, whose sum is 1 ``(n, j)``.
+        curve: yield stresses ``(n j,)``.
+    """
+
+    weights: Array
+    curve: Linear
+
+    @staticmethod
+    def of(table: BackTable, yield_stress: Array, mu: Array) -> Layers:
+        """Whose uniaxial curve is ``yield_stress (n,)`` and the table; ``mu (n,)``."""
+        stiff = 3 * mu[:, None]
+        parts = stiff / (stiff + table.slopes)
+        stresses = (yield_stress[:, None] + table.stresses + stiff * table.strains).ravel()
+        return Layers(np.diff(parts, axis=1, prepend=0.0), Linear(stresses, np.zeros_like(stresses)))
+
+    @property
+    def count(self) -> int:
+        """Number of layers at each point, j."""
+        return self.weights.shape[1]
+
+    def repeat(self, values: Array) -> Array:
+        """For each layer those of its point ``(n, ...)``."""
+        return np.repeat(values, self.count, axis=0)
+
+    def mean(self, values: Array) -> Array:
+        """Of values of layers ``(n j, ...)``, by their weights ``(n, ...)``."""
+        each = values.reshape(*self.weights.shape, *values.shape[1:])
+        return np.einsum("nj,nj...->n...", self.weights, each)
+
+    def logarithmic_return(
+        self, gradient: Array, plastic_strain: Array, peeq: Array, mu: Array, components: Sequence[Ints]
+    ) -> Flowed:
+        """That of all layers in finite strain: their history ``(n j, k)`` and ``(n j,)``, the rest of the body."""
+        mu, gradient = self.repeat(mu), self.repeat(gradient)
+        each = logarithmic_return(gradient, plastic_strain, peeq, mu, self.curve, components)
+        stress, piola, tangent, energy = (
+            self.mean(values) for values in (each.stress, each.first_piola, each.tangent, each.energy)
+        )
+        return Flowed(stress, piola, tangent, each.plastic_strain, each.peeq, energy)
+
+    def radial_return(self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array) -> Returned:
+        """That of all layers: their history ``(n j, k)`` and ``(n j,)``, and j vectors m; the rest of the body."""
+        mu, none = self.repeat(mu), np.zeros_like(peeq)
+        each = radial_return(self.repeat(strain), plastic_strain, peeq, mu, self.curve.yield_stress, none, none)
+        m = np.sqrt(self.weights).reshape(-1, 1) * each.m
+        stress, a, c, energy = (self.mean(values) for values in (each.stress, each.a, each.c, each.energy))
+        return Returned(
+            stress, each.plastic_strain, each.peeq, a, c, m.reshape(len(strain), self.count * strain.shape[1]), energy
+        )
+
+    def plane_stress_return(self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array) -> Returned:
+        """That of all layers, which also share the strain across the plane, at which the body is free of stress across it.
+
+        The stress across grows with this strain: Newton's method, kept between strains known to be too small and too large.
+
+        Args:
+            strain: in the plane ``(n, 3)``.
+            plastic_strain: committed, of layers, with the part across, as in plane strain ``(n j, 4)``.
+            peeq: committed, of layers ``(n j,)``.
+            E: Young's modulus ``(n,)``.
+            nu: Poisson's ratio ``(n,)``.
+
+        Returns:
+            Stress of the body in the plane, NaN where no strain was found; history of layers; j + 1 vectors m.
+        """
+        mu, bulk = E / (2 * (1 + nu)), E / (3 * (1 - 2 * nu))
+        full, plane, one = np.insert(strain, 2, 0.0, axis=1), [0, 1, 3], np.array([1.0, 1.0, 0.0])
+        low, high = np.full(len(strain), -np.inf), np.full(len(strain), np.inf)
+        # as if nothing flowed on
+        step = 2 * mu * self.mean(plastic_strain)[:, 2] - (bulk - 2 / 3 * mu) * strain[:, :2].sum(axis=1)
+        step /= bulk + 4 / 3 * mu
+        for _ in range(MAX_STEPS):
+            full[:, 2] += step
+            each = self.radial_return(full, plastic_strain, peeq, mu)
+            pressure, c, m = bulk * full[:, :3].sum(axis=1), each.c + bulk, each.m.reshape(len(full), self.count, 4)
+            stiff = each.a + c - (m[:, :, 2] ** 2).sum(axis=1)
+            settled = np.abs(step) <= RETURNED * np.linalg.norm(full, axis=1)
+            if settled.all():
+                break
+            across, now = each.stress[:, 2] + pressure, full[:, 2]
+            low, high = np.where(across < 0, now, low), np.where(across > 0, now, high)
+            step = -across / stiff
+            i = np.flatnonzero((now + step < low) | (now + step > high))
+            step[i] = (low[i] + high[i]) / 2 - now[i]
+        stress = each.stress[:, plane] + pressure[:, None] * one
+        stress[~settled] = np.nan
+        # the strain across follows: derivative of the stress in the plane by it
+        mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, plane])
+        last = mixed / np.sqrt(stiff)[:, None]
+        vectors = np.concatenate([m[:, :, plane].reshape(len(full), 3 * self.count), last], axis=1)
+        return Returned(stress, each.plastic_strain, each.peeq, each.a, c, vectors, each.energy + pressure**2 / (2 * bulk))
