@@ -66,7 +66,8 @@ def radial_return(
     s = strain - plastic_strain
     s[:, :3] -= s[:, :3].mean(axis=1, keepdims=True)
     s *= 2 * mu[:, None]
-    over = s - 2 / 3 * modulus[:, None] * plastic_strain
+    moves = modulus.any()
+    over = s - 2 / 3 * modulus[:, None] * plastic_strain if moves else s
     q = np.sqrt(1.5) * np.linalg.norm(over, axis=1)
     flow = yield_stress + hardening * peeq
     plastic_strain, peeq, a, m = plastic_strain.copy(), peeq.copy(), 2 * mu, np.zeros_like(s)
@@ -79,10 +80,12 @@ def radial_return(
     kept = (flow[i] + harder * dp) / q[i]
     peeq[i] += dp
     plastic_strain[i] += 1.5 * dp[:, None] * direction
-    s[i] += kept[:, None] * over[i] - over[i]
+    s[i] = s[i] - over[i] + kept[:, None] * over[i]
     a[i] *= kept
     m[i] = np.sqrt(9 * mu[i] ** 2 / stiff * flow[i] / q[i])[:, None] * direction
-    energy = (s**2).sum(axis=1) / (4 * mu) + modulus / 3 * (plastic_strain**2).sum(axis=1)
+    energy = _squares(s) / (4 * mu)
+    if moves:
+        energy += modulus / 3 * _squares(plastic_strain)
     return Returned(s, plastic_strain, peeq, a, -a / 3, m, energy)
 
 
@@ -92,20 +95,20 @@ def plane_stress_return(
     """Return within the plane of stress (Simo and Taylor, Int. J. Numer. Meth. Engng 22 (1986) 649-670).
 
     Elasticity, back stress and yield surface share the eigenmodes s11 + s22, s11 - s22 and s12. What they have beyond the back stress
-    shrinks by 1 / (1 + (r + k) x) and 1 / (1 + (1 + k) x) with k = modulus / (3 mu); x is the consistency parameter times 2 mu and the
-    root of
+    shrinks by 1 / (1 + (r + k) x) and 1 / (1 + (1 + k) x) with r = (1 + nu) / (1 - nu) / 3 and k = modulus / (3 mu); x is the consistency
+    parameter times 2 mu and the root of
 
         h(x) = flow / q(x) + 2 H x / (6 mu) - 1.
 
     1 / q is the harmonic-like mean ``(y1^-2 + y2^-2)^(-1/2)`` of linear functions of x, so h is concave and grows: Newton's method
-    from x = 0 approaches the root from the left and needs no other safeguard. Arguments are those of ``radial_return`` with k = 3,
-    Young's modulus and Poisson's ratio ``(n,)`` in place of mu.
+    from x = 0 approaches the root from the left and needs no other safeguard. Arguments are those of ``radial_return``, vectors with 3
+    components, and Young's modulus and Poisson's ratio ``(n,)`` in place of mu.
     """
     shear, area = E / (1 + nu), E / (1 - nu)
     of_normal = np.array([[3.0], [1.0], [1.0]])
     modes = _MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])
-    back = of_normal * (_MODES @ plastic_strain.T) * (2 / 3 * modulus)
-    over, flow = modes - back, yield_stress + hardening * peeq
+    moves, flow = modulus.any(), yield_stress + hardening * peeq
+    over = modes - of_normal * (_MODES @ plastic_strain.T) * (2 / 3 * modulus) if moves else modes
     i = np.flatnonzero(_plane_mises(over[0] ** 2, over[1] ** 2 + over[2] ** 2) > (1 + ON_SURFACE) * flow)
     b, flow, H, K, r = shear[i], flow[i], hardening[i], modulus[i], (area / shear)[i] / 3
     ss, dd = over[0, i] ** 2, over[1, i] ** 2 + over[2, i] ** 2
@@ -119,27 +122,33 @@ def plane_stress_return(
         if (np.abs(step) <= RETURNED * (1 + x)).all():
             break
     y, z, moved = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x), 1 + k * x
-    over[:, i] *= np.stack([y, z, z])
-    q = _plane_mises(over[0, i] ** 2, over[1, i] ** 2 + over[2, i] ** 2)
+    before = over[:, i]
+    left = before * np.stack([y, z, z])
+    q = _plane_mises(left[0] ** 2, left[1] ** 2 + left[2] ** 2)
     plastic_strain, peeq, m = plastic_strain.copy(), peeq.copy(), np.zeros_like(strain)
-    normal = over[:, i] / of_normal
+    normal = left / of_normal
     plastic_strain[i] += (_MODES.T @ (normal * x / b)).T
     peeq[i] += x / b * q / 1.5
-    modes[:, i] = back[:, i] + moved * over[:, i]
+    modes[:, i] = modes[:, i] - before + moved * left
     area[i] *= moved * y
     shear[i] *= moved * z
     pushed = normal * np.stack([area[i], shear[i], shear[i]])
     resisted = 4 / 9 * q**2 * moved * (K + moved * H * q / flow)
     m[i] = (_MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + resisted))).T
-    stress, across = (_MODES.T @ modes).T, plastic_strain[:, :2].sum(axis=1)
-    energy = ((1 + nu) * (stress**2).sum(axis=1) - nu * stress[:, :2].sum(axis=1) ** 2) / (2 * E)
-    energy += modulus / 3 * ((plastic_strain**2).sum(axis=1) + across**2)
-    return Returned(stress, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
+    energy = ((1 - nu) * modes[0] ** 2 + (1 + nu) * (modes[1] ** 2 + modes[2] ** 2)) / (2 * E)
+    if moves:
+        energy += modulus / 3 * (_squares(plastic_strain) + (plastic_strain[:, 0] + plastic_strain[:, 1]) ** 2)
+    return Returned((_MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
 
 
 #: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.
 #: [format; components; -]
 _MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
+
+
+def _squares(v: Array) -> Array:
+    """Of the size of vectors ``(n, k)``."""
+    return np.asarray(np.einsum("nk,nk->n", v, v), dtype=np.float64)
 
 
 def _plane_mises(ss: Array, dd: Array) -> Array:
