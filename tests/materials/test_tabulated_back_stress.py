@@ -1,7 +1,6 @@
 """Kinematic hardening by a table or a slope: the curve of tension, Masing's rule in cycles, and what is stored and refused.
 
-The test to read first is ``test_cycles_of_a_bar``. Masing's rule [Proc. 2nd Int. Congr. Applied Mechanics, Zurich (1926) 332-335]: after a
-reversal the stress follows the virgin curve, twice as large, until the strain of the reversal before; there the older curve goes on.
+The test to read first is ``test_cycles_of_a_bar``.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from helpers import at, clamp, refused, rotation, slow
-from plastic_scenes import FY, MU, NU, E, H, block, reaction, spread, tangent_in_flow, wiggle
+from plastic_scenes import FY, MU, NU, TABLE, E, H, Masing, block, reaction, spread, tangent_in_flow, wiggle
 from scipy.optimize import brentq
 
 import uem_dolfinx as uem
@@ -19,54 +18,9 @@ from uem_dolfinx.materials.layers import BackTable, Layers
 from uem_dolfinx.materials.logarithmic import to_components, to_tensors
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
 
-#: Back stress over plastic strain.
-TABLE = [(0.0, 0.0), (0.002, 0.6 * FY), (0.01, 1.4 * FY), (0.05, 2.0 * FY)]
 #: Slope of a linear back stress, and the table that it is as far as strains go.
 K = 25.0
 STRAIGHT = [(0.0, 0.0), (10.0, 10 * K)]
-
-
-class Masing:
-    """Stress over strain in tension by Masing's rule, the plastic strain, and work."""
-
-    def __init__(self, table, stiffness=E, yield_stress=FY):
-        p, back = np.transpose(table)
-        stress = yield_stress + back
-        self.stiffness, self.strain, self.stress, self.work, self.way = stiffness, 0.0, 0.0, 0.0, 0.0
-        #: Bends of the virgin curve, which is constant at its end.
-        self.bends = np.append(0.0, stress / stiffness + p), np.append(0.0, stress)
-        #: Reversals ``(strain, stress)`` from which no loop has closed yet; the last one begins the present branch.
-        self.open = []
-
-    def to(self, strain):
-        """Stress after a way in one direction."""
-        way = np.sign(strain - self.strain)
-        if way == -self.way:
-            self.open.append((self.strain, self.stress))
-        self.way = way
-        while self.open:
-            closes = self.open[-2][0] if len(self.open) > 1 else -self.open[-1][0]
-            if way * (strain - closes) <= 0:
-                break
-            self._lead(closes)
-            del self.open[-2:]
-        self._lead(strain)
-        return self.stress
-
-    def _lead(self, strain):
-        """Go on along the present branch, with the work of its straight parts."""
-        (e, s), size = (self.open[-1], 2) if self.open else ((0.0, 0.0), 1)
-        bends = e + size * np.concatenate([self.bends[0], -self.bends[0]])
-        low, high = sorted((self.strain, strain))
-        points = np.sort(np.concatenate([[low, high], bends[(bends > low) & (bends < high)]]))
-        values = s + size * np.sign(points - e) * np.interp(abs(points - e) / size, *self.bends)
-        self.work += self.way * float(((values[1:] + values[:-1]) / 2 * np.diff(points)).sum())
-        self.strain, self.stress = strain, values[-1 if self.way > 0 else 0]
-
-    @property
-    def plastic(self):
-        """Plastic strain."""
-        return self.strain - self.stress / self.stiffness
 
 
 #: Strains of a bar over that of its yield: turns within turns, loops that close, and beyond all before.

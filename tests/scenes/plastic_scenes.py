@@ -19,6 +19,8 @@ from uem_dolfinx import compat, forms
 
 E, NU, FY, H = 200.0, 0.3, 0.4, 15.0
 MU = E / (2 * (1 + NU))
+#: Back stress over plastic strain.
+TABLE = [(0.0, 0.0), (0.002, 0.6 * FY), (0.01, 1.4 * FY), (0.05, 2.0 * FY)]
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
@@ -137,3 +139,53 @@ def tangent_in_flow(material: uem.VonMises, u: fem.Function) -> None:
         sides.append(vector(material.residual(v), V))
     slope, product = (sides[0] - sides[1]) / (2 * h), (K * x).array_r
     assert highest(comm, np.abs(slope - product)) < 2e-6 * highest(comm, np.abs(product))
+
+
+# -- closed forms ------------------------------------------------------------------------------------------------------
+
+
+class Masing:
+    """Stress over strain in tension by Masing's rule, the plastic strain, and work.
+
+    After a reversal the stress follows the virgin curve, twice as large, until the strain of the reversal before; there the older curve
+    goes on [Proc. 2nd Int. Congr. Applied Mechanics, Zurich (1926) 332-335].
+    """
+
+    def __init__(self, table: list[tuple[float, float]], stiffness: float = E, yield_stress: float = FY):
+        p, back = np.transpose(table)
+        stress = yield_stress + back
+        self.stiffness, self.strain, self.stress, self.work, self.way = stiffness, 0.0, 0.0, 0.0, 0.0
+        #: Bends of the virgin curve, which is constant at its end.
+        self.bends = np.append(0.0, stress / stiffness + p), np.append(0.0, stress)
+        #: Reversals ``(strain, stress)`` from which no loop has closed yet; the last one begins the present branch.
+        self.open: list[tuple[float, float]] = []
+
+    def to(self, strain: float) -> float:
+        """Stress after a way in one direction."""
+        way = np.sign(strain - self.strain)
+        if way == -self.way:
+            self.open.append((self.strain, self.stress))
+        self.way = way
+        while self.open:
+            closes = self.open[-2][0] if len(self.open) > 1 else -self.open[-1][0]
+            if way * (strain - closes) <= 0:
+                break
+            self._lead(closes)
+            del self.open[-2:]
+        self._lead(strain)
+        return self.stress
+
+    def _lead(self, strain: float) -> None:
+        """Go on along the present branch, with the work of its straight parts."""
+        (e, s), size = (self.open[-1], 2) if self.open else ((0.0, 0.0), 1)
+        bends = e + size * np.concatenate([self.bends[0], -self.bends[0]])
+        low, high = sorted((self.strain, strain))
+        points = np.sort(np.concatenate([[low, high], bends[(bends > low) & (bends < high)]]))
+        values = s + size * np.sign(points - e) * np.interp(abs(points - e) / size, *self.bends)
+        self.work += self.way * float(((values[1:] + values[:-1]) / 2 * np.diff(points)).sum())
+        self.strain, self.stress = strain, values[-1 if self.way > 0 else 0]
+
+    @property
+    def plastic(self) -> float:
+        """Plastic strain."""
+        return self.strain - self.stress / self.stiffness

@@ -41,7 +41,7 @@ class ConfigurationAmongFields(Configuration):
     def __init__(self, w: fem.Function, displacement: int):
         W = w.function_space
         with agreed(W.mesh.comm):
-            degree = _degree_of_displacement(W, displacement)
+            degree = degree_of_displacement(W, displacement)
         given.alike(W.mesh.comm, "UnitedProblem", displacement=displacement)
         self.whole, self.part, self.u = w, int(displacement), ufl.split(w)[displacement]
         # numbered as a space of its own, which surfaces and results are of
@@ -268,7 +268,7 @@ class Unknowns(Nodes):
         K.setDiagonal(diagonal)
 
 
-def _degree_of_displacement(W: Any, i: Any) -> int:
+def degree_of_displacement(W: Any, i: Any) -> int:
     """Degree of a mixed space's part i, a vector Lagrange space."""
     if not compat.is_mixed(W):
         raise SpaceError("displacement names a part of a mixed space, and the space of u is none: leave displacement out")

@@ -263,7 +263,8 @@ def material_of(f: Any) -> Any:
 class HistoryMaterial(Protocol):
     """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity.
 
-    The Functions that its forms hold may refer to it, weakly, by an attribute ``material``, and it to its displacement by ``u``.
+    The Functions that its forms hold may refer to it, weakly, by an attribute ``material``, and it to its displacement by ``u``. Of a
+    mixed space it tells the displacement's part as ``displacement``; ``stiffness`` gets trial and test functions of the whole space.
     """
 
     #: Committed Functions that the stress depends on, by name.

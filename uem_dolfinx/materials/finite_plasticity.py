@@ -50,7 +50,7 @@ class FinitePlasticity(VonMises):
     rings. That part is an energy in ``J``, and the tangent is symmetric.
 
     Args:
-        u: displacement, a Function of a vector Lagrange space.
+        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as the problem's.
         E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
         nu: Poisson's ratio.
         yield_stress: in uniaxial tension, force per present area times J; infinite where the body is elastic. Or a table: pairs
@@ -58,6 +58,7 @@ class FinitePlasticity(VonMises):
         hardening: increase of the yield stress per equivalent plastic strain, with a table beyond its last point; or ``Voce``.
         kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs
             (logarithmic plastic strain, back stress), as ``VonMises`` has it, without isotropic hardening.
+        displacement: number of the part of the mixed space that is the displacement.
         kind: ``"3d"``, ``"plane_strain"``, or ``"axisymmetric"`` on a mesh that has been declared so.
         cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
         quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
@@ -82,6 +83,7 @@ class FinitePlasticity(VonMises):
         hardening: Any = 0.0,
         *,
         kinematic_hardening: Any = 0.0,
+        displacement: int | None = None,
         kind: str = "3d",
         cells: Part | None = None,
         quadrature_degree: int | None = None,
@@ -90,8 +92,8 @@ class FinitePlasticity(VonMises):
         #: Outcome of the last update.
         self._trial: Flowed
         super().__init__(
-            u, E, nu, yield_stress, hardening, kinematic_hardening=kinematic_hardening, kind=kind, cells=cells,
-            quadrature_degree=quadrature_degree,
+            u, E, nu, yield_stress, hardening, kinematic_hardening=kinematic_hardening, displacement=displacement, kind=kind,
+            cells=cells, quadrature_degree=quadrature_degree,
         )  # fmt: skip
 
     def _read_curve(self, yield_stress: Any, hardening: Any) -> YieldCurve:
@@ -114,7 +116,7 @@ class FinitePlasticity(VonMises):
 
     def _compile(self) -> None:
         """Prepare the displacement's gradient at the points of stress, and ln J at those of pressure."""
-        self._strain = self._points.compile(self._components(self.u))
+        self._strain = self._points.compile(self._components(self._moved))
         self._volume_change = self._pressure_points.compile(ufl.ln(self._volume_ratio()))
 
     def _gradient(self, w: Any) -> Expr:
@@ -138,20 +140,20 @@ class FinitePlasticity(VonMises):
         A ring's volume is the integral of ``2 pi r`` and the area. Over such a cell both ``r`` and the ratio of areas are linear in
         each coordinate, and the mean of their product is that at the centre and the product of their slopes along the sides over 12.
         """
-        F = ufl.Identity(3) + self._gradient(self.u)
+        F = ufl.Identity(3) + self._gradient(self._moved)
         if not self._of_rings:
             return ufl.det(F)
         r, area = ufl.SpatialCoordinate(self.mesh)[0], F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
-        return area * F[2, 2] + self._mean_of_slopes(area, r + self.u[0]) / r
+        return area * F[2, 2] + self._mean_of_slopes(area, r + self._moved[0]) / r
 
     def _volume_variation(self, v: Any) -> Expr:
         """Derivative of ``ln J`` along ``v``."""
-        F, G = ufl.Identity(3) + self._gradient(self.u), self._gradient(v)
+        F, G = ufl.Identity(3) + self._gradient(self._moved), self._gradient(v)
         if not self._of_rings:
             return ufl.inner(ufl.inv(F).T, G)
         r, area = ufl.SpatialCoordinate(self.mesh)[0], F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
         grown = F[1, 1] * G[0, 0] + F[0, 0] * G[1, 1] - F[1, 0] * G[0, 1] - F[0, 1] * G[1, 0]
-        slopes = self._mean_of_slopes(grown, r + self.u[0]) + self._mean_of_slopes(area, v[0])
+        slopes = self._mean_of_slopes(grown, r + self._moved[0]) + self._mean_of_slopes(area, v[0])
         return (grown * F[2, 2] + area * G[2, 2] + slopes / r) / self._volume_ratio()
 
     def _mean_of_slopes(self, a: Expr, b: Expr) -> Expr:
@@ -161,11 +163,13 @@ class FinitePlasticity(VonMises):
 
     def residual(self, v: Any) -> ufl.Form:
         """Internal virtual work of the material's cells; see ``VonMises.residual``."""
+        v = self._part(v)
         pressed = self._kappa * ufl.ln(self._volume_ratio()) * self._volume_variation(v) * self._pressure_points.dx
         return ufl.dot(self._piola, self._components(v)) * self._points.dx + pressed
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
         """The deviator's part of the tangent, which ``ufl.derivative(residual(v), u)`` cannot see; see ``VonMises.stiffness``."""
+        du, v = self._part(du), self._part(v)
         count = len(VARYING[self.kind][0])
         number = np.zeros((count, count), int)
         number[np.triu_indices(count)] = np.arange(self._upper.function_space.dofmap.index_map_bs)

@@ -73,7 +73,7 @@ class VonMises:
     Plane stress does not lock with any cell.
 
     Args:
-        u: displacement, a Function of a vector Lagrange space.
+        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as the problem's.
         E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
         nu: Poisson's ratio.
         yield_stress: in uniaxial tension; infinite where the body is elastic.
@@ -81,6 +81,7 @@ class VonMises:
         kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs (plastic
             strain, back stress in uniaxial tension) from (0, 0), with straight lines between, whose slopes do not rise, and a constant
             beyond the last; then ``hardening`` is 0, and in plane stress ``nu`` below 1/2.
+        displacement: number of the part of the mixed space that is the displacement.
         kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh that has been declared so.
         strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange
             strain, with the second Piola-Kirchhoff stress in the yield surface; for large rotations and moderate strains.
@@ -108,6 +109,7 @@ class VonMises:
         hardening: Any = 0.0,
         *,
         kinematic_hardening: Any = 0.0,
+        displacement: int | None = None,
         kind: str = "3d",
         strain: str = "small",
         cells: Part | None = None,
@@ -117,10 +119,13 @@ class VonMises:
         given.word("kind", kind, KINDS)
         given.word("strain", strain, STRAINS)
         V = u.function_space
-        self.u, self.kind, self.strain = u, kind, strain
+        self.u, self.displacement, self.kind, self.strain = u, displacement, kind, strain
         self.mesh, self.comm = V.mesh, V.mesh.comm
+        degree = self._degree_of(u)
+        #: The displacement in UFL.
+        self._moved = u if displacement is None else ufl.split(u)[displacement]
         self.cells = owned_cells(self.mesh, cells)
-        degrees = self._degrees(quadrature_degree)
+        degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
         #: Yield stress over peeq; of layers where a table is handed over, which then are all that hardens.
         self._curve: YieldCurve
@@ -135,19 +140,29 @@ class VonMises:
 
     def _compile(self) -> None:
         """Prepare the strain at the points of stress, and its trace at those of pressure."""
-        self._strain = self._points.compile(self._vector(self._lagrangian(self.u)))
-        self._volume_change = self._pressure_points.compile(self._dilatation(self._lagrangian(self.u)))
+        self._strain = self._points.compile(self._vector(self._lagrangian(self._moved)))
+        self._volume_change = self._pressure_points.compile(self._dilatation(self._lagrangian(self._moved)))
 
-    def _degrees(self, quadrature_degree: int | None) -> tuple[int, int]:
-        """Degrees of the quadrature of stress and of pressure."""
-        V, gdim = self.u.function_space, self.mesh.geometry.dim
+    def _degree_of(self, u: fem.Function) -> int:
+        """Degree of the displacement."""
+        V, gdim, size = u.function_space, self.mesh.geometry.dim, u.function_space.dofmap.index_map_bs
         degree = compat.lagrange_degree(V)
-        if V.dofmap.index_map_bs != gdim or self.mesh.topology.dim != gdim or degree not in (1, 2):
+        if self.displacement is not None:
+            from uem_dolfinx.geometry.fields import degree_of_displacement
+
+            degree, size = degree_of_displacement(V, self.displacement), gdim
+        if size != gdim or self.mesh.topology.dim != gdim or degree not in (1, 2):
             raise SpaceError(
                 f"plasticity needs a displacement in a vector Lagrange space of size {gdim} and degree 1 or 2 on a mesh of "
-                f"dimension {gdim}: got size {V.dofmap.index_map_bs}, degree {degree}, dimension {self.mesh.topology.dim}"
+                f"dimension {gdim}: got size {size}, degree {degree}, dimension {self.mesh.topology.dim}"
+                + ("; of a mixed space name the part that it is, as displacement=0" if compat.is_mixed(V) else "")
             )
-        check_kind(self.kind, self.u)
+        return degree
+
+    def _degrees(self, degree: int, quadrature_degree: int | None) -> tuple[int, int]:
+        """Degrees of the quadrature of stress and of pressure."""
+        gdim = self.mesh.geometry.dim
+        check_kind(self.kind, self._moved)
         cell = compat.cell_name(self.mesh)
         simplex = cell in ("triangle", "tetrahedron")
         affine = simplex and compat.geometry_dofs(self.mesh).shape[1] == gdim + 1
@@ -264,13 +279,17 @@ class VonMises:
         for f in functions:
             f.material = weakref.ref(self)
 
+    def _part(self, v: Any) -> Any:
+        """The displacement's part of a trial or test function of the space of ``u``; what is one stays."""
+        return ufl.split(v)[self.displacement] if self.displacement is not None and isinstance(v, ufl.Argument) else v
+
     def _lagrangian(self, u: Any) -> Expr:
         return ufl.sym(displacement_gradient(u)) if self.strain == "small" else green_lagrange(u)
 
     def _variation(self, v: Any) -> Expr:
         """Derivative of the strain along ``v``."""
-        G = displacement_gradient(v)
-        return ufl.sym(G if self.strain == "small" else G + displacement_gradient(self.u).T * G)
+        G = displacement_gradient(self._part(v))
+        return ufl.sym(G if self.strain == "small" else G + displacement_gradient(self._moved).T * G)
 
     def _vector(self, A: Any) -> Expr:
         """Components of a symmetric tensor in the order of ``Returned``."""
@@ -290,7 +309,7 @@ class VonMises:
         """Internal virtual work of the material's cells.
 
         Args:
-            v: test function.
+            v: test function, of a mixed space its part or the whole.
 
         Returns:
             The form, integrated over all cells, in those of other materials with zeros, so that it may be added to integrals over
@@ -300,7 +319,7 @@ class VonMises:
         work = ufl.dot(self._s, self._vector(variation)) * self._points.dx
         if self.kind == "plane_stress":
             return work
-        pressed = self._kappa * self._dilatation(self._lagrangian(self.u)) * self._dilatation(variation)
+        pressed = self._kappa * self._dilatation(self._lagrangian(self._moved)) * self._dilatation(variation)
         return work + pressed * self._pressure_points.dx
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:

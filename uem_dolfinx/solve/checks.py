@@ -41,8 +41,8 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
 
 
-def check_materials(materials: Any, F: ufl.Form, u: fem.Function) -> list[HistoryMaterial]:
-    """The laws with history as a list: all that F is made of, each once, of this displacement.
+def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: int | None = None) -> list[HistoryMaterial]:
+    """The laws with history as a list: all that F is made of, each once, of this displacement or this part of u.
 
     Raises:
         InputTypeError: if they are no list of laws with history.
@@ -58,6 +58,8 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function) -> list[Histor
             raise InputError(f"{name} stands in the list before: expected each law once; make a law of its own for every body")
         if getattr(material, "u", u) is not u:
             raise SpaceError(f"{name} is of another displacement: expected the problem's u; make it with that")
+        if (part := getattr(material, "displacement", None)) != displacement:
+            raise SpaceError(f"{name} is of displacement={part}: expected the problem's part of u; make it with {displacement=}")
     fields = {id(law): f for f in F.coefficients() if (law := material_of(f)) is not None}
     for i, material in enumerate(found):
         tells = any(material_of(f) is material for f in material.history.values())
@@ -81,12 +83,6 @@ def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
         raise InputError(
             f"{what} are not there for a displacement among other fields: expected a problem of a displacement; {remedy}"
         )
-
-
-def check_fields(config: Configuration, materials: Sequence[HistoryMaterial]) -> None:
-    """Refuse what a displacement among other fields cannot have: laws with history."""
-    if materials:
-        refuse_other_fields(config, "materials with history", "write the stress in UFL of the mixed Function")
 
 
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:

@@ -31,7 +31,6 @@ from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.checks import (
     check_conditions,
-    check_fields,
     check_load,
     check_materials,
     check_residual,
@@ -152,10 +151,9 @@ class UnitedProblem:
 
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, equations, **others)
-            self.materials = check_materials(materials, F, u)
+            self.materials = check_materials(materials, F, u, displacement)
             still = dynamics is None
             self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
-            check_fields(self.config, self.materials)
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
