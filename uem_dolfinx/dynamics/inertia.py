@@ -22,7 +22,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
-from uem_dolfinx.errors import InputError, InputTypeError, LinearSolveError, NotFiniteError, SpaceError
+from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import logger, timed
@@ -30,13 +30,6 @@ from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.dynamics.added_mass import AddedMass
-
-#: Components with less mass than this part of the largest have no acceleration at the start.
-#: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
-MASSLESS = 1e-12
-#: Residual that the first acceleration is solved to.
-#: [bound; forces; -]
-ACCELERATED = 1e-13
 
 #: What a step in time begins with: time, length of the last step, energy given, displacement, fields, and masses at points.
 DynamicsMemory = tuple[float, float, float, Array, list[Array], list[list[Array]]]
@@ -65,9 +58,13 @@ class Dynamics:
         accelerated: whether the acceleration fits the forces yet.
         moving: whether a step has begun that is neither kept nor left.
         massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
+        held: owned components that are prescribed ``(n,)``.
+        past: what the velocity in the damping form is beside the displacement's share, a Function; there with damping alone.
         resumed: how often a checkpoint has been read into them.
         dt: length of the step that has begun last.
     """
+
+    past: fem.Function
 
     def __init__(
         self,
@@ -129,7 +126,7 @@ class Dynamics:
         self.mean_velocity = fem.Function(config.V, name="mean_velocity")
         self._set_velocity()
         self.mean_velocity.x.array[:] = self.velocity.x.array
-        self._held = np.zeros(self._n, dtype=bool)
+        self.held = np.zeros(self._n, dtype=bool)
         with agreed(config.comm):
             self._down = np.zeros(g) if self.gravity is None else given.vector("gravity", self.gravity, g)
             if config.axisymmetric and self._down[0] != 0.0:
@@ -141,9 +138,9 @@ class Dynamics:
         #: Inertia forces of the committed state, which balance all others.
         self.forces = fem.Function(config.V)
         if self.damping is not None:
-            self._rate, self._past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
-            self._past.x.array[:] = self.velocity.x.array
-            form = ask_together(config.comm, "damping", self.damping, self._rate * config.u + self._past)
+            self._rate, self.past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
+            self.past.x.array[:] = self.velocity.x.array
+            form = ask_together(config.comm, "damping", self.damping, self._rate * config.u + self.past)
             with agreed(config.comm):
                 if form is None:
                     raise InputTypeError("damping(v) = None: expected a UFL form, linear in the test function; return it")
@@ -183,7 +180,7 @@ class Dynamics:
 
     def hold(self, held: Bools) -> None:
         """Take which owned components are prescribed ``(n_owned, gdim)``: their velocities are those of what is prescribed."""
-        self._held = held.ravel()
+        self.held = held.ravel()
 
     def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
         """Hand the mass of contact surfaces on as ``massless.without_surfaces`` does, or warn that contactors keep it (collective).
@@ -236,7 +233,7 @@ class Dynamics:
         self.factor = self.scheme.factor(dt)
         if self.damping is not None:
             self._rate.value = self._v_rate
-            self._past.x.array[:] = self._v_past - self._v_rate * self._u
+            self.past.x.array[:] = self._v_past - self._v_rate * self._u
         for one in self.added:
             one.begin(self.scheme, dt)
 
@@ -248,7 +245,7 @@ class Dynamics:
         their signs differ. That is of second order where the motion is smooth, and w at once behind a jump, which so is an impact
         within the step. Accelerations are differences of v, carried on to the instant of the equation.
         """
-        i, dt, last = self._held, self.dt, self._last
+        i, dt, last = self.held, self.dt, self._last
         v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
         w = (self._displacement - self._u)[: self._n][i] / dt
         slope = 2.0 * (w - self.mean_velocity.x.array[: self._n][i]) / (dt + last)
@@ -262,9 +259,9 @@ class Dynamics:
         """Bring the velocity of prescribed components in the damping form up to the present displacement (collective)."""
         if self.damping is None or not self.moving:
             return
-        i = np.flatnonzero(self._held)
-        self._past.x.array[i] = self._prescribed()[0] - self._v_rate * self._displacement[i]
-        self._past.x.scatter_forward()
+        i = np.flatnonzero(self.held)
+        self.past.x.array[i] = self._prescribed()[0] - self._v_rate * self._displacement[i]
+        self.past.x.scatter_forward()
 
     def memory(self) -> DynamicsMemory:
         """What the next step begins with."""
@@ -324,7 +321,7 @@ class Dynamics:
         s, n = self.scheme, self._n
         du = self._displacement - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
-        a[:n][self._held] = self._prescribed()[2]
+        a[:n][self.held] = self._prescribed()[2]
         inertia = self.mass.M * self._like(a[:n])
         if s.alpha_f:
             inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
@@ -341,29 +338,9 @@ class Dynamics:
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
             )
-        M = self.matrix.copy() if restriction.alone else self.matrix.PtAP(restriction.P)
-        if restriction.alone:
-            restriction.cross_out(M)
-        if added is not None:
-            M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        rhs = restriction.transpose(F)
-        diagonal = M.getDiagonal()
-        idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
-        diagonal.array[idle], rhs.array[idle] = 1.0, 0.0
-        M.setDiagonal(diagonal)
-        ksp = PETSc.KSP().create(self.config.comm)
-        ksp.setType("cg")
-        ksp.getPC().setType("jacobi")
-        ksp.setTolerances(rtol=ACCELERATED, max_it=10_000)
-        ksp.setOperators(M)
-        q = rhs.duplicate()
-        with timed("first acceleration"):
-            ksp.solve(-rhs, q)
-        if ksp.getConvergedReason() < 0:
-            raise LinearSolveError(
-                f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
-            )
-        a = restriction.expand(q)
+        from uem_dolfinx.dynamics.first_acceleration import united_accelerations
+
+        a = united_accelerations(self.matrix, restriction, -F, added)
         self.acceleration.x.array[: self._n] = a.array_r[: self._n] * self.massy.ravel()
         self.acceleration.x.scatter_forward()
         for one in self.added:
@@ -373,19 +350,23 @@ class Dynamics:
         self.forces.x.scatter_forward()
         self.accelerated = True
 
+    def rates(self) -> tuple[Array, Array]:
+        """Velocity and acceleration at the end of the step under way, at the present displacement, ``(n,)`` each."""
+        n, held, massy = self._n, self.held, self.massy.ravel()
+        end, mean, _ = self._prescribed()
+        du = (self._displacement - self._u)[:n]
+        a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
+        a[held], v[held] = mean, end
+        # what has no mass has no velocity of its own
+        return np.where(massy, v, du / self.dt), np.where(massy, a, 0.0)
+
     def commit(self) -> None:
         """Keep velocity and acceleration that belong to the present displacement."""
         if self.moving:
-            n, dt, held = self._n, self.dt, self._held
-            end, mean, _ = self._prescribed()
-            du, massy = (self._displacement - self._u)[:n], self.massy.ravel()
+            n, dt, held = self._n, self.dt, self.held
             self.forces.x.array[:n] = self._inertia().array_r
-            a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
-            a[held], v[held] = mean, end
-            self.acceleration.x.array[:n] = np.where(massy, a, 0.0)
-            # what has no mass has no velocity of its own
-            self.velocity.x.array[:n] = np.where(massy, v, du / dt)
-            self.mean_velocity.x.array[:n] = du / dt
+            self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates()
+            self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
             change = self.velocity.x.array[:n] - self._velocity[:n]
             given = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)
             self.driven += float(given[held].sum())
@@ -398,7 +379,7 @@ class Dynamics:
 
     def change_rates(self, velocity: Array, acceleration: Array) -> None:
         """Give free components of the committed state another velocity and acceleration, with the same momentum ``(n,)`` (collective)."""
-        n, free = self._n, ~self._held
+        n, free = self._n, ~self.held
         change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
         self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
         self.acceleration.x.array[:n] += change

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
 from typing import Any
 
 from mpi4py import MPI
@@ -21,7 +20,8 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.errors import MassError, SpaceError
+from uem_dolfinx.dynamics.densities import as_density, cell_masses
+from uem_dolfinx.errors import MassError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
@@ -60,11 +60,13 @@ class Mass:
         M: with the layout and the block size of K.
         config: nodes and bodies; the displacement in it is not used.
         diagonal: whether M holds nothing but its diagonal.
+        density: that M was made with, a UFL expression; None where masses were given at nodes.
     """
 
     M: PETSc.Mat
     config: Configuration
     diagonal: bool
+    density: Any = None
 
     @cached_property
     def of_nodes(self) -> Array:
@@ -159,7 +161,7 @@ class Mass:
             M.diagonalScale(left, right)
             left.destroy()
             right.destroy()
-        return Mass(M, config, self.diagonal)
+        return Mass(M, config, self.diagonal, self.density)
 
     def _scaling(self, kept: Bools) -> tuple[Array, Bools]:
         """Factors of the nodes that are kept with which these have the moments of all, and bodies that have none (collective).
@@ -327,12 +329,12 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     """
     config = configuration_of(V)
     with timed("assemble mass"):
-        density = _density(config, rho)
-        _cell_masses(config, density)
+        density = as_density(config, rho)
+        cell_masses(config, density)
         a = forms.form(revolved(density * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx))
         M = forms.create_matrix(a)
         forms.assemble_matrix(M, a)
-    return Mass(M, config, diagonal=False)
+    return Mass(M, config, diagonal=False, density=density)
 
 
 def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
@@ -351,9 +353,9 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     """
     config = configuration_of(V)
     with timed("assemble mass"):
-        density = _density(config, rho)
+        density = as_density(config, rho)
         rows = forms.assemble_array(V, forms.form(revolved(density * ufl.TestFunction(V)[0] * ufl.dx)))[:: config.gdim]
-        of_cells = _cell_masses(config, density)
+        of_cells = cell_masses(config, density)
         cell = compat.cell_name(config.mesh)
         points, weights = forms.quadrature_rule(cell, 2 * config.degree)
         N = forms.create_lagrange_element(cell, config.degree).tabulate(0, points)[0, :, :, 0]
@@ -364,7 +366,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
         body = body[: config.n_owned]
         refused = body_sums(config.comm, (rows < LEAST_ROW_SUM * scaled).astype(float), body, count) > 0
         m = np.where(refused[body], scaled, rows)
-    return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True)
+    return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True, density=density)
 
 
 @timed("assemble mass")
@@ -403,36 +405,6 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
             error = MassError(f"the mass {m[wrong[0]]} of the node at {where} is negative or not finite: give masses from 0 up")
     agree(config.comm, error)
     return Mass(_diagonal(config, m.ravel()), config, diagonal=True)
-
-
-def _density(config: Configuration, rho: Any) -> Any:
-    """The density as a UFL expression that forms can hold."""
-    if isinstance(rho, (Real, ufl.constantvalue.ConstantValue)):
-        # forms lose terms with a literal zero
-        return fem.Constant(config.mesh, float(rho))
-    if not isinstance(rho, ufl.core.expr.Expr):
-        raise MassError(f"the density {rho!r} is neither a number nor a Function nor a UFL expression: give one of them")
-    if rho.ufl_shape != ():
-        raise MassError(f"the density {rho} has shape {rho.ufl_shape}: give a scalar")
-    if ufl.algorithms.extract_arguments(rho):
-        raise MassError(f"the density {rho} holds a test or trial function: give one that is known")
-    if any(domain != config.mesh.ufl_domain() for domain in ufl.domain.extract_domains(rho)):
-        raise SpaceError("the density lives on another mesh than the displacement: build both on one mesh")
-    return rho
-
-
-def _cell_masses(config: Configuration, density: Any) -> Array:
-    """Masses of the owned cells ``(n_cells,)``, refused if they cannot be (collective)."""
-    S = compat.function_space(config.mesh, ("DG", 0))
-    n_cells = config.mesh.topology.index_map(config.tdim).size_local
-    of_dofs = forms.assemble_array(S, forms.form(revolved(density * ufl.TestFunction(S) * ufl.dx)))
-    masses = of_dofs[compat.cell_dofs(S)[:n_cells, 0]]
-    wrong, error = np.flatnonzero(~((masses >= 0) & np.isfinite(masses))), None
-    if len(wrong):
-        where = ", ".join(f"{c:.6g}" for c in config.X[compat.cell_dofs(config.V)[wrong[0]]].mean(axis=0))
-        error = MassError(f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}: give one that is finite and not negative")
-    agree(config.comm, error)
-    return masses
 
 
 def _diagonal(config: Configuration, values: Array) -> PETSc.Mat:

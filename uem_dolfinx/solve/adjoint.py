@@ -26,7 +26,7 @@ as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -46,6 +46,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.derivatives import Derivatives, along
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState, Rows
 from uem_dolfinx.solve.system import CLOSED, BodySystem
@@ -70,7 +71,8 @@ class Linearised:
     """The united problem linearised at the state of equilibrium, which is left as it was in the end (collective).
 
     Attributes:
-        F: the residual in UFL, and ``test`` its test function.
+        F: the residual in UFL.
+        derivatives: of it and of functionals.
         P: restriction matrix of the active contactors.
         rows: their equations.
         multipliers: of all equations of contacts, and of users ``(m,)``.
@@ -81,10 +83,10 @@ class Linearised:
     rows: Rows
     multipliers: Array
 
-    def __init__(self, problem: UnitedProblem):
+    def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None):
         self.problem, self.config, self.ramp = problem, problem.config, 1.0
         self.F = problem.bodies.F
-        self.test = self.F.arguments()[0]
+        self.derivatives = derivatives or Derivatives(self.F, problem.config.V)
 
     def __enter__(self) -> Linearised:
         try:
@@ -237,7 +239,7 @@ class Linearised:
                 if (form := forms.expanded(ufl.derivative(self.F, m, change))) is not None:
                     forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
                 continue
-            if (form := _along(self.F, m, change)) is not None:
+            if (form := along(self.F, m, change)) is not None:
                 forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
             values = change.x.array if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
             prescribed += self.prescribed_by(m, values)
@@ -304,29 +306,27 @@ class Adjoint:
         now, drawn = config.vector(), config.vector()
         for contact in pressing:
             p = contact.pressure
-            of_p = _derivative(functionals[0], p, ufl.TestFunction(p.function_space))
-            of_nodes = np.zeros(len(contact.nodes))
-            if of_p is not None:
-                of_nodes = forms.assemble_array(p.function_space, forms.form(of_p))[contact.nodes]
-            found = at.pressures(contact).back(of_nodes)
+            of_p = at.derivatives.by_values(functionals[0], p)
+            found = at.pressures(contact).back(np.zeros(len(contact.nodes)) if of_p is None else of_p[contact.nodes])
             weights[contact] = found.multipliers
             functionals += [] if found.areas is None else [found.areas]
             now.array[:] += found.now.ravel()
             drawn.array[:] += found.drawn.ravel()
         of_u = config.vector()
         for functional in functionals:
-            if (part := _derivative(functional, at.problem.u, at.test)) is not None:
-                of_u.array[:] += forms.assemble_array(config.V, forms.form(part))
+            if (part := at.derivatives.by_values(functional, at.problem.u, at.derivatives.test)) is not None:
+                of_u.array[:] += part
         of_u = at.held(of_u)
         lift = at.lift(weights)
         drive = of_u + at.stiffness(lift) + now + config.vector(handed)
         along = at.solve_back(drive)
         left = along - lift
-        self.a = at.function(left)
+        self.a = at.derivatives.a
         #: J with its areas, and the work of the residual along a, with their signs.
-        self._forms = *((functional, 1.0) for functional in functionals), (ufl.replace(at.F, {at.test: self.a}), -1.0)
+        self._terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
         held = ~at.problem.bodies.free[: config.n_owned]
         self.left = drive - at.stiffness_back(along)
+        at.derivatives.along(left)
         self.by_values = np.where(held, at.P.carried_back(self.left), 0.0)
         #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
         self._by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
@@ -355,25 +355,20 @@ class Adjoint:
 
     def _by_constant(self, m: fem.Constant) -> Array:
         """An array of its shape."""
-        comm, shape, share = self.config.comm, np.shape(m.value), self.at.share(m)
-        found = np.zeros(shape)
-        for entry in np.ndindex(shape):
-            unit = np.zeros(shape)
+        found = np.asarray(self.at.share(m) * self.at.derivatives.by_constant(self._terms, m))
+        for entry in np.ndindex(found.shape):
+            unit = np.zeros(found.shape)
             unit[entry] = 1.0
-            for form, sign in self._forms:
-                if (part := _along(form, m, unit)) is not None:
-                    found[entry] += share * sign * forms.assemble_scalar(forms.form(part), comm)
-            found[entry] += self.at.ramp * float(reduced(comm, float((self.by_values * self.at.prescribed_by(m, unit)).sum())))
+            work = float((self.by_values * self.at.prescribed_by(m, unit)).sum())
+            found[entry] += self.at.ramp * float(reduced(self.config.comm, work))
         return found
 
     def _by_function(self, m: fem.Function) -> fem.Function:
         """A Function of its space."""
-        V = m.function_space
-        found = fem.Function(V)
-        self._assemble(found, lambda form: _derivative(form, m, ufl.TestFunction(V)))
+        found, added = self.at.derivatives.by_function(self._terms, m), fem.Function(m.function_space)
         # conditions that take its values tell which
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
-        own, added = which > 0.5, fem.Function(V)
+        own = which > 0.5
         np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.at.ramp * self.by_values[own])
         forms.sum_ghosts(added)
         found.x.array[:] += added.x.array
@@ -381,35 +376,7 @@ class Adjoint:
 
     def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
         """A Function of the displacement's space."""
-        found = fem.Function(self.config.V)
-        self._assemble(found, lambda form: forms.expanded(ufl.derivative(form, X, ufl.TestFunction(self.config.V))))
+        found = self.at.derivatives.by_places(self._terms, X)
         found.x.array[: len(self._by_places)] += self._by_places
         found.x.scatter_forward()
         return found
-
-    def _assemble(self, found: fem.Function, derivative: Callable[[ufl.Form], ufl.Form | None]) -> None:
-        """Add up the derivatives of both forms."""
-        for form, sign in self._forms:
-            if (part := derivative(form)) is not None:
-                values = forms.assemble_array(found.function_space, forms.form(part))
-                found.x.array[: len(values)] += sign * values
-        found.x.scatter_forward()
-
-
-def _derivative(form: ufl.Form, m: fem.Function, direction: Any) -> ufl.Form | None:
-    """Derivative of a form by a Function; None where it does not depend on it."""
-    return forms.expanded(ufl.derivative(form, m, direction)) if m in form.coefficients() else None
-
-
-def _along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.Form | None:
-    """Derivative of a form along a change of a Constant or a Function; None where it does not depend on it."""
-    if isinstance(m, fem.Function):
-        return _derivative(form, m, change)
-    if m not in form.constants():
-        return None
-    v, integrals = ufl.variable(m), []
-    for integral in form.integrals():
-        by, shape = ufl.diff(ufl.replace(integral.integrand(), {m: v}), v), np.shape(m.value)
-        parts = [float(np.asarray(change)[i]) * (by[i] if i else by) for i in np.ndindex(shape) if np.asarray(change)[i] != 0.0]
-        integrals += [integral.reconstruct(integrand=sum(parts[1:], parts[0]))] if parts else []
-    return forms.expanded(ufl.Form(integrals))

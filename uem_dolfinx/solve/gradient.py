@@ -121,18 +121,18 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
         refuse_other_fields(problem.config, "gradients", "take differences of two solutions")
-        for present, history in (
+        if problem.bodies.dead is not None:
+            raise InputError("forces that a step has not released yet depend on all steps, whose derivatives are not known")
+        for present, what in (
             (problem.dynamics is not None, "a problem in time"),
             (bool(problem.materials), "a law with history"),
-            (problem.bodies.dead is not None, "forces that a step has not released yet"),
+            (any(pair.frictional for pair in problem.pairs), "a contact with friction"),
         ):
-            if present:
-                raise InputError(f"the gradient of {history} depends on all steps, whose derivatives are not known")
-        if not recorded and any(pair.frictional for pair in problem.pairs):
-            raise InputError(
-                "the gradient of a contact with friction depends on all steps, of which the last alone is known: take the steps while "
-                "uem.recording(problem) keeps them, and ask that history"
-            )
+            if present and not recorded:
+                raise InputError(
+                    f"the gradient of {what} depends on all steps, of which the last alone is known: take the steps while "
+                    "uem.recording(problem) keeps them, and ask that history"
+                )
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.tied for contact in problem.contacts):

@@ -1,90 +1,54 @@
-"""Gradients of functionals of all steps: committed steps kept in memory, and swept backwards, each by one adjoint problem.
+"""Gradients of functionals of all steps: committed steps are kept, and swept backwards, each by one adjoint problem, as in ``sweep``.
 
-With displacements u_n, anchors h_n that a step leaves behind, and a residual R of a step that began with h_{n-1},
-
-    R(u_n, h_{n-1}; m) = 0,        h_n = H(u_n, h_{n-1})
-
-a sweep from the last step to the first hands derivatives back,
-
-    d_n = dJ/du_n + (dH/du_n)' b_n,        b_{n-1} = (dH/dh_{n-1})' b_n + dJ/dh_{n-1} through a_n
-
-where a_n is of the adjoint problem with the load d_n, as in ``adjoint``. Which contactors touch, stick and slip, and the number of steps,
-are those that were found.
+Which contactors touch, stick and slip, which points yield, and the number and lengths of steps, are those that were found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
-from petsc4py import PETSc
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import forms, given
-from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.anchor_slopes import AnchorSlopes
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law, follows_load
-from uem_dolfinx.contact.parameters import ContactParameter, keeps_distance, motion_of
-from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.parameters import keeps_distance
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.geometry.rigid import Motion
-from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.adjoint import Adjoint, Linearised
+from uem_dolfinx.materials.elastic import material_of
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.gradient import AnyControl, check_controls, check_problem, refuse_results
 from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.tangent import contact_curvature, curvature_of, slip_terms, together
-
-
-@dataclass(frozen=True)
-class Record:
-    """One committed step: a value.
-
-    Attributes:
-        before: what the step began with.
-        displacement: it ended with ``(n_local incl. ghosts,)``.
-        states: of the pairs in equilibrium, before they were committed.
-        motions: of the pairs' rigid targets.
-        values: of what the residual is made of.
-        friction, offsets: of the pairs' contactors ``(n,)`` each; None without.
-        call: of ``load_steps`` that it was made in.
-        factor: part of the loads and of the Dirichlet values that it was led to.
-        ramp: how much of a change of its values a Dirichlet condition takes over.
-    """
-
-    before: Memory
-    displacement: Array
-    states: list[PairState]
-    motions: list[Motion | None]
-    values: list[Array]
-    friction: list[Array | None]
-    offsets: list[Array | None]
-    call: int
-    factor: float
-    ramp: float
+from uem_dolfinx.solve.records import Record, Records
+from uem_dolfinx.solve.sweep import Sweep
 
 
 class History:
     """All steps that a problem takes while it is recorded, see :func:`recording`.
 
     Args:
-        problem: in statics, without laws with history.
+        problem: whose steps are kept.
+        folder: for a scratch file of each rank; None keeps them in memory.
     """
 
-    def __init__(self, problem: UnitedProblem):
+    def __init__(self, problem: UnitedProblem, folder: Path | None = None):
         self.problem = problem
         self._first = problem.progress.steps
-        self._records: list[Record] = []
+        self._records = Records(folder)
+        #: What a motion begins with; None in statics.
+        self._start: Record | None = None
         F = problem.bodies.F
-        self._inputs = [*F.constants(), *(f for f in F.coefficients() if f is not problem.u)]
+        known = (f for f in F.coefficients() if f is not problem.u and material_of(f) is None)
+        self._inputs = [*F.constants(), *known]
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -96,30 +60,35 @@ class History:
 
     def note(self, before: Memory, start: Array | None, factor: float, arc: bool) -> None:
         """Keep the step that the problem is about to commit, in place of the last one if that is taken again."""
-        problem, records = self.problem, self._records
+        problem = self.problem
         if arc:
             raise InputError(
                 "the steps of an arc depend on each other by their lengths, of which there are no derivatives: record steps of given load"
             )
-        del records[problem.progress.steps - self._first - 1 :]
-        last, call = records[-1] if records else None, problem.progress.ramp
+        self._records.cut(problem.progress.steps - self._first - 1)
         # values that a ramp began with: of the step before, or of that before the first step of the ramp
-        began = [r for r in records if start is None or r.call != call]
-        ramp = factor + (1.0 - factor) * (began[-1].ramp if began else 0.0)
-        inputs = [np.array(forms.values_of(m)) for m in self._inputs]
-        self._records.append(
-            Record(
-                before=before,
-                displacement=np.array(problem.u.x.array),
-                states=[pair.trial for pair in problem.pairs],
-                motions=problem.rigid_motions(),
-                values=[b if last and np.array_equal(a, b) else a for a, b in zip(inputs, last.values if last else inputs)],
-                friction=[None if pair.friction is None else pair.friction.value for pair in problem.pairs],
-                offsets=[pair.discretisation.offset for pair in problem.pairs],
-                call=call,
-                factor=factor,
-                ramp=ramp,
-            )
+        began = self._records.ramp_before(None if start is None else problem.progress.ramp)
+        self._records.add(self._record(before, factor, factor + (1.0 - factor) * began))
+
+    def note_start(self) -> None:
+        """Keep what a motion begins with, and its first acceleration."""
+        self._start = self._record(Memory.of(self.problem), 1.0, 1.0)
+
+    def _record(self, before: Memory, factor: float, ramp: float) -> Record:
+        """The problem as it is, at the end of a step that began so."""
+        problem, dynamics = self.problem, self.problem.dynamics
+        return Record(
+            before=before,
+            displacement=np.array(problem.u.x.array),
+            states=[pair.trial for pair in problem.pairs],
+            motions=problem.rigid_motions(),
+            values=[np.array(forms.values_of(m)) for m in self._inputs],
+            friction=[None if pair.friction is None else pair.friction.value for pair in problem.pairs],
+            offsets=[pair.discretisation.offset for pair in problem.pairs],
+            call=problem.progress.ramp,
+            factor=factor if dynamics is None else dynamics.time + dynamics.dt * dynamics.moving,
+            ramp=ramp,
+            dt=0.0 if dynamics is None else dynamics.dt,
         )
 
     def gradient(
@@ -147,40 +116,48 @@ class History:
         problem = self.problem
         some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
         functionals = self._functionals(J)
+        self._check_controls(some)
+        now, displacement = Memory.of(problem), np.array(problem.u.x.array)
+        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
+        offsets = [pair.discretisation.offset for pair in problem.pairs]
+        sweep = Sweep(problem, some)
+        try:
+            begun = False
+            for k in reversed(range(len(self))):
+                begun = begun or functionals[k] is not None
+                if begun:
+                    record = self._records[k]
+                    self._place(record)
+                    sweep.pass_back(record, functionals[k])
+            sweep.begin(record)
+            if self._start is not None:
+                self._place(self._start)
+                sweep.accelerate(self._start)
+        finally:
+            self._put(values, friction, offsets)
+            now.put_back(problem)
+            problem.u.x.array[:] = displacement
+        return sweep.found
+
+    def _check_controls(self, controls: Sequence[AnyControl]) -> None:
+        """Refuse controls that steps depend on in a way of which there are no derivatives (collective)."""
+        problem, dynamics = self.problem, self.problem.dynamics
         load = problem.load if isinstance(problem.load, Mapping) else {}
+        density = None if dynamics is None else dynamics.mass.density
+        made_of = [] if density is None else list(traverse_unique_terminals(density))
         with agreed(problem.comm):
-            for k, m in enumerate(some):
+            for k, m in enumerate(controls):
                 if isinstance(m, fem.Constant) and callable(load.get(m)):
                     raise InputError(
                         f"controls[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
                         "multiplied in the residual"
                     )
-        now, displacement = Memory.of(problem), np.array(problem.u.x.array)
-        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets = [pair.discretisation.offset for pair in problem.pairs]
-        found: list[Any] = [None] * len(some)
-        by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
-        try:
-            begun = False
-            for record, functional in zip(reversed(self._records), reversed(functionals)):
-                begun = begun or functional is not None
-                if not begun:
-                    continue
-                step = LinearisedStep(self, record)
-                with step:
-                    handed, by_anchors = step.handed_back(by_anchors)
-                    adjoint = Adjoint(step, None if functional is None else revolved(functional), (), handed)
-                    for k, m in enumerate(some):
-                        found[k] = _added(found[k], adjoint.by(m))
-                        if isinstance(m, ContactParameter):
-                            found[k] += _left_behind(problem, m, handed)
-                    by_anchors = step.by_anchors(adjoint, by_anchors)
-            self._begin(some, found, by_anchors)
-        finally:
-            self._put(values, friction, offsets)
-            now.put_back(problem)
-            problem.u.x.array[:] = displacement
-        return found
+                if isinstance(m, ufl.SpatialCoordinate) and dynamics is not None:
+                    raise InputError(
+                        f"controls[{k}] is the shape, on which masses depend: there are no derivatives by it in time"
+                    )
+                if m is not density and any(m is one for one in made_of):
+                    raise InputError(f"controls[{k}] is a part of the density: expected a Constant that is the density itself")
 
     def _functionals(self, J: Any) -> list[ufl.Form | None]:
         """One for each step, or None (collective)."""
@@ -202,21 +179,17 @@ class History:
                     given.kind(what, functional, not functional.empty(), "a UFL form with an integral")
                     check_functional(what, functional)
                     refuse_results(functional)
-        return some
+                    self._refuse_unknown(what, functional)
+        # the same form in several steps stays the same
+        whole = {id(f): revolved(f) for f in some if f is not None}
+        return [None if f is None else whole[id(f)] for f in some]
 
-    def _begin(self, controls: list[AnyControl], found: list[Any], by_anchors: list[Array]) -> None:
-        """Add derivatives by the anchors that the first step began with, where contactors stood before it (collective)."""
-        problem = self.problem
-        if not any(pair.frictional for pair in problem.pairs):
-            return
-        Memory.put_back(self._records[0].before, problem)
-        handed, _ = _back(problem, by_anchors)
-        for k, m in enumerate(controls):
-            if isinstance(m, ContactParameter):
-                found[k] += _left_behind(problem, m, handed)
-            elif isinstance(m, ufl.SpatialCoordinate):
-                found[k].x.array[: handed.size] += handed.ravel()
-                found[k].x.scatter_forward()
+    def _refuse_unknown(self, what: str, J: ufl.Form) -> None:
+        """Refuse a functional of fields that follow the displacement in a way of which there are no derivatives."""
+        dynamics = self.problem.dynamics
+        for f in J.coefficients():
+            if dynamics is not None and (f is dynamics.mean_velocity or f is dynamics.forces):
+                raise InputError(f"{what} holds '{f.name}': expected displacement, velocity and acceleration alone")
 
     def _put(self, values: Sequence[Array], friction: Sequence[Array | None], offsets: Sequence[Array | None]) -> None:
         """Let the problem be made of these (collective)."""
@@ -225,10 +198,11 @@ class History:
         for pair, mu, offset in zip(self.problem.pairs, friction, offsets):
             if pair.friction is not None and mu is not None:
                 pair.discretisation.with_friction(pair.friction.limits.change(mu))
-            if pair.discretisation.offset is not offset:
+            there = pair.discretisation.offset
+            if there is not offset and (there is None or offset is None or not np.array_equal(there, offset)):
                 pair.discretisation.set_offset(offset)
 
-    def place(self, record: Record) -> None:
+    def _place(self, record: Record) -> None:
         """Bring the problem to the end of a step, before it was committed (collective)."""
         problem = self.problem
         self._put(record.values, record.friction, record.offsets)
@@ -237,132 +211,8 @@ class History:
         move_targets(problem, record.motions)
         for pair, state in zip(problem.pairs, record.states):
             pair.trial = state
-
-    def share(self, m: Any, record: Record) -> float:
-        """How much of a change of a control a step has seen."""
-        load = self.problem.load
-        return record.factor if isinstance(load, Mapping) and m in load else 1.0
-
-
-class LinearisedStep(Linearised):
-    """The united problem linearised at the end of a recorded step (collective)."""
-
-    def __init__(self, history: History, record: Record):
-        super().__init__(history.problem)
-        self._history, self._record, self.ramp = history, record, record.ramp
-        self._slopes: list[AnchorSlopes | None] = []
-
-    def share(self, m: Any) -> float:
-        """How much of a change of a control the step has seen."""
-        return self._history.share(m, self._record)
-
-    def _linearise(self) -> None:
-        problem = self.problem
-        self._history.place(self._record)
-        state, pairs = self._state(), problem.pairs
-        self._slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(pairs, problem.contacts)]
-        if state.rows.independent is not None and state.rows.independent.found and any(self._slopes):
-            raise InputError(
-                "equations of contactors with friction conflict with each other or with Dirichlet conditions, and have been replaced by "
-                "others, through which histories have no derivatives; let nodes be contactors of one contact, with free normals"
-            )
-        forms.free_petsc_garbage(problem.comm)
-        self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of(range(len(pairs)))
-        K = self.K
-        back = _transposed(K) if not is_symmetric(K, self.config.unknowns) else K
-        self._K_back, self._G_back = back, None if self.G is None else _transposed(self.G)
-        problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
-        self._tell_idle()
-
-    def __exit__(self, *error: object) -> None:
-        solver = self.problem.solver
-        if solver.iterative or not solver.lasting or any(self._slopes):
-            self.problem.system.forget()
-
-    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
-        """As that of ``Linearised``, with all that friction adds (collective)."""
-        pairs, slopes = [self.problem.pairs[k] for k in which], [self._slopes[k] for k in which]
-        states, like = [pair.trial for pair in pairs], self.config.unknowns.vector()
-        for pair, own in zip(pairs, slopes):
-            pair.trial = pair.trial if own is None else own.without_stuck()
-        try:
-            curvature = curvature_of(pairs, like, any(self._slopes), False)
-        finally:
-            for pair, state in zip(pairs, states):
-                pair.trial = state
-        if self.config.gdim == 2 or not any(slopes):
-            return curvature
-        turned, _ = slip_terms(pairs, like)
-        leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
-        return together(together(curvature, turned), leaning)
-
-    def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
-        mu, _ = self.problem.solver.solve(self.P.transpose(forces))
-        return self.Q.expand(self.problem.solver.complete(mu))
-
-    def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
-        """``(K + G)' a`` (collective)."""
-        return forms.product(self._K_back, a, self._G_back)
-
-    def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
-        """``K' a`` (collective)."""
-        return forms.product(self._K_back, a)
-
-    def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
-        """Derivatives by anchors at the step's end as those by its places, and by the anchors that stay (collective)."""
-        return _back(self.problem, by_anchors, self._slopes)
-
-    def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
-        """Derivatives by the anchors that the step began with, those of anchors that stay among them (collective)."""
-        n, g = self.config.n_owned, self.config.gdim
-        a, first, found = adjoint.a.x.array[: n * g].reshape(n, g), 0, []
-        for slopes, own, before in zip(self._slopes, self.rows.equations, kept):
-            part = adjoint.by_gaps[first : first + len(own)]
-            first += len(own)
-            found.append(before if slopes is None else slopes.by_anchors(part, own, a) + before)
-        return found
-
-
-def _back(
-    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None] | None = None
-) -> tuple[Array, list[Array]]:
-    """Derivatives by anchors as those by places of the owned nodes ``(n_owned, gdim)``, and by the anchors that stay (collective)."""
-    first = slopes is None
-    if slopes is None:
-        slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
-    handed, left = np.zeros((problem.config.n_owned, problem.config.gdim)), []
-    for own, at, pair in zip(by_anchors, slopes, problem.pairs):
-        if at is not None:
-            places, own = at.back(own if own.size else np.zeros((len(pair.nodes), at.size)), first)
-            handed += places
-        left.append(own)
-    return handed, left
-
-
-def _left_behind(problem: UnitedProblem, m: ContactParameter, handed: Array) -> Array:
-    """What derivatives by places of contactors are by a motion of their target, which leaves these behind (collective)."""
-    found = np.zeros(m.shape(problem.config.gdim))
-    for entry in np.ndindex(found.shape) if m.parameter in ("place", "turn") else ():
-        found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
-    return np.asarray(reduced(problem.comm, found))
-
-
-def _added(found: Any, more: Array | fem.Function) -> Any:
-    """The sum of two derivatives, the first of which may be None."""
-    if found is None:
-        return more
-    if isinstance(more, fem.Function):
-        found.x.array[:] += more.x.array
-        return found
-    return found + more
-
-
-def _transposed(A: PETSc.Mat) -> PETSc.Mat:
-    """A matrix of its own."""
-    out = PETSc.Mat()
-    A.transpose(out)
-    return out
+        if problem.dynamics is not None and record is not self._start:
+            problem.dynamics.begin(record.dt)
 
 
 def _friction_of(pair: Any) -> Array | None:
@@ -370,7 +220,7 @@ def _friction_of(pair: Any) -> Array | None:
 
 
 @contextmanager
-def recording(problem: UnitedProblem) -> Iterator[History]:
+def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> Iterator[History]:
     """Keep all steps that a problem takes in a ``with`` block, for gradients through their history (collective).
 
     Example::
@@ -380,35 +230,55 @@ def recording(problem: UnitedProblem) -> Iterator[History]:
                 ...
         by_E, by_mu = history.gradient(J, [E, uem.ContactParameter(contact, "friction")])
 
-    Each step keeps the displacement, what contactors remember, and the values of Constants and Functions in the residual that have changed.
+    Each step keeps the displacement, what contactors, laws and inertia remember, and the values of Constants and Functions in the residual
+    that have changed.
 
     Args:
-        problem: in statics; it may have Coulomb's friction between nodes of degree 1 and surfaces of sliding='finite'.
+        problem: in statics or in time; it may have Coulomb's friction between nodes of degree 1 and surfaces of sliding='finite', and laws
+            ``VonMises``.
+        scratch: folder for a file of each rank that holds the steps, which is gone with the history; None keeps them in memory.
 
     Yields:
         The history, which may be asked in the block and after it.
 
     Raises:
-        InputError, InputTypeError: for a problem that there are no such derivatives of: with mortar and friction, in time, with laws with
-            history, other laws of friction, wear, ties, or offsets of contacts with friction.
+        InputError, InputTypeError: for a problem that there are no such derivatives of: with mortar and friction, other laws with history
+            or of friction, wear, ties, offsets of contacts with friction, or in time sliding='small'; or if there is no such folder.
     """
     check_problem(problem)
     with agreed(problem.comm):
+        given.kind("scratch", scratch, scratch is None or isinstance(scratch, (str, Path)), "a folder, or None")
         if problem.history is not None:
             raise InputError("the problem is being recorded: expected one history at a time")
         for contact in problem.contacts:
             if contact.pair.frictional:
-                if problem.progress.steps:
-                    raise InputError(
-                        f"the problem has taken {problem.progress.steps} step(s), on which those of contact '{contact.name}' with friction "
-                        "depend: expected a problem that is recorded from its first step on"
-                    )
+                _check_first(problem, f"those of contact '{contact.name}' with friction")
                 _check_friction(problem, contact)
-    history = problem.history = History(problem)
+            if problem.dynamics is not None and contact.sliding == "small":
+                raise InputError(
+                    f"contact '{contact.name}': a step in time has no derivative by where contactors of sliding='small' were projected: "
+                    "expected 'finite' or 'fixed'"
+                )
+        if problem.dynamics is not None:
+            _check_first(problem, "steps in time")
+        try:
+            history = History(problem, None if scratch is None else Path(scratch))
+        except OSError as error:
+            raise InputError(f"scratch = {scratch!r}: cannot write there ({error}); expected a folder on every rank") from error
+    problem.history = history
     try:
         yield history
     finally:
         problem.history = None
+
+
+def _check_first(problem: UnitedProblem, what: str) -> None:
+    """Refuse a problem whose steps depend on some that were not recorded."""
+    if problem.progress.steps:
+        raise InputError(
+            f"the problem has taken {problem.progress.steps} step(s), on which {what} depend: expected a problem that is recorded from its "
+            "first step on"
+        )
 
 
 def _check_friction(problem: UnitedProblem, contact: Any) -> None:

@@ -136,7 +136,10 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
     control = problem.step_control
     control.begin(dt)
     problem.set_load(dynamics.time)
+    first = not dynamics.accelerated
     problem.system.accelerate()
+    if first and problem.history is not None:
+        problem.history.note_start()
     before, rounding = _touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
         # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is

@@ -1,0 +1,102 @@
+"""Motions and flows whose end depends on all that there are derivatives by."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from gradient_scenes import dot, wave
+from helpers import at, box, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+COMM = MPI.COMM_WORLD
+
+
+def thrown(comm=COMM, law=uem.LinearElastic, scheme=None, damped=True, friction=0.0, shaken=False, wall=True, end=0.16):
+    """A block that is thrown at a leaning rigid plane, comes off again, and may be held at its top by what shakes it.
+
+    ``solve()`` takes all steps anew with the present values of all that the motion depends on.
+    """
+    gap = 0.02
+    s = scene(comm, "quadrilateral", [box("quadrilateral", [0.0, gap], [1.0, 1.0 + gap], [2, 6])])
+    mesh, V = s.mesh, compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    tip, top = s.tag("tip", 0, at(1, gap)), s.tag("top", 0, at(1, 1.0 + gap))
+    E, rho, viscosity = (fem.Constant(mesh, value) for value in (900.0, 1.0, 0.002))
+    force, push, grows = (fem.Constant(mesh, np.array(value)) for value in ((0.3, -5.0), (0.0, 0.0), (1.0, 0.5)))
+    thrown_by, hand = fem.Function(V), fem.Function(V)
+    thrown_by.x.array.reshape(-1, 2)[:] = [0.1, -1.0]
+    spin = wave(V, 0.1)
+    thrown_by.x.array[:] += spin.x.array
+    F = law(E, 0.3, kind="plane_strain").residual(u, v) * ufl.dx - ufl.inner(force + push, v) * ufl.dx
+    way = fem.Function(V)
+
+    def lead(time):
+        """Put the hand where it is at a time."""
+        hand.x.array.reshape(-1, 2)[:] = np.array([0.3, -0.5]) * np.sin(9 * time)
+        hand.x.array[:] += way.x.array
+
+    def solve():
+        u.x.array[:] = 0.0
+        push.value[:] = 0.0
+        viscous = viscosity * E
+        damping = (lambda w: viscous * ufl.inner(ufl.sym(ufl.grad(w)), ufl.sym(ufl.grad(v))) * ufl.dx) if damped else None
+        contact = uem.Contact(tip, uem.RigidPlane([0.0, 0.0], [0.1, 1.0]), friction=friction)
+        dynamics = uem.Dynamics(
+            uem.consistent_mass(V, rho), velocity=thrown_by, scheme=scheme, damping=damping, gravity=[0.0, -1.0]
+        )
+        bcs = [uem.dirichlet(V, top, value=hand)] if shaken else []
+        problem, states = (
+            uem.UnitedProblem(
+                F, u, bcs=bcs, contacts=[contact] if wall else [], dynamics=dynamics, load={push: grows.value}, rtol=1e-13
+            ),
+            [],
+        )
+        lead(0.02)
+        with uem.recording(problem) as history:
+            for step in uem.time_steps(problem, 0.02, end):
+                states.append((round(step.dt, 9), contact.n_active if wall else 0))
+                lead(step.time + 0.02)
+        w = dynamics.velocity
+        J = ufl.inner(u, u) * ufl.dx + 0.05 * rho * ufl.inner(w, w) * ufl.dx
+        return SimpleNamespace(problem=problem, history=history, contact=contact, states=states, J=J)
+
+    return SimpleNamespace(
+        V=V, u=u, E=E, rho=rho, viscosity=viscosity, force=force, push=push, grows=grows, velocity=thrown_by, hand=hand, way=way,
+        solve=solve,
+    )  # fmt: skip
+
+
+def taylor(s, changes, size=1e-3, J=None):
+    """Order of Taylor's test of a scene with all controls changed together, and the slope.
+
+    Args:
+        s: with ``solve()``, which returns the history, the functional, and the states that are to stay.
+        changes: of each control the values that tell it and the change of these.
+    """
+    found = s.solve()
+    slopes = found.history.gradient(found.J, [control for control, _, _ in changes])
+    slope = sum(
+        dot(by, change) if isinstance(by, fem.Function) else float(np.sum(by * change))
+        for by, (_, _, change) in zip(slopes, changes)
+    )
+    values = [told.x.array if isinstance(told, fem.Function) else told.value for _, told, _ in changes]
+    before = [np.array(told) for told in values]
+
+    def functional(h):
+        for told, old, (_, _, change) in zip(values, before, changes):
+            told[...] = old + h * (change.x.array if isinstance(change, fem.Function) else change)
+        again = s.solve()
+        assert again.states == found.states, f"other steps or contactors at {h}: take another scene"
+        return uem.integrate(again.J)
+
+    order = uem.taylor_test(functional, slope, size, 1)
+    for told, old in zip(values, before):
+        told[...] = old
+    return order, slope

@@ -1,0 +1,74 @@
+"""Gradients through motions with impact: against differences and closed forms, on any ranks, and where they are refused.
+
+Read first: ``test_of_second_order``, Taylor's test of a block that is thrown at a plane and comes off it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from gradient_scenes import dot, wave
+from helpers import refused, slow
+from history_scenes import COMM, taylor, thrown
+
+import uem_dolfinx as uem
+
+SCENES = [
+    {"scheme": uem.generalised_alpha(0.7)},
+    slow({"law": uem.NeoHooke, "friction": 0.2, "damped": False}),
+    slow({"law": uem.NeoHooke, "scheme": uem.generalised_alpha(0.7), "shaken": True, "end": 0.3}),
+]
+
+
+def changes(s, damped=True, shaken=False, **_):
+    """Of all controls of a scene: what tells it, and a change."""
+    two = np.ones(2)
+    some = [(s.E, s.E, 90.0), (s.rho, s.rho, 0.1), (s.force, s.force, two), (s.push, s.grows, two)]
+    some += [(s.velocity, s.velocity, wave(s.V, 0.2))]
+    some += [(s.viscosity, s.viscosity, 1e-3)] if damped else []
+    return some + ([(s.hand, s.way, wave(s.V, 0.1))] if shaken else [])
+
+
+@pytest.mark.parametrize("how", SCENES)
+def test_of_second_order(how):
+    """``J(h) - J(0) - h J'`` vanishes with h^2 where the same contactors touch in the same steps, and two ranks tell the same slope."""
+    s = thrown(**how)
+    order, slope = taylor(s, changes(s, **how))
+    assert order >= 1.95, order
+    if COMM.size > 1:
+        alone = thrown(comm=COMM.Create_group(COMM.group.Incl([COMM.rank])), **how)
+        found = alone.solve()
+        some = changes(alone, **how)
+        by = found.history.gradient(found.J, [control for control, _, _ in some])
+        told = sum(dot(b, c) if isinstance(b, fem.Function) else float(np.sum(b * c)) for b, (_, _, c) in zip(by, some))
+        assert told == pytest.approx(slope, rel=1e-10)
+
+
+def test_free_flight():
+    """Without contact every node flies as a point does, ``u = v t + (f / rho + g) t^2 / 2``, and so do its derivatives."""
+    s = thrown(wall=False, end=0.1, damped=False)
+    s.velocity.x.array.reshape(-1, 2)[:] = [0.1, -1.0]
+    found, t = s.solve(), 0.1
+    by_v, by_rho, by_f, by_push = found.history.gradient(s.u[1] * ufl.dx, [s.velocity, s.rho, s.force, s.push])
+    up = fem.Function(s.V)
+    up.x.array.reshape(-1, 2)[:, 1] = 1.0
+    assert dot(by_v, up) == pytest.approx(t, rel=1e-10)
+    # the push has grown with time, and the trapezoidal rule integrates a cubic in steps of 0.02
+    grown = sum(0.02**2 * (0.25 * (k * 0.02 + (k + 1) * 0.02) + 0.5 * (4 - k) * (2 * k + 1) * 0.02) for k in range(5))
+    assert by_f[1] == pytest.approx(t**2 / 2, rel=1e-10) and abs(by_f[0]) <= 1e-12
+    assert by_push[1] == pytest.approx(grown, rel=1e-10)
+    assert float(by_rho) == pytest.approx(5.0 * t**2 / 2 - 0.5 * grown, rel=1e-10)
+
+
+def test_what_is_refused():
+    """What masses depend on otherwise than as a density, fields that follow otherwise, and motions that have begun."""
+    s = thrown(wall=False, end=0.02, damped=False)
+    problem = s.solve().problem
+    refused(uem.InputError, "expected a problem that is recorded from its first step on", uem.recording(problem).__enter__)
+    refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, []))
+    history = s.solve().history
+    ask, w = history.gradient, history.problem.dynamics.mean_velocity
+    refused(uem.InputError, "the shape, on which masses depend", lambda: ask(s.u[0] * ufl.dx, ufl.SpatialCoordinate(s.V.mesh)))
+    refused(uem.InputError, "holds 'mean_velocity'", lambda: ask(w[0] * ufl.dx, []))

@@ -1,0 +1,55 @@
+"""Acceleration of united bodies under forces, with which a motion begins."""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.errors import LinearSolveError
+from uem_dolfinx.log import timed
+
+#: Components with less mass than this part of the largest have no acceleration at the start.
+#: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
+MASSLESS = 1e-12
+#: Residual that the first acceleration is solved to.
+#: [bound; forces; -]
+ACCELERATED = 1e-13
+
+
+def united_accelerations(
+    mass: PETSc.Mat, restriction: Restriction, forces: PETSc.Vec, added: PETSc.Mat | None = None
+) -> PETSc.Vec:
+    """``P a`` with ``P'MP a = P' forces``, zero in components without mass (collective).
+
+    Args:
+        mass: M, with the rows and columns of the united system.
+        restriction: P.
+        forces: on all unknowns.
+        added: what masses at points add to M.
+
+    Raises:
+        LinearSolveError: if masses are negative.
+    """
+    M = mass.copy() if restriction.alone else mass.PtAP(restriction.P)
+    if restriction.alone:
+        restriction.cross_out(M)
+    if added is not None:
+        M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    rhs = restriction.transpose(forces)
+    diagonal = M.getDiagonal()
+    idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
+    diagonal.array[idle], rhs.array[idle] = 1.0, 0.0
+    M.setDiagonal(diagonal)
+    ksp = PETSc.KSP().create(M.comm)
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setTolerances(rtol=ACCELERATED, max_it=10_000)
+    ksp.setOperators(M)
+    q = rhs.duplicate()
+    with timed("first acceleration"):
+        ksp.solve(rhs, q)
+    if ksp.getConvergedReason() < 0:
+        raise LinearSolveError(
+            f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
+        )
+    return restriction.expand(q)
