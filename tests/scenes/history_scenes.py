@@ -73,7 +73,24 @@ def thrown(comm=COMM, law=uem.LinearElastic, scheme=None, damped=True, friction=
     )  # fmt: skip
 
 
-def taylor(s, changes, size=1e-3, J=None):
+def slope_of(by, changes):
+    """Derivative along all changes together, of what ``changes`` of controls tell (collective)."""
+    parts = zip(by, (change for _, _, change in changes))
+    return sum(dot(b, c) if isinstance(b, fem.Function) else float(np.sum(b * c)) for b, c in parts)
+
+
+def slope_alone(s, changes):
+    """That of a scene on one rank alone."""
+    found = s.solve()
+    return slope_of(found.history.gradient(found.J, [control for control, _, _ in changes]), changes)
+
+
+def alone():
+    """A communicator of this rank."""
+    return COMM.Create_group(COMM.group.Incl([COMM.rank]))
+
+
+def taylor(s, changes, size=1e-3):
     """Order of Taylor's test of a scene with all controls changed together, and the slope.
 
     Args:
@@ -81,11 +98,7 @@ def taylor(s, changes, size=1e-3, J=None):
         changes: of each control the values that tell it and the change of these.
     """
     found = s.solve()
-    slopes = found.history.gradient(found.J, [control for control, _, _ in changes])
-    slope = sum(
-        dot(by, change) if isinstance(by, fem.Function) else float(np.sum(by * change))
-        for by, (_, _, change) in zip(slopes, changes)
-    )
+    slope = slope_of(found.history.gradient(found.J, [control for control, _, _ in changes]), changes)
     values = [told.x.array if isinstance(told, fem.Function) else told.value for _, told, _ in changes]
     before = [np.array(told) for told in values]
 
@@ -100,3 +113,44 @@ def taylor(s, changes, size=1e-3, J=None):
     for told, old in zip(values, before):
         told[...] = old
     return order, slope
+
+
+def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, steps=2, friction=0.0):
+    """A plastic block that is pressed against a rigid plane by its bottom, and goes back a little, in some steps each way.
+
+    ``solve()`` makes the law anew with the present values of its parameters, and takes all steps.
+    """
+    g = 3 if cell == "hexahedron" else 2
+    s = scene(comm, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)])
+    mesh, V = s.mesh, compat.function_space(s.mesh, 1, (g,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    bottom, top = s.tag("bottom", 0, at(g - 1, 0.0)), s.tag("top", 0, at(g - 1, 1.0))
+    E, flow = fem.Constant(mesh, 200.0), fem.Constant(mesh, 0.4)
+    hardening = fem.Function(compat.function_space(mesh, ("DG", 0)))
+    hardening.interpolate(lambda x: 15.0 + 5.0 * x[0])
+    load, led = fem.Constant(mesh, np.full(g, 0.02)), fem.Constant(mesh, np.zeros(g))
+    led.value[0], led.value[-1] = 0.004, 0.012
+    w = fem.Function(V)
+    compat.set_bc_values(w.x.array, [uem.dirichlet(V, bottom, g - 1, 1.0)])
+    w.x.scatter_forward()
+
+    def solve():
+        u.x.array[:] = 0.0
+        way = np.array(led.value)
+        law = uem.VonMises(u, E, 0.3, flow, hardening, kind=kind, strain=strain)
+        F = law.residual(v) - ufl.inner(load, v) * ufl.dx
+        contact = uem.Contact(top, uem.RigidPlane([0.0] * (g - 1) + [1.0], [0.0] * (g - 1) + [-1.0]), friction=friction)
+        bcs = [fem.dirichletbc(led, fem.locate_dofs_topological(V, g - 1, bottom.entities), V)]
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], materials=[law], rtol=1e-13)
+        states = []
+        with uem.recording(problem) as history:
+            for back in (0.0, 0.0006):
+                led.value[:] = way
+                led.value[-1] -= back
+                for step in uem.load_steps(problem, steps):
+                    states.append((step.factor, contact.n_active, int((law.peeq.x.array > 0).sum())))
+        led.value[:] = way
+        J = ufl.inner(u, u) * ufl.dx + ufl.replace(F, {v: w})
+        return SimpleNamespace(problem=problem, history=history, contact=contact, states=states, J=J, law=law)
+
+    return SimpleNamespace(V=V, u=u, E=E, flow=flow, hardening=hardening, load=load, led=led, solve=solve)

@@ -375,7 +375,7 @@ class UnitedSolver:
             self._tell_unused()
             if np.isfinite(dq.norm()):
                 return dq, 1
-            raise LinearSolveError("the united problem is singular: hold free bodies by conditions or contact; those that slip are free")
+            raise LinearSolveError("the united problem is singular: hold bodies that are free or slip by Dirichlet conditions")
         self._condensed.whole = True
         if self._served is not None:
             if accuracy > 0 and (found := self._kept.solve(*self._served, rhs, accuracy)) is not None:

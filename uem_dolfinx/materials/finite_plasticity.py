@@ -74,6 +74,8 @@ class FinitePlasticity(VonMises):
         SpaceError, TagError: as ``VonMises``.
     """
 
+    has_slopes = False
+
     def __init__(
         self,
         u: fem.Function,

@@ -11,12 +11,13 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import circumference, is_axisymmetric
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.log import compiling
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import agree, reduced
 
 #: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
 #: [convention; reference cell; test_thresholds_motion.py::test_points_beside_the_centre]
@@ -114,3 +115,32 @@ class QuadraturePoints:
         """Middle of the cell that holds a point, for error messages."""
         nodes = compat.geometry_dofs(self.mesh)[self.cells[point // len(self.points)]]
         return "(" + ", ".join(f"{x:.6g}" for x in self.mesh.geometry.x[nodes].mean(axis=0)[: self.mesh.geometry.dim]) + ")"
+
+    def spread_from(self, others: QuadraturePoints) -> Array:
+        """Values at these points of what other points of the cells give as a constant or (multi)linear: rows sum to 1."""
+        if others.degree == 0:
+            # the points beside a centre count as one
+            count = len(others.points)
+            return np.full((len(self.points), count), 1.0 / count)
+        linear = forms.create_lagrange_element(compat.cell_name(self.mesh), 1)
+        at, known = (linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in (self, others))
+        spread = at @ np.linalg.pinv(known)
+        return np.asarray(spread / spread.sum(axis=1, keepdims=True))
+
+    def of_cells(self, name: str, value: Any, within: given.Range) -> Array:
+        """Values of a parameter in the cells, refused on all ranks if they are out of range on any (collective)."""
+        if not isinstance(value, fem.Function):
+            number = np.asarray(value.value)[()] if isinstance(value, fem.Constant) else value
+            return np.full(len(self.cells), given.number(name, number, within))
+        V = value.function_space
+        dofs = compat.cell_dofs(V)
+        if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
+            expected = "expected a number, or a scalar DG0 Function of the displacement's mesh"
+            raise SpaceError(f"{name} is a Function of {V}: {expected}")
+        values = np.array(value.x.array[dofs[self.cells, 0]])
+        bad, found = np.flatnonzero(~within.holds(values)), None
+        if len(bad):
+            where = self.where(bad[0] * len(self.points))
+            found = InputError(f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {within.words}")
+        agree(self.mesh.comm, found)
+        return values

@@ -106,16 +106,16 @@ def plane_stress_return(
     """
     shear, area = E / (1 + nu), E / (1 - nu)
     of_normal = np.array([[3.0], [1.0], [1.0]])
-    modes = _MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])
+    modes = MODES @ (strain - plastic_strain).T * np.stack([area, shear, shear])
     moves, flow = modulus.any(), yield_stress + hardening * peeq
-    over = modes - of_normal * (_MODES @ plastic_strain.T) * (2 / 3 * modulus) if moves else modes
-    i = np.flatnonzero(_plane_mises(over[0] ** 2, over[1] ** 2 + over[2] ** 2) > (1 + ON_SURFACE) * flow)
+    over = modes - of_normal * (MODES @ plastic_strain.T) * (2 / 3 * modulus) if moves else modes
+    i = np.flatnonzero(plane_mises(over[0] ** 2, over[1] ** 2 + over[2] ** 2) > (1 + ON_SURFACE) * flow)
     b, flow, H, K, r = shear[i], flow[i], hardening[i], modulus[i], (area / shear)[i] / 3
     ss, dd = over[0, i] ** 2, over[1, i] ** 2 + over[2, i] ** 2
     slope, k, x = 2 * H / (3 * b), 2 * K / (3 * b), np.zeros(len(i))
     for _ in range(MAX_STEPS):
         y, z = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x)
-        q = _plane_mises(ss * y**2, dd * z**2)
+        q = plane_mises(ss * y**2, dd * z**2)
         falls = flow / q**3 * (0.5 * (r + k) * ss * y**3 + 1.5 * (1 + k) * dd * z**3)
         step = (1 - slope * x - flow / q) / (falls + slope)
         x += step
@@ -124,26 +124,26 @@ def plane_stress_return(
     y, z, moved = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x), 1 + k * x
     before = over[:, i]
     left = before * np.stack([y, z, z])
-    q = _plane_mises(left[0] ** 2, left[1] ** 2 + left[2] ** 2)
+    q = plane_mises(left[0] ** 2, left[1] ** 2 + left[2] ** 2)
     plastic_strain, peeq, m = plastic_strain.copy(), peeq.copy(), np.zeros_like(strain)
     normal = left / of_normal
-    plastic_strain[i] += (_MODES.T @ (normal * x / b)).T
+    plastic_strain[i] += (MODES.T @ (normal * x / b)).T
     peeq[i] += x / b * q / 1.5
     modes[:, i] = modes[:, i] - before + moved * left
     area[i] *= moved * y
     shear[i] *= moved * z
     pushed = normal * np.stack([area[i], shear[i], shear[i]])
     resisted = 4 / 9 * q**2 * moved * (K + moved * H * q / flow)
-    m[i] = (_MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + resisted))).T
+    m[i] = (MODES.T @ (pushed / np.sqrt((normal * pushed).sum(axis=0) + resisted))).T
     energy = ((1 - nu) * modes[0] ** 2 + (1 + nu) * (modes[1] ** 2 + modes[2] ** 2)) / (2 * E)
     if moves:
         energy += modulus / 3 * (_squares(plastic_strain) + (plastic_strain[:, 0] + plastic_strain[:, 1]) ** 2)
-    return Returned((_MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
+    return Returned((MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
 
 
 #: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.
 #: [format; components; -]
-_MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
+MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
 
 
 def _squares(v: Array) -> Array:
@@ -151,6 +151,6 @@ def _squares(v: Array) -> Array:
     return np.asarray(np.einsum("nk,nk->n", v, v), dtype=np.float64)
 
 
-def _plane_mises(ss: Array, dd: Array) -> Array:
+def plane_mises(ss: Array, dd: Array) -> Array:
     """Von Mises stress from the squares of the modes."""
     return np.sqrt(0.5 * ss + 1.5 * dd)

@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import centre_of_mass, displacement_gradient
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.materials.hardening import YieldCurve
     from uem_dolfinx.materials.layers import Layers
     from uem_dolfinx.materials.logarithmic import Flowed
+    from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 
 STRAINS = ("small", "green_lagrange")
 #: What is expected of a back stress.
@@ -93,6 +94,7 @@ class VonMises:
             ``update``, the others committed; zero outside of ``cells``. With a table those of the layers, one after another
             (in plane stress with the components of plane strain); ``cell_averages`` give those of the body, by the layers' weights.
         history: the committed Functions by name, all that the material remembers.
+        handed: parameters as they were handed over, by name.
 
     Raises:
         InputError, InputTypeError: for an unknown word, a parameter out of its range, or isotropic hardening beside a table.
@@ -127,13 +129,14 @@ class VonMises:
         self.cells = owned_cells(self.mesh, cells)
         degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
+        self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
         #: Yield stress over peeq; of layers where a table is handed over, which then are all that hardens.
         self._curve: YieldCurve
         self._layers: Layers | None = None
         self._read_parameters(E, nu, yield_stress, hardening, kinematic_hardening)
         self._create_functions()
         self._compile()
-        self._spread = self._spreading()
+        self._spread = self._points.spread_from(self._pressure_points)
         #: Outcome of the last update.
         self._trial: Returned | Flowed
         self.update()
@@ -175,24 +178,13 @@ class VonMises:
         stress = max(stress, lowest) if quadrature_degree is None else quadrature_degree
         return stress, min(stress, max(pressure, lowest) if simplex else pressure)
 
-    def _spreading(self) -> Array:
-        """Values at the stress points of the pressure, which its own points give as a constant or (multi)linear: rows sum to 1."""
-        if self._pressure_points.degree == 0:
-            # the points beside a centre count as one
-            count = len(self._pressure_points.points)
-            return np.full((len(self._points.points), count), 1.0 / count)
-        linear, rules = forms.create_lagrange_element(compat.cell_name(self.mesh), 1), (self._points, self._pressure_points)
-        at, known = (linear.tabulate(0, rule.points)[0].reshape(len(rule.points), -1) for rule in rules)
-        spread = at @ np.linalg.pinv(known)
-        return spread / spread.sum(axis=1, keepdims=True)
-
     def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any, kinematic_hardening: Any) -> None:
         """Take the parameters of every cell, and repeat them for its points."""
         from uem_dolfinx.materials.hardening import is_table
 
         layered, count = is_table(kinematic_hardening), len(self._points.points)
-        E = self._cellwise("E", E, given.POSITIVE)
-        nu = self._cellwise("nu", nu, given.between(-1.0, 1.0) if self.kind == "plane_stress" and not layered else POISSON)
+        E = self._points.of_cells("E", E, given.POSITIVE)
+        nu = self._points.of_cells("nu", nu, given.between(-1.0, 1.0) if self.kind == "plane_stress" and not layered else POISSON)
         self._E, self._nu = np.repeat(E, count), np.repeat(nu, count)
         self._mu = self._E / (2 * (1 + self._nu))
         self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
@@ -230,26 +222,8 @@ class VonMises:
         self.parameters |= {"kinematic_hardening": table.stresses, "plastic strains of kinematic_hardening": table.strains}
 
     def _pointwise(self, name: str, value: Any, within: given.Range) -> Array:
-        """Values of a parameter at this rank's points; see ``_cellwise`` (collective)."""
-        return np.repeat(self._cellwise(name, value, within), len(self._points.points))
-
-    def _cellwise(self, name: str, value: Any, within: given.Range) -> Array:
-        """Values of a parameter in ``cells``, refused on all ranks if they are out of range on any (collective)."""
-        if not isinstance(value, fem.Function):
-            number = np.asarray(value.value)[()] if isinstance(value, fem.Constant) else value
-            return np.full(len(self.cells), given.number(name, number, within))
-        V = value.function_space
-        dofs = compat.cell_dofs(V)
-        if V.mesh is not self.mesh or dofs.shape[1] != 1 or V.dofmap.index_map_bs != 1:
-            expected = "expected a number, or a scalar DG0 Function of the displacement's mesh"
-            raise SpaceError(f"{name} is a Function of {V}: {expected}")
-        values = np.array(value.x.array[dofs[self.cells, 0]])
-        bad, found = np.flatnonzero(~within.holds(values)), None
-        if len(bad):
-            where = self._points.where(bad[0] * len(self._points.points))
-            found = InputError(f"{name} = {values[bad[0]]:.6g} in the cell at {where}: expected {within.words}")
-        agree(self.comm, found)
-        return values
+        """Values of a parameter at this rank's points; see ``of_cells`` (collective)."""
+        return np.repeat(self._points.of_cells(name, value, within), len(self._points.points))
 
     def _create_history(self) -> int:
         """Stress and history at the quadrature points, zero outside of this material's cells: the number of the stress's components."""
@@ -376,6 +350,27 @@ class VonMises:
     def _mean(self, values: Array) -> Array:
         """Of the layers of each point; values ``(n, ...)`` themselves where there are none."""
         return values if self._layers is None else self._layers.mean(values)
+
+    @property
+    def has_slopes(self) -> bool:
+        """Whether gradients through histories know its derivatives: without back stresses, at this rank's points."""
+        return self._layers is None and not self._modulus.any()
+
+    def begins_with(self) -> tuple[Array, ...]:
+        """What the return at the present displacement begins with: strain, committed history and parameters, in its order."""
+        elastic = (self._E, self._nu) if self.kind == "plane_stress" else (self._mu,)
+        return self._points.evaluate(self._strain), *self._committed(), *elastic, *self._curve.parameters.values()
+
+    @property
+    def stress_in_forms(self) -> fem.Function:
+        """The Function that stands for the stress in ``residual``: its deviator, but in plane stress itself."""
+        return self._s
+
+    def slopes(self, a: fem.Function, test: Any) -> PlasticSlopes:
+        """Derivatives through its load steps, for gradients through histories; arguments as of ``PlasticSlopes`` (collective)."""
+        from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
+
+        return PlasticSlopes(self, self._points, self._s, self._kappa, lambda w: self._vector(self._variation(w)), a, test)
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""

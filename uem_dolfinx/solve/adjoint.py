@@ -297,6 +297,7 @@ class Adjoint:
     Attributes:
         a: what forces do to J, less what they do to contact forces by themselves, a Function of the displacement's space.
         left: derivative by a change of the displacement with everything else at rest, what the adjoint forces have not taken up.
+        terms: J with its areas, and the work of the residual along a, with their signs.
         by_values: derivative of J by the prescribed displacement of every owned component, zero where free ``(n_owned, gdim)``.
     """
 
@@ -322,8 +323,7 @@ class Adjoint:
         along = at.solve_back(drive)
         left = along - lift
         self.a = at.derivatives.a
-        #: J with its areas, and the work of the residual along a, with their signs.
-        self._terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
+        self.terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
         held = ~at.problem.bodies.free[: config.n_owned]
         self.left = drive - at.stiffness_back(along)
         at.derivatives.along(left)
@@ -355,7 +355,7 @@ class Adjoint:
 
     def _by_constant(self, m: fem.Constant) -> Array:
         """An array of its shape."""
-        found = np.asarray(self.at.share(m) * self.at.derivatives.by_constant(self._terms, m))
+        found = np.asarray(self.at.share(m) * self.at.derivatives.by_constant(self.terms, m))
         for entry in np.ndindex(found.shape):
             unit = np.zeros(found.shape)
             unit[entry] = 1.0
@@ -365,7 +365,7 @@ class Adjoint:
 
     def _by_function(self, m: fem.Function) -> fem.Function:
         """A Function of its space."""
-        found, added = self.at.derivatives.by_function(self._terms, m), fem.Function(m.function_space)
+        found, added = self.at.derivatives.by_function(self.terms, m), fem.Function(m.function_space)
         # conditions that take its values tell which
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own = which > 0.5
@@ -376,7 +376,7 @@ class Adjoint:
 
     def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
         """A Function of the displacement's space."""
-        found = self.at.derivatives.by_places(self._terms, X)
+        found = self.at.derivatives.by_places(self.terms, X)
         found.x.array[: len(self._by_places)] += self._by_places
         found.x.scatter_forward()
         return found

@@ -46,6 +46,8 @@ class History:
         self._records = Records(folder)
         #: What a motion begins with; None in statics.
         self._start: Record | None = None
+        #: Laws with history, of which there are slopes.
+        self._laws: list[Any] = problem.materials
         F = problem.bodies.F
         known = (f for f in F.coefficients() if f is not problem.u and material_of(f) is None)
         self._inputs = [*F.constants(), *known]
@@ -156,6 +158,17 @@ class History:
                     raise InputError(
                         f"controls[{k}] is the shape, on which masses depend: there are no derivatives by it in time"
                     )
+                if isinstance(m, ufl.SpatialCoordinate) and problem.materials:
+                    raise InputError(f"controls[{k}] is the shape, by which there are no derivatives through laws with history")
+                if isinstance(m, fem.Function) and material_of(m) is not None:
+                    raise InputError(
+                        f"controls[{k}] is '{m.name}', a field of a law with history: expected what the problem is made of"
+                    )
+                if any(m is law.handed["nu"] for law in self._laws):
+                    raise InputError(
+                        f"controls[{k}] is Poisson's ratio of a law with history, by which there is no derivative: expected E, "
+                        "yield_stress or hardening"
+                    )
                 if m is not density and any(m is one for one in made_of):
                     raise InputError(f"controls[{k}] is a part of the density: expected a Constant that is the density itself")
 
@@ -190,6 +203,11 @@ class History:
         for f in J.coefficients():
             if dynamics is not None and (f is dynamics.mean_velocity or f is dynamics.forces):
                 raise InputError(f"{what} holds '{f.name}': expected displacement, velocity and acceleration alone")
+            if material_of(f) is not None and all(f is not law.stress_in_forms for law in self._laws):
+                raise InputError(
+                    f"{what} holds '{f.name}', a field of a law with history: expected the displacement, and what the residual of this "
+                    "problem's laws holds"
+                )
 
     def _put(self, values: Sequence[Array], friction: Sequence[Array | None], offsets: Sequence[Array | None]) -> None:
         """Let the problem be made of these (collective)."""
@@ -261,6 +279,13 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
                 )
         if problem.dynamics is not None:
             _check_first(problem, "steps in time")
+        for material in problem.materials:
+            _check_first(problem, "those of a law with history")
+            if not getattr(material, "has_slopes", False):
+                raise InputError(
+                    f"a history has no derivatives through what {type(material).__name__} remembers: expected VonMises "
+                    "without back stresses as law with history; else take differences of runs"
+                )
         try:
             history = History(problem, None if scratch is None else Path(scratch))
         except OSError as error:

@@ -30,6 +30,7 @@ from uem_dolfinx.contact.parameters import ContactParameter, motion_of
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.adjoint import Adjoint, Linearised
 from uem_dolfinx.solve.derivatives import Derivatives
@@ -58,6 +59,8 @@ class Sweep:
         self._derivatives = Derivatives(problem.bodies.F, problem.config.V)
         self._by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
         self._rates = None if problem.dynamics is None else RateSlopes(problem.dynamics)
+        laws: list[Any] = problem.materials
+        self._laws = [law.slopes(self._derivatives.a, self._derivatives.test) for law in laws]
 
     def pass_back(self, record: Record, J: ufl.Form | None) -> None:
         """Go back over a step, at whose end the problem has been placed, with a functional of that end (collective)."""
@@ -68,6 +71,9 @@ class Sweep:
             if self._rates is not None:
                 self._begin_rates(self._rates, J)
                 load = load + self._rates.load()
+            for law in self._laws:
+                law.begin(None if J is None else self._derivatives.by_values(J, law.stress))
+                load = load + law.load()
             adjoint = Adjoint(step, J, (), load)
             for k, m in enumerate(self._controls):
                 self._add(k, adjoint.by(m))
@@ -78,6 +84,16 @@ class Sweep:
                 a = adjoint.a.x.array[: load.size]
                 self._add_density(self._rates.by_density, a)
                 self._rates.pass_back(a, step.damped)
+            for law in self._laws:
+                self._pass_back_law(law, adjoint)
+
+    def _pass_back_law(self, law: PlasticSlopes, adjoint: Adjoint) -> None:
+        """Take derivatives by the history that a law began the step with, and by its parameters (collective)."""
+        by, by_bulk = law.pass_back(), None
+        for k, m in enumerate(self._controls):
+            if isinstance(m, fem.Constant | fem.Function) and law.is_made_of(m):
+                by_bulk = by_bulk or self._derivatives.by_function(adjoint.terms, law.bulk)
+                self._add(k, law.by_parameter(m, by, by_bulk))
 
     def _begin_rates(self, rates: RateSlopes, J: ufl.Form | None) -> None:
         """Take the slopes of the step, and the velocity and acceleration of its end, with what a functional makes of them (collective)."""

@@ -1,0 +1,141 @@
+"""Gradients through plastic flow: against differences and the closed form of a bar, on any ranks, and where they are refused.
+
+Read first: ``test_a_bar_that_flows``, force over elongation of a bar that yields and is unloaded, in closed form.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from gradient_scenes import wave
+from helpers import at, box, refused, run, scene, slow
+from history_scenes import COMM, alone, bent, slope_alone, taylor
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
+from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
+
+SCENES = [
+    {"kind": "plane_stress"},
+    slow({"friction": 0.2}),
+    slow({"strain": "green_lagrange"}),
+    slow({"cell": "hexahedron", "kind": "3d"}),
+]
+
+
+def changes(s):
+    """Of all controls of a scene: what tells it, and a change."""
+    g = len(s.led.value)
+    some = [(s.E, s.E, 20.0), (s.flow, s.flow, 0.04), (s.hardening, s.hardening, wave(s.hardening.function_space, 2.0))]
+    return [*some, (s.load, s.load, np.full(g, 0.02)), (s.led, s.led, np.full(g, 1e-3))]
+
+
+@pytest.mark.parametrize("how", SCENES)
+def test_of_second_order(how):
+    """``J(h) - J(0) - h J'`` vanishes with h^2 where the same points flow, and two ranks tell the same slope."""
+    s = bent(**how)
+    order, slope = taylor(s, changes(s), 1e-2)
+    assert order >= 1.95, order
+    if COMM.size > 1:
+        one = bent(comm=alone(), **how)
+        assert slope_alone(one, changes(one)) == pytest.approx(slope, rel=1e-10)
+
+
+def bar():
+    """A bar of height 1 in plane stress, free across, drawn to 2 % and back to 1.9 % in four steps, and the force in it."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [2, 2])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    E, flow, strain = (fem.Constant(s.mesh, value) for value in (200.0, 0.4, 0.02))
+    hardening = fem.Function(compat.function_space(s.mesh, ("DG", 0)))
+    hardening.x.array[:] = 15.0
+    law = uem.VonMises(u, E, 0.3, flow, hardening, kind="plane_stress")
+    sides = [uem.dirichlet(V, s.tag(name, 0, at(i, 0.0)), i) for i, name in enumerate(("left", "bottom"))]
+    top = s.tag("top", 0, at(1, 1.0))
+    dofs = fem.locate_dofs_topological(V.sub(1), 1, top.entities)
+    bcs = [*sides, fem.dirichletbc(strain, dofs, V.sub(1))]
+    F, w = law.residual(v), fem.Function(V)
+    compat.set_bc_values(w.x.array, [uem.dirichlet(V, top, 1, 1.0)])
+    w.x.scatter_forward()
+    return uem.UnitedProblem(F, u, bcs=bcs, materials=[law], rtol=1e-12), ufl.replace(F, {v: w}), (E, flow, hardening, strain)
+
+
+def test_a_bar_that_flows():
+    """The force ``E (Y + H e) / (E + H)``, less E times what it goes back by, and its derivatives by E, Y, H and e."""
+    problem, force, controls = bar()
+    E, Y, H, e, strain = 200.0, 0.4, 15.0, 0.02, controls[-1]
+    with uem.recording(problem) as history:
+        run(problem, 2)
+        strain.value = 0.019
+        run(problem, 2)
+    assert uem.integrate(force) == pytest.approx(E * (Y + H * e) / (E + H) - E * 0.001, rel=1e-8)
+    by_E, by_Y, by_H, _ = history.gradient([None, None, None, force], controls)
+    assert float(by_E) == pytest.approx(H * (Y + H * e) / (E + H) ** 2 - 0.001, rel=1e-7)
+    assert float(by_Y) == pytest.approx(E / (E + H), rel=1e-7)
+    own = by_H.function_space.dofmap.index_map.size_local
+    assert COMM.allreduce(by_H.x.array[:own].sum()) == pytest.approx(E * (E * e - Y) / (E + H) ** 2, rel=1e-7)
+    (by_e,) = history.gradient([None, force, None, None], strain)
+    assert float(by_e) == pytest.approx(E * H / (E + H), rel=1e-7)
+    peeq = problem.materials[0].peeq
+    refused(uem.InputError, "holds 'peeq', a field of a law with history", lambda: history.gradient(peeq * ufl.dx, strain))
+    refused(uem.InputError, "is 'peeq', a field of a law with history", lambda: history.gradient(force, peeq))
+    refused(
+        uem.InputError,
+        "the shape, by which",
+        lambda: history.gradient(force, ufl.SpatialCoordinate(problem.u.function_space.mesh)),
+    )
+
+
+@pytest.mark.parametrize("k", [3, 4, 6])
+def test_slopes_of_returns(k):
+    """Of every return by strain, history and parameters, where points flow and where they do not, against central differences."""
+    rng, n = np.random.default_rng(1), 40
+    returned, back = (plane_stress_return, plane_stress_back) if k == 3 else (radial_return, radial_back)
+    E, nu = 200.0 * (1.0 + rng.random(n)), np.full(n, 0.3)
+    strain, plastic, deviatoric = rng.normal(size=(n, k)) * 2e-3, rng.normal(size=(n, k)) * 1e-3, rng.normal(size=(n, k)) * 1e-3
+    if k > 3:
+        plastic[:, :3] -= plastic[:, :3].mean(axis=1, keepdims=True)
+        deviatoric[:, :3] -= deviatoric[:, :3].mean(axis=1, keepdims=True)
+    begin = [strain, plastic, rng.random(n) * 0.01, E, np.full(n, 0.8), 15.0 * rng.random(n)]
+    counts = rng.normal(size=(n, k)), rng.normal(size=(n, k)), rng.normal(size=n)
+
+    def arguments(values):
+        """Of a return."""
+        *state, E, flow, hardening = values
+        return *state, *((E, nu) if k == 3 else (E / (2 * (1 + nu)),)), flow, hardening
+
+    def counted(values):
+        """What counts after a return."""
+        found = returned(*arguments(values))
+        return (found.stress * counts[0] + found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
+
+    flows = returned(*arguments(begin)).peeq > begin[2]
+    assert 5 < flows.sum() < n - 5
+    by = back(*arguments(begin), *counts)
+    found = by.strain, by.plastic_strain, by.peeq, by.stiffness / E, by.yield_stress, by.hardening
+    for i, change in enumerate(
+        (rng.normal(size=(n, k)) * 1e-3, deviatoric, 0.01 * np.ones(n), 0.1 * E, 0.1 * begin[4], begin[5])
+    ):
+        ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
+        slope = (found[i] * change).reshape(n, -1).sum(axis=1)
+        assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-7, abs=1e-7 * np.abs(slope).max())
+
+
+def test_what_is_refused():
+    """Laws whose memory has no derivatives, and Poisson's ratio."""
+    s = bent()
+    nu = fem.Constant(s.V.mesh, 0.3)
+    v = ufl.TestFunction(s.V)
+    finite = uem.FinitePlasticity(s.u, 200.0, 0.3, 0.4, kind="plane_strain")
+    problem = uem.UnitedProblem(finite.residual(v), s.u, materials=[finite])
+    refused(uem.InputError, "through what FinitePlasticity remembers", uem.recording(problem).__enter__)
+    law = uem.VonMises(s.u, 200.0, nu, 0.4, kind="plane_strain")
+    bottom = [fem.dirichletbc(s.led, fem.locate_dofs_geometrical(s.V, lambda x: np.isclose(x[1], 0.0)), s.V)]
+    problem = uem.UnitedProblem(law.residual(v), s.u, bcs=bottom, materials=[law])
+    with uem.recording(problem) as history:
+        run(problem)
+    refused(uem.InputError, "is Poisson's ratio of a law with history", lambda: history.gradient(s.u[0] * ufl.dx, nu))
+    refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, nu))
