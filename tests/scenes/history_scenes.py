@@ -42,7 +42,7 @@ def thrown(comm=COMM, law=uem.LinearElastic, scheme=None, damped=True, friction=
         hand.x.array.reshape(-1, 2)[:] = np.array([0.3, -0.5]) * np.sin(9 * time)
         hand.x.array[:] += way.x.array
 
-    def solve():
+    def solve(**how):
         u.x.array[:] = 0.0
         push.value[:] = 0.0
         viscous = viscosity * E
@@ -59,7 +59,7 @@ def thrown(comm=COMM, law=uem.LinearElastic, scheme=None, damped=True, friction=
             [],
         )
         lead(0.02)
-        with uem.recording(problem) as history:
+        with uem.recording(problem, **how) as history:
             for step in uem.time_steps(problem, 0.02, end):
                 states.append((round(step.dt, 9), contact.n_active if wall else 0))
                 lead(step.time + 0.02)

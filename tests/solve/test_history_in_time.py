@@ -5,6 +5,9 @@ Read first: ``test_of_second_order``, Taylor's test of a block that is thrown at
 
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -14,6 +17,7 @@ from helpers import refused, slow
 from history_scenes import COMM, alone, slope_alone, taylor, thrown
 
 import uem_dolfinx as uem
+from uem_dolfinx.solve.records import Records
 
 SCENES = [
     {"scheme": uem.generalised_alpha(0.7)},
@@ -56,6 +60,27 @@ def test_free_flight():
     assert by_f[1] == pytest.approx(t**2 / 2, rel=1e-10) and abs(by_f[0]) <= 1e-12
     assert by_push[1] == pytest.approx(grown, rel=1e-10)
     assert float(by_rho) == pytest.approx(5.0 * t**2 / 2 - 0.5 * grown, rel=1e-10)
+
+
+def test_steps_in_a_file(tmp_path):
+    """Steps that are kept in files are those in memory, and take no memory; the files are gone by themselves."""
+    s = thrown(end=0.04, damped=False)
+    one, other = s.solve(), s.solve(scratch=tmp_path)
+    (by_E, by_v), (again_E, again_v) = (found.history.gradient(found.J, [s.E, s.velocity]) for found in (one, other))
+    assert float(again_E) == pytest.approx(float(by_E), rel=1e-10)
+    assert again_v.x.array == pytest.approx(by_v.x.array, rel=1e-8, abs=1e-12 * np.abs(by_v.x.array).max())
+    assert not list(tmp_path.iterdir())
+    record, records = one.history._records[0], Records(tmp_path)
+    tracemalloc.start()
+    for _ in range(20):
+        records.add(replace(record, displacement=np.ones(10_000), values=[np.ones(10_000), np.array(len(records))]))
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held <= 3 * 80_000 and [int(own.values[1]) for own in records] == list(range(20))
+    records.cut(5)
+    assert len(records) == 5 and int(records[-1].values[1]) == 4
+    refused(uem.InputError, "expected a folder on every rank", lambda: s.solve(scratch=tmp_path / "no"))
+    refused(uem.InputTypeError, "scratch = 3: expected a folder", lambda: s.solve(scratch=3))
 
 
 def test_what_is_refused():
