@@ -68,7 +68,7 @@ def thrown(comm=COMM, law=uem.LinearElastic, scheme=None, damped=True, friction=
         return SimpleNamespace(problem=problem, history=history, contact=contact, states=states, J=J)
 
     return SimpleNamespace(
-        V=V, u=u, E=E, rho=rho, viscosity=viscosity, force=force, push=push, grows=grows, velocity=thrown_by, hand=hand, way=way,
+        V=V, u=u, F=F, E=E, rho=rho, viscosity=viscosity, force=force, push=push, grows=grows, velocity=thrown_by, hand=hand, way=way,
         solve=solve,
     )  # fmt: skip
 

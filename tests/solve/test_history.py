@@ -112,6 +112,7 @@ def test_what_is_refused():
         refused(uem.InputError, "expected one history at a time", lambda: record(new))
         run(new)
     refused(uem.InputError, "J has 2 items: expected one for each of the 1 recorded steps", lambda: history.gradient([J, J], []))
+    refused(uem.InputError, "J holds no functional", lambda: history.gradient([None], []))
     refused(uem.InputTypeError, "J[0] = 1.0", lambda: history.gradient([1.0], []))
     with uem.recording(problem()) as history:
         history.problem.contacts[0].friction = 0.0

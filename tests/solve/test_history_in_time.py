@@ -90,6 +90,11 @@ def test_what_is_refused():
     refused(uem.InputError, "expected a problem that is recorded from its first step on", uem.recording(problem).__enter__)
     refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, []))
     history = s.solve().history
-    ask, w = history.gradient, history.problem.dynamics.mean_velocity
-    refused(uem.InputError, "the shape, on which masses depend", lambda: ask(s.u[0] * ufl.dx, ufl.SpatialCoordinate(s.V.mesh)))
+    ask, w, mesh = history.gradient, history.problem.dynamics.mean_velocity, s.V.mesh
+    refused(uem.InputError, "the shape, on which masses depend", lambda: ask(s.u[0] * ufl.dx, ufl.SpatialCoordinate(mesh)))
     refused(uem.InputError, "holds 'mean_velocity'", lambda: ask(w[0] * ufl.dx, []))
+    field = fem.Function(uem.function_space(mesh, ("DG", 0)))
+    field.x.array[:] = 1.0
+    with uem.recording(uem.UnitedProblem(s.F, s.u, dynamics=uem.Dynamics(uem.lumped_mass(s.V, field)))) as history:
+        list(uem.time_steps(history.problem, 0.02, 0.02))
+    refused(uem.InputError, "is a part of the density", lambda: history.gradient(s.u[0] * ufl.dx, field))

@@ -98,21 +98,26 @@ class History:
     ) -> list[Array | fem.Function]:
         """Derivatives of a functional of the recorded steps by parameters of the problem, by one adjoint solve a step (collective).
 
-        Exact for the discrete steps: the derivatives are those of all that is computed, with the contactors that touched, stuck and slipped
-        in each step. A change of a control is the same in all steps; of the values of ``load``, and of Dirichlet values that load steps
-        lead to, it is a change of those at the full load. The problem is left as it is.
+        Exact for the discrete steps: the derivatives are those of all that is computed, with the contactors that touched, stuck and
+        slipped, the points that yielded, and the length of each step. A change of a control is the same in all steps; of the values of
+        ``load``, and of Dirichlet values that load steps lead to, it is a change of those at the full load, or at time 1. The problem is
+        left as it is.
 
         Args:
-            J: functional of ``problem.u`` in the last step and of the controls, as of :func:`uem_dolfinx.gradient`; or a list of
-                functionals, one for each step or None, whose sum is differentiated.
-            controls: as of :func:`uem_dolfinx.gradient`, coefficients of friction among them.
+            J: functional of ``problem.u`` in the last step and of the controls, as of :func:`uem_dolfinx.gradient`; in time also of
+                ``velocity`` and ``acceleration`` of the dynamics; or a list of functionals, one for each step or None, whose sum is
+                differentiated.
+            controls: as of :func:`uem_dolfinx.gradient`, coefficients of friction among them; in time also the Constant that is the
+                density of the mass, and the Function that is the velocity at the start; of ``VonMises`` what was handed over as E,
+                yield_stress and hardening.
 
         Returns:
             As of :func:`uem_dolfinx.gradient`.
 
         Raises:
-            InputError, InputTypeError: see :func:`uem_dolfinx.gradient` and :func:`recording`; if no step was recorded, or where anchors
-                have no derivatives: beside edges of the target in space, and in its corners.
+            InputError, InputTypeError: see :func:`uem_dolfinx.gradient` and :func:`recording`; if no step was recorded; for controls and
+                fields in J of which steps know no derivatives; or where anchors have none: beside edges of the target in space, and in
+                its corners.
             LinearSolveError: if a united matrix is singular.
         """
         problem = self.problem
@@ -169,7 +174,8 @@ class History:
                         f"controls[{k}] is Poisson's ratio of a law with history, by which there is no derivative: expected E, "
                         "yield_stress or hardening"
                     )
-                if m is not density and any(m is one for one in made_of):
+                scales = m is density and isinstance(m, fem.Constant)
+                if not scales and any(m is one for one in made_of):
                     raise InputError(f"controls[{k}] is a part of the density: expected a Constant that is the density itself")
 
     def _functionals(self, J: Any) -> list[ufl.Form | None]:
@@ -186,6 +192,8 @@ class History:
             )
             if len(some) != n:
                 raise InputError(f"J has {len(some)} items: expected one for each of the {n} recorded steps")
+            if all(functional is None for functional in some):
+                raise InputError("J holds no functional: expected one of a step at least")
             for k, functional in enumerate(some):
                 if functional is not None:
                     what = "J" if one else f"J[{k}]"
