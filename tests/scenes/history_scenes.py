@@ -125,7 +125,7 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
     mesh, V = s.mesh, compat.function_space(s.mesh, 1, (g,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     bottom, top = s.tag("bottom", 0, at(g - 1, 0.0)), s.tag("top", 0, at(g - 1, 1.0))
-    E, flow = fem.Constant(mesh, 200.0), fem.Constant(mesh, 0.4)
+    E, nu, flow = (fem.Constant(mesh, value) for value in (200.0, 0.3, 0.4))
     hardening = fem.Function(compat.function_space(mesh, ("DG", 0)))
     hardening.interpolate(lambda x: 15.0 + 5.0 * x[0])
     load, led = fem.Constant(mesh, np.full(g, 0.02)), fem.Constant(mesh, np.zeros(g))
@@ -137,7 +137,7 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
     def solve():
         u.x.array[:] = 0.0
         way = np.array(led.value)
-        law = uem.VonMises(u, E, 0.3, flow, hardening, kind=kind, strain=strain)
+        law = uem.VonMises(u, E, nu, flow, hardening, kind=kind, strain=strain)
         F = law.residual(v) - ufl.inner(load, v) * ufl.dx
         contact = uem.Contact(top, uem.RigidPlane([0.0] * (g - 1) + [1.0], [0.0] * (g - 1) + [-1.0]), friction=friction)
         bcs = [fem.dirichletbc(led, fem.locate_dofs_topological(V, g - 1, bottom.entities), V)]
@@ -153,4 +153,4 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
         J = ufl.inner(u, u) * ufl.dx + ufl.replace(F, {v: w})
         return SimpleNamespace(problem=problem, history=history, contact=contact, states=states, J=J, law=law)
 
-    return SimpleNamespace(V=V, u=u, E=E, flow=flow, hardening=hardening, load=load, led=led, solve=solve)
+    return SimpleNamespace(V=V, u=u, E=E, nu=nu, flow=flow, hardening=hardening, load=load, led=led, solve=solve)

@@ -87,15 +87,22 @@ class PlasticSlopes:
             by: as ``pass_back`` returned it.
             by_bulk: derivative by the values of ``bulk``.
         """
-        points, E = self._points, self._law.parameters["E"]
-        at_points = {"E": by.stiffness / E, "yield_stress": by.yield_stress, "hardening": by.hardening}
-        volumes, of_cells = points.volumes, np.zeros(len(points.cells))
+        points, known = self._points, self._law.parameters
+        volumes, of_cells, E, nu = self._points.volumes, np.zeros(len(points.cells)), known["E"], known["nu"]
+        at_points = {
+            "E": (by.shear + by.area) / E,
+            "nu": by.area / (1 - nu) - by.shear / (1 + nu),
+            "yield_stress": by.yield_stress,
+            "hardening": by.hardening,
+        }
+        # of the bulk modulus, E / 3 / (1 - 2 nu)
+        rates = {"E": 1 / E, "nu": 2 / (1 - 2 * nu)}
+        at = compat.cell_dofs(by_bulk.function_space)[points.cells, 0]
+        of_bulk = by_bulk.x.array[at] * self.bulk.x.array[at]
         for name, value in self._law.handed.items():
             if value is m:
                 of_cells += (at_points[name].reshape(volumes.shape) * volumes).sum(axis=1)
-            if value is m and name == "E":
-                at = compat.cell_dofs(by_bulk.function_space)[points.cells, 0]
-                of_cells += by_bulk.x.array[at] * self.bulk.x.array[at] / E.reshape(volumes.shape)[:, 0]
+                of_cells += of_bulk * (rates[name].reshape(volumes.shape)[:, 0] if name in rates else 0.0)
         if isinstance(m, fem.Constant):
             return np.asarray(reduced(points.mesh.comm, float(of_cells.sum())))
         found = fem.Function(m.function_space)

@@ -21,14 +21,15 @@ class ByReturn:
     Attributes:
         strain, plastic_strain: ``(n, k)``, the latter the committed one.
         peeq: committed ``(n,)``.
-        stiffness: by the logarithm of Young's modulus ``(n,)``.
+        shear, area: by the logarithms of E / (1 + nu), and in plane stress of E / (1 - nu) ``(n,)``.
         yield_stress, hardening: ``(n,)``.
     """
 
     strain: Array
     plastic_strain: Array
     peeq: Array
-    stiffness: Array
+    shear: Array
+    area: Array
     yield_stress: Array
     hardening: Array
 
@@ -57,14 +58,16 @@ def radial_back(
     of_dp[i] = along + by_peeq[i]
     turned = (dp / q[i])[:, None] * (by_flow - 1.5 * along[:, None] * N)
     by_t[i] += (1.5 * of_dp[i] / stiff)[:, None] * N + turned
-    by_log = (by_t * t).sum(axis=1)
-    by_log[i] -= 3 * mu[i] * dp * ((by_stress[i] * N).sum(axis=1) + of_dp[i] / stiff)
+    by_shear = (by_t * t).sum(axis=1)
+    by_shear[i] -= 3 * mu[i] * dp * ((by_stress[i] * N).sum(axis=1) + of_dp[i] / stiff)
     by_t[:, :3] -= by_t[:, :3].mean(axis=1, keepdims=True)
     by_strain = 2 * mu[:, None] * by_t
     by_yield, by_hardening = np.zeros_like(q), np.zeros_like(q)
     by_yield[i] = -of_dp[i] / stiff
     by_hardening[i] = by_yield[i] * (peeq[i] + dp)
-    return ByReturn(by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_log, by_yield, by_hardening)
+    return ByReturn(
+        by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_shear, 0.0 * q, by_yield, by_hardening
+    )
 
 
 def plane_stress_back(
@@ -78,7 +81,7 @@ def plane_stress_back(
     flow = yield_stress + hardening * peeq
     i = np.flatnonzero(plane_mises(m[0] ** 2, m[1] ** 2 + m[2] ** 2) > (1 + ON_SURFACE) * flow)
     by_m = MODES @ by_stress.T
-    by_yield, by_hardening, by_log = np.zeros_like(E), np.zeros_like(E), np.zeros_like(E)
+    by_yield, by_hardening = np.zeros_like(E), np.zeros_like(E)
     b, H, r, third = shear[i], hardening[i], (area / shear)[i] / 3, np.array([[3.0], [1.0], [1.0]])
     after = plane_stress_return(strain, plastic_strain, peeq, E, nu, yield_stress, hardening, np.zeros_like(E))
     t, e = MODES @ after.stress[i].T, MODES @ by_plastic_strain[i].T
@@ -93,10 +96,15 @@ def plane_stress_back(
     by_x = flowed + by_peeq[i] * q / (1.5 * b) + (by_t * t_x).sum(axis=0)
     h_x = slope - flow[i] / q**2 * (of_q * t_x).sum(axis=0)
     root = by_x / h_x
-    by_m[:, i] = shrunk * (by_t + root * flow[i] / q**2 * of_q)
+    by_t = by_t + root * flow[i] / q**2 * of_q
+    by_m[:, i] = shrunk * by_t
     by_yield[i] = -root / q
     by_hardening[i] = by_yield[i] * peeq[i] - root * 2 * x / (3 * b)
-    by_log += (by_m * m).sum(axis=0)
-    by_log[i] += root * slope * x - x * flowed - by_peeq[i] * x * q / (1.5 * b)
+    by_area, by_shear = by_m[0] * m[0], (by_m[1:] * m[1:]).sum(axis=0)
+    of_ratio = -r * x * y * t[0] * by_t[0]
+    by_area[i] += of_ratio
+    by_shear[i] += root * slope * x - x * flowed - by_peeq[i] * x * q / (1.5 * b) - of_ratio
     by_strain = (MODES.T @ (C * by_m)).T
-    return ByReturn(by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_log, by_yield, by_hardening)
+    return ByReturn(
+        by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_shear, by_area, by_yield, by_hardening
+    )

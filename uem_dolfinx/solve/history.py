@@ -108,8 +108,8 @@ class History:
                 ``velocity`` and ``acceleration`` of the dynamics; or a list of functionals, one for each step or None, whose sum is
                 differentiated.
             controls: as of :func:`uem_dolfinx.gradient`, coefficients of friction among them; in time also the Constant that is the
-                density of the mass, and the Function that is the velocity at the start; of ``VonMises`` what was handed over as E,
-                yield_stress and hardening.
+                density of the mass, and the Function that is the velocity at the start; of ``VonMises`` its parameters as they were
+                handed over.
 
         Returns:
             As of :func:`uem_dolfinx.gradient`.
@@ -168,11 +168,6 @@ class History:
                 if isinstance(m, fem.Function) and material_of(m) is not None:
                     raise InputError(
                         f"controls[{k}] is '{m.name}', a field of a law with history: expected what the problem is made of"
-                    )
-                if any(m is law.handed["nu"] for law in self._laws):
-                    raise InputError(
-                        f"controls[{k}] is Poisson's ratio of a law with history, by which there is no derivative: expected E, "
-                        "yield_stress or hardening"
                     )
                 scales = m is density and isinstance(m, fem.Constant)
                 if not scales and any(m is one for one in made_of):
