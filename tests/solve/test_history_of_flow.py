@@ -97,7 +97,7 @@ def test_a_bar_that_flows():
 @pytest.mark.parametrize("k", [3, 4, 6])
 def test_slopes_of_returns(k):
     """Of every return by strain, history and parameters, where points flow and where they do not, against central differences."""
-    rng, n = np.random.default_rng(1), 40
+    rng, n, none = np.random.default_rng(1), 40, np.zeros(40)
     returned, back = (plane_stress_return, plane_stress_back) if k == 3 else (radial_return, radial_back)
     E, nu = 200.0 * (1.0 + rng.random(n)), np.full(n, 0.3)
     strain, plastic, deviatoric = rng.normal(size=(n, k)) * 2e-3, rng.normal(size=(n, k)) * 1e-3, rng.normal(size=(n, k)) * 1e-3
@@ -114,10 +114,10 @@ def test_slopes_of_returns(k):
 
     def counted(values):
         """What counts after a return."""
-        found = returned(*arguments(values))
+        found = returned(*arguments(values), none)
         return (found.stress * counts[0] + found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
 
-    flows = returned(*arguments(begin)).peeq > begin[2]
+    flows = returned(*arguments(begin), none).peeq > begin[2]
     assert 5 < flows.sum() < n - 5
     by = back(*arguments(begin), *counts)
     found = by.strain, by.plastic_strain, by.peeq, (by.shear + by.area) / E, by.area / (1 - nu) - by.shear / (1 + nu)
@@ -136,6 +136,9 @@ def test_what_is_refused():
     finite = uem.FinitePlasticity(s.u, 200.0, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(finite.residual(v), s.u, materials=[finite])
     refused(uem.InputError, "through what FinitePlasticity remembers", uem.recording(problem).__enter__)
+    law = uem.VonMises(s.u, 200.0, 0.3, 0.4, kinematic_hardening=1.0, kind="plane_strain")
+    problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
+    refused(uem.InputError, "expected VonMises without back stresses", uem.recording(problem).__enter__)
     law = uem.VonMises(s.u, s.E, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
     refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))
