@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import numpy as np
 import ufl
 from dolfinx import fem
 from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
@@ -91,6 +92,15 @@ def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
         if any(other != own for other in ufl.domain.extract_domains(part)):
             held = f"'{part.name}'" if isinstance(part, fem.Function) else given.described(part)
             raise SpaceError(f"{what} holds {held} of another mesh: expected all of {mesh}; make both on one mesh")
+
+
+def check_parts(what: str, form: ufl.Form, u: fem.Function) -> None:
+    """Refuse a form of ``u.sub(i)``, of which derivatives by u would know nothing, by an InputError."""
+    for f in form.coefficients():
+        if f is not u and isinstance(f, fem.Function) and np.may_share_memory(f.x.array, u.x.array):
+            raise InputError(
+                f"{what} holds u.sub(i) of the mixed Function u, by which it is not differentiated: expected ufl.split(u)[i]"
+            )
 
 
 def _mesh(domain: Any) -> str:

@@ -273,8 +273,12 @@ def test_what_is_not_there_among_other_fields():
     problem = uem.UnitedProblem(F, f.w, displacement=0, bcs=bcs)
     refused(uem.InputError, ("arc length", "leave arc_length out"), lambda: list(uem.load_steps(problem, 2, arc_length=True)))
     run(problem)
-    J = f.w[0] * ufl.dx
-    refused(uem.InputError, ("gradients", "differences"), lambda: uem.gradient(problem, J, [fem.Constant(b.scene.mesh, 1.0)]))
+
+    def record():
+        with uem.recording(problem):
+            pass
+
+    refused(uem.InputError, ("gradients of histories", "differences"), record)
 
 
 def heated(mu=0.3):

@@ -43,6 +43,20 @@ def test_forward_and_adjoint_agree(cell, degree, coupling, rigid, law):
     assert uem.integrate(ufl.algorithms.expand_derivatives(explicit)) == pytest.approx(adjoint, rel=1e-11)
 
 
+def test_a_tangent_that_is_not_symmetric():
+    """Under a pressure that follows the surface the adjoint problem has the transposed matrix."""
+    b = blocks(COMM, "triangle", 2, 3, overhang=0.25)
+    E, v = fem.Constant(b.scene.mesh, 1.0), ufl.TestFunction(b.V)
+    push = ufl.cofac(ufl.Identity(2) + ufl.grad(b.u)) * ufl.FacetNormal(b.scene.mesh)
+    F = uem.NeoHooke(E, 0.3, kind="plane_strain").residual(b.u, v) * ufl.dx + 0.2 * ufl.inner(push, v) * uem.ds(b.top)
+    bcs = [*clamp(b.V, b.bottom), uem.dirichlet(b.V, b.high, 0)]
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[uem.Contact(b.high, b.low)], rtol=1e-13)
+    run(problem)
+    J = ufl.inner(b.u, b.u) * ufl.dx
+    (by,), du = uem.gradient(problem, J, E), uem.tangent(problem, [(E, 1.0)])
+    assert uem.integrate(ufl.derivative(J, b.u, du)) == pytest.approx(float(by), rel=1e-11)
+
+
 @pytest.mark.parametrize("coupling", [pytest.param("node_to_surface", marks=pytest.mark.slow), "mortar"])
 def test_a_body_that_contact_alone_holds(coupling):
     """A block that lies on another by its weight stays where it is across it: derivatives along that motion are zero, others right."""

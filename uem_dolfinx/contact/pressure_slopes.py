@@ -85,7 +85,7 @@ class PressureSlopes:
 
         Args:
             multipliers: changes of those of the pair's equations ``(m,)``.
-            du: change of the displacement.
+            du: change of the displacement, and of all other fields.
             shape: of the places of the nodes where they were drawn, in the displacement's space.
         """
         config, nodes, kinematics, p = self._config, self._pair.nodes, self._pair.kinematics, self._pressures
@@ -93,11 +93,11 @@ class PressureSlopes:
         if self.contact.contactor.dim > 0:
             V = compat.function_space(config.mesh, config.degree)
             area = self.contact.surface.integral(ufl.TestFunction(V), self._current)
-            for by, change in ((config.u, du), (ufl.SpatialCoordinate(config.mesh), shape)):
+            for by, change in ((config.whole, du), (ufl.SpatialCoordinate(config.mesh), shape)):
                 if (form := forms.expanded(ufl.derivative(area, by, change))) is not None:
                     areas += forms.assemble_array(V, forms.form(form))[nodes]
         slopes = self._over * (lam - p * kinematics.areas_along(areas))
         if self._stretching is not None:
             drawn = shape.x.array.reshape(-1, config.gdim)
-            slopes += p * self._stretching.along(du.x.array.reshape(-1, config.gdim) + drawn, drawn)
+            slopes += p * self._stretching.along(config.of(du.x.array) + drawn, drawn)
         return slopes

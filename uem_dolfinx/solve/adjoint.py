@@ -22,6 +22,7 @@ has a further load that moves contactors against their targets, by which the for
 
 Parameters of a contact change gaps and contact forces alone: c closes the gaps, and what forces at the same multipliers change by counts
 as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/du``, and (K + G)' stands for (K + G) in what goes back.
+Among other fields u is all of them; contacts, and the places of nodes, have a part in the displacement's rows alone.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
@@ -46,7 +48,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.derivatives import Derivatives, along
+from uem_dolfinx.solve.derivatives import Derivatives, along, transposed, values_in
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState, Rows
 from uem_dolfinx.solve.system import CLOSED, BodySystem
@@ -57,7 +59,7 @@ class Motion(NamedTuple):
     """What moves with changes of controls.
 
     Attributes:
-        du: change of the displacement.
+        du: change of the displacement, and of all other fields.
         shape: of the places of the nodes where they were drawn.
         reactions: of the forces that contacts and Dirichlet conditions bear, on the bodies.
     """
@@ -85,8 +87,11 @@ class Linearised:
 
     def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None):
         self.problem, self.config, self.ramp = problem, problem.config, 1.0
+        self.K = self._K_back = problem.bodies.tangent.K
+        # of the displacement's components here, which are the first of vectors
+        self._n = problem.config.n_owned * problem.config.gdim
         self.F = problem.bodies.F
-        self.derivatives = derivatives or Derivatives(self.F, problem.config.V)
+        self.derivatives = derivatives or Derivatives(self.F, problem.u.function_space, problem.config.V)
 
     def __enter__(self) -> Linearised:
         try:
@@ -102,6 +107,7 @@ class Linearised:
         # no step begins: a factorisation of the same matrix goes on serving
         system.linearise(state, 1)
         self.K, self.G = self.problem.bodies.tangent.K, system.curvature
+        self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
         self._tell_idle()
 
     def _state(self) -> BodyState:
@@ -134,7 +140,7 @@ class Linearised:
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
         # multigrid learns from one matrix for the next, and steps may not depend on whether a gradient was asked for
-        if solver.iterative or not solver.lasting:
+        if solver.iterative or not solver.lasting or self._K_back is not self.K:
             self.problem.system.forget()
         self.problem.restore()
 
@@ -156,8 +162,19 @@ class Linearised:
         parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.rows.equations)]
         return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
 
+    def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
+        """A vector with what the displacement's owned nodes have ``(n_owned, gdim)``, zero in other fields."""
+        v = self.config.unknowns.vector()
+        v.array[: self._n] = np.ravel(at_nodes)
+        return v
+
+    def assembled(self, form: ufl.Form) -> Array:
+        """A linear form of all unknowns in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        values = forms.assemble_array(self.problem.u.function_space, forms.form(form))
+        return np.asarray(self.config.rows(values).ravel())
+
     def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``P dq`` under forces: symmetric, since P is Q without friction (collective)."""
+        """``P dq`` under forces, P being Q without friction (collective)."""
         # as accurately as an iterative solver can
         dq, _ = self.problem.solver.solve(self.P.transpose(forces))
         return self.P.expand(dq)
@@ -165,7 +182,9 @@ class Linearised:
     def held(self, v: PETSc.Vec) -> PETSc.Vec:
         """Without what bodies that contact alone holds move along it, where steps leave them; its own transpose (collective)."""
         assert isinstance(self.problem.system, BodySystem)
-        return self.config.vector(self.problem.system.floating.without_open_motions(np.array(v.array_r)))
+        out = v.copy()
+        out.array[: self._n] = self.problem.system.floating.without_open_motions(np.array(v.array_r[: self._n]))
+        return out
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
         """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
@@ -173,6 +192,8 @@ class Linearised:
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""
+        if self._K_back is not self.K:
+            self.problem.solver.set_operator(self.P, self._K_back, self.G)
         return self.solve(forces)
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
@@ -181,11 +202,11 @@ class Linearised:
 
     def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
         """``(K + G)' a`` (collective)."""
-        return self.stiffness(a)
+        return forms.product(self._K_back, a, self.G)
 
     def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
         """``K' a`` (collective)."""
-        return forms.product(self.K, a)
+        return forms.product(self._K_back, a)
 
     def share(self, m: Control) -> float:
         """How much of a change of a control the state has seen: all of it, unless load steps lead there."""
@@ -219,35 +240,34 @@ class Linearised:
             nodes, force = pair.nodal_forces(pair.trial)
             pushed = config.add_at_owners(nodes, turned_by(entry, force))
         if (stiffness := self.stiffness_of([k])) is not None:
-            pushed = pushed + forms.product(stiffness, config.vector(b)).array_r.reshape(-1, config.gdim)
+            pushed = pushed + forms.product(stiffness, self.vector(b)).array_r[: self._n].reshape(-1, config.gdim)
         return gaps, -pushed
 
     def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
         """What moves with changes of controls (collective)."""
-        config = self.config
-        forces, prescribed, shape = config.vector(), np.zeros((config.n_owned, config.gdim)), fem.Function(config.V)
+        config, bodies = self.config, self.problem.bodies
+        forces, prescribed, shape = self.vector(), np.zeros(bodies.free_rows.shape), fem.Function(config.V)
         gaps = np.zeros_like(self.multipliers)
         for m, change in direction:
             if isinstance(m, ContactParameter):
                 for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):
                     opened, pushed = self.changes(m, entry)
                     gaps += size * opened
-                    forces.array[:] -= size * pushed.ravel()
+                    forces.array[: self._n] -= size * pushed.ravel()
                 continue
             if isinstance(m, ufl.SpatialCoordinate):
-                shape.x.array[:] += change.x.array
+                shape.x.array[:] += values_in(config.V, change)
                 if (form := forms.expanded(ufl.derivative(self.F, m, change))) is not None:
-                    forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
+                    forces.array[:] -= self.assembled(form)
                 continue
             if (form := along(self.F, m, change)) is not None:
-                forces.array[:] -= forms.assemble_array(config.V, forms.form(form))
-            values = change.x.array if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
+                forces.array[:] -= self.assembled(form)
+            values = values_in(m.function_space, change) if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
             prescribed += self.prescribed_by(m, values)
         shape.x.scatter_forward()
-        drawn = config.vector(shape.x.array[: config.n_owned * config.gdim])
+        drawn = self.vector(shape.x.array[: self._n])
         forces.axpy(1.0, forms.product(self.K, drawn))
-        held = ~self.problem.bodies.free[: config.n_owned]
-        c = self.P.carried(prescribed + np.where(held, drawn.array_r.reshape(-1, config.gdim), 0.0))
+        c = self.P.carried(prescribed + np.where(bodies.free_rows, 0.0, drawn.array_r.reshape(-1, config.gdim)))
         c.axpy(-1.0, self.P.read_back(gaps))
         way = self.solve(forces - self.stiffness(c))
         way.axpy(1.0, c)
@@ -255,9 +275,9 @@ class Linearised:
         return Motion(self.function(self.held(way - drawn)), shape, reactions)
 
     def function(self, v: PETSc.Vec) -> fem.Function:
-        """A Function of the displacement's space with these values (collective)."""
-        f = fem.Function(self.config.V)
-        f.x.array[: len(v.array_r)] = v.array_r
+        """A Function of the problem's space with these values (collective)."""
+        f, values = fem.Function(self.problem.u.function_space), self.config.from_rows(v.array_r)
+        f.x.array[: len(values)] = values
         f.x.scatter_forward()
         return f
 
@@ -273,8 +293,8 @@ class Linearised:
         return found
 
     def prescribed_by(self, m: Any, values: Array) -> Array:
-        """What the ``values`` of a control make of the Dirichlet values of the owned components, zero where free ``(n_owned, gdim)``."""
-        bodies, config, found = self.problem.bodies, self.config, []
+        """What the ``values`` of a control make of Dirichlet values in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        bodies, found = self.problem.bodies, []
         before = np.array(forms.values_of(m))
         for now in (values, 0.0 * values):
             out = np.zeros(len(self.problem.u.x.array))
@@ -282,7 +302,8 @@ class Linearised:
             compat.set_bc_values(out, bodies.bcs)
             found.append(out)
         forms.values_of(m)[...] = before
-        return np.where(bodies.free, 0.0, (found[0] - found[1]).reshape(-1, config.gdim))[: config.n_owned]
+        change = np.where(bodies.held, found[0] - found[1], 0.0)
+        return np.asarray(self.config.rows(change[: len(bodies.residual_of_all)]))
 
 
 class Adjoint:
@@ -295,41 +316,41 @@ class Adjoint:
         handed: derivative by the places of the owned nodes through what later steps remember of them ``(n_owned, gdim)``.
 
     Attributes:
-        a: what forces do to J, less what they do to contact forces by themselves, a Function of the displacement's space.
+        a: what forces do to J, less what they do to contact forces by themselves, a Function of the problem's space.
         left: derivative by a change of the displacement with everything else at rest, what the adjoint forces have not taken up.
         terms: J with its areas, and the work of the residual along a, with their signs.
-        by_values: derivative of J by the prescribed displacement of every owned component, zero where free ``(n_owned, gdim)``.
+        by_values: derivative of J by the prescribed value of every component of vectors, zero where free ``(n_rows, gdim)``.
     """
 
     def __init__(self, at: Linearised, J: ufl.Form | None, pressing: Sequence[Contact] = (), handed: npt.ArrayLike | float = 0.0):
         self.at, self.config = at, at.config
         config, functionals, weights = at.config, [] if J is None else [J], {}
-        now, drawn = config.vector(), config.vector()
+        now, drawn = at.vector(), at.vector()
         for contact in pressing:
             p = contact.pressure
             of_p = at.derivatives.by_values(functionals[0], p)
             found = at.pressures(contact).back(np.zeros(len(contact.nodes)) if of_p is None else of_p[contact.nodes])
             weights[contact] = found.multipliers
             functionals += [] if found.areas is None else [found.areas]
-            now.array[:] += found.now.ravel()
-            drawn.array[:] += found.drawn.ravel()
-        of_u = config.vector()
+            now.axpy(1.0, at.vector(found.now))
+            drawn.axpy(1.0, at.vector(found.drawn))
+        of_u = at.vector()
         for functional in functionals:
             if (part := at.derivatives.by_values(functional, at.problem.u, at.derivatives.test)) is not None:
-                of_u.array[:] += part
+                of_u.array[:] += config.rows(part).ravel()
         of_u = at.held(of_u)
         lift = at.lift(weights)
-        drive = of_u + at.stiffness(lift) + now + config.vector(handed)
-        along = at.solve_back(drive)
-        left = along - lift
+        drive = of_u + at.stiffness_back(lift) + now + at.vector(handed)
+        whole = at.solve_back(drive)
+        left = whole - lift
         self.a = at.derivatives.a
         self.terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
-        held = ~at.problem.bodies.free[: config.n_owned]
-        self.left = drive - at.stiffness_back(along)
-        at.derivatives.along(left)
-        self.by_values = np.where(held, at.P.carried_back(self.left), 0.0)
+        self.left = drive - at.stiffness_back(whole)
+        at.derivatives.along(config.from_rows(left.array_r))
+        self.by_values = np.where(at.problem.bodies.free_rows, 0.0, at.P.carried_back(self.left))
         #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
-        self._by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
+        by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
+        self._by_places = by_places[: config.n_owned * config.gdim]
 
     @cached_property
     def by_gaps(self) -> Array:
@@ -347,7 +368,7 @@ class Adjoint:
     def _by_contact(self, m: ContactParameter) -> Array:
         """An array of its shape."""
         found = np.zeros(m.shape(self.config.gdim))
-        a = self.a.x.array[: self.config.n_owned * self.config.gdim].reshape(-1, self.config.gdim)
+        a = self.config.of(self.a.x.array)[: self.config.n_owned]
         for entry in np.ndindex(found.shape):
             opened, pushed = self.at.changes(m, entry)
             found[entry] = self.by_gaps @ opened - (a * pushed).sum()

@@ -19,7 +19,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
-from uem_dolfinx.form_checks import check_linear
+from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
 
@@ -36,6 +36,7 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
         InputTypeError, InputError, SpaceError: each with the remedy.
     """
     check_linear(what, F, u.function_space)
+    check_parts(what, F, u)
     for part in chain.from_iterable(traverse_unique_terminals(integral.integrand()) for integral in F.integrals()):
         if isinstance(part, ScalarValue) and not np.isfinite(complex(part)):
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")

@@ -1,4 +1,7 @@
-"""Derivatives of forms by controls, differentiated and compiled once for all states that they are assembled at."""
+"""Derivatives of forms by controls, differentiated and compiled once for all states that they are assembled at.
+
+Beside them transposed matrices, and values of Functions in spaces that are numbered otherwise.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from uem_dolfinx import forms
+from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 
 #: Forms whose derivatives are added up, each with its sign.
@@ -22,24 +25,25 @@ class Derivatives:
 
     Args:
         F: residual, in UFL.
-        V: space of its test function.
+        W: space of its test function.
+        V: of the displacement, by whose nodes places are told.
 
     Attributes:
         test: test function of F.
-        a: the field, a Function of V.
+        a: the field, a Function of W.
         work: F along it, a functional.
     """
 
-    def __init__(self, F: ufl.Form, V: fem.FunctionSpace):
-        self.test, self.a = F.arguments()[0], fem.Function(V)
+    def __init__(self, F: ufl.Form, W: fem.FunctionSpace, V: fem.FunctionSpace):
+        self.test, self.a, self._V = F.arguments()[0], fem.Function(W), V
         self.work = ufl.replace(F, {self.test: self.a})
         self._comm = V.mesh.comm
         #: Compiled derivatives, None for those that vanish, with the form and the control that their keys number.
         self._known: dict[tuple[Any, ...], tuple[Any, ufl.Form, Any]] = {}
 
-    def along(self, a: PETSc.Vec) -> None:
+    def along(self, values: Array) -> None:
         """Take the residual's work along a field with these owned values (collective)."""
-        self.a.x.array[: len(a.array_r)] = a.array_r
+        self.a.x.array[: len(values)] = values
         self.a.x.scatter_forward()
 
     def _compiled(self, form: ufl.Form, m: Any, make: Callable[[], ufl.Form | None], *which: Any) -> Any:
@@ -73,7 +77,7 @@ class Derivatives:
 
     def by_places(self, terms: Terms, X: ufl.SpatialCoordinate) -> fem.Function:
         """Derivative by the places of the nodes that integrals are taken over, a Function of V (collective)."""
-        V = self.a.function_space
+        V = self._V
 
         def by(form: ufl.Form) -> Array | None:
             found = self._compiled(form, X, lambda: forms.expanded(ufl.derivative(form, X, ufl.TestFunction(V))))
@@ -87,6 +91,24 @@ class Derivatives:
                 found.x.array[: len(values)] += sign * values
         found.x.scatter_forward()
         return found
+
+
+def transposed(A: PETSc.Mat) -> PETSc.Mat:
+    """A matrix of its own."""
+    out = PETSc.Mat()
+    A.transpose(out)
+    return out
+
+
+def values_in(V: Any, f: fem.Function) -> Array:
+    """Local values of f as its element's space V numbers them: spaces made from parts of a mixed one are numbered otherwise."""
+    places = []
+    for space in (V, f.function_space):
+        block = space.dofmap.index_map_bs
+        places.append(compat.cell_dofs(space)[:, :, None] * block + np.arange(block))
+    values = np.zeros(len(f.x.array))
+    values[places[0]] = f.x.array[places[1]]
+    return values
 
 
 def derivative(form: ufl.Form, m: fem.Function, direction: Any) -> ufl.Form | None:

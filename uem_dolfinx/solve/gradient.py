@@ -17,7 +17,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.errors import InputError, InputTypeError
-from uem_dolfinx.form_checks import Control, check_functional
+from uem_dolfinx.form_checks import Control, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.checks import refuse_other_fields
@@ -38,10 +38,11 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     on curved rigid surfaces, it is as exact as Newton's tangent. The state is left as it is.
 
     Args:
-        problem: in statics, without friction and without laws with history; its last step is the state.
+        problem: in statics, without friction, heat through contacts and laws with history; its last step is the state.
         J: functional of ``problem.u``, of the ``pressure`` of the problem's contacts and of the controls, a UFL form without test
-            functions. The force with which Dirichlet conditions hold a part, or that contacts exert on one, is a functional of
-            ``problem.u``: ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
+            functions. Among other fields ``problem.u`` is the mixed Function, and J holds parts of ``ufl.split(problem.u)``. The force
+            with which Dirichlet conditions hold a part, or that contacts exert on one, is a functional of ``problem.u``:
+            ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
         controls: Constants and Functions that F, J or the values of Dirichlet conditions are made of: moduli, loads, fields of moduli,
             prescribed displacements. A Function is taken by its degrees of freedom; ``ufl.SpatialCoordinate(mesh)`` stands for the places
             of the nodes: the shape; a ``ContactParameter`` is the offset of a contact, or the place or the turn of its rigid target.
@@ -61,6 +62,7 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     with agreed(problem.comm):
         given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
         check_functional("J", J)
+        check_parts("J", J, problem.u)
     pressing = _check_results(problem, J)
     from uem_dolfinx.solve.adjoint import Adjoint, Linearised
 
@@ -71,6 +73,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 
 def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]], of: fem.Function | None = None) -> fem.Function:
     """How the displacement, or a contact pressure, changes with parameters of the problem, by one solve (collective).
+
+    Among other fields the displacement and these are told, as one Function of the mixed space.
 
     Args:
         problem: as of :func:`gradient`.
@@ -120,7 +124,10 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
     """Refuse problems whose equations do not tell derivatives, and those of all steps unless they are ``recorded`` (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
-        refuse_other_fields(problem.config, "gradients", "take differences of two solutions")
+        if recorded or not problem.config.moves:
+            refuse_other_fields(
+                problem.config, "gradients of histories" if recorded else "gradients", "take differences of two solutions"
+            )
         if problem.bodies.dead is not None:
             raise InputError("forces that a step has not released yet depend on all steps, whose derivatives are not known")
         for present, what in (
@@ -135,6 +142,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
                 )
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
+        if any(contact.heat is not None for contact in problem.contacts):
+            raise InputError("gradients do not know heat that passes through a contact: expected contacts without heat")
         if any(contact.tied for contact in problem.contacts):
             raise InputError("gradients do not know how a tie changes with what it ties: expected contacts that are not tied")
         if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
@@ -175,7 +184,13 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
     """The contacts whose pressures J holds; refuse other results of contacts, and those of other problems (collective)."""
     results = [f for f in J.coefficients() if _is_result(f)]
     pressures = [contact.pressure for contact in problem.contacts] if results else []
+    copies = problem.config.functions().values() if problem.config.unknowns.mixed else []
     with agreed(problem.comm):
+        for f in J.coefficients():
+            if any(f is copy for copy in copies):
+                raise InputError(
+                    f"J holds '{f.name}', a copy of a part of the unknowns u: expected ufl.split(u), which J depends on"
+                )
         for f in results:
             if all(f is not pressure for pressure in pressures):
                 raise InputError(

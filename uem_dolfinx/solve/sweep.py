@@ -33,7 +33,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.adjoint import Adjoint, Linearised
-from uem_dolfinx.solve.derivatives import Derivatives
+from uem_dolfinx.solve.derivatives import Derivatives, transposed
 from uem_dolfinx.solve.gradient import AnyControl
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -56,7 +56,7 @@ class Sweep:
     def __init__(self, problem: UnitedProblem, controls: Sequence[AnyControl]):
         self.problem, self._controls = problem, controls
         self.found: list[Any] = [None] * len(controls)
-        self._derivatives = Derivatives(problem.bodies.F, problem.config.V)
+        self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
         self._by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
         self._rates = None if problem.dynamics is None else RateSlopes(problem.dynamics)
         laws: list[Any] = problem.materials
@@ -208,8 +208,8 @@ class LinearisedStep(Linearised):
         forms.free_petsc_garbage(problem.comm)
         self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of(range(len(pairs)))
         K = self.K
-        back = _transposed(K) if not is_symmetric(K, self.config.unknowns) else K
-        self._K_back, self._G_back = back, None if self.G is None else _transposed(self.G)
+        back = transposed(K) if not is_symmetric(K, self.config.unknowns) else K
+        self._K_back, self._G_back = back, None if self.G is None else transposed(self.G)
         problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
         self._tell_idle()
 
@@ -274,7 +274,7 @@ def share_of(problem: UnitedProblem, m: Any, factor: float) -> float:
 
 def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) -> Array | float:
     """Derivative of the work of damping along ``a``, which ``derivatives`` take, by the velocity ``(n,)``; 0 without (collective)."""
-    derivatives.along(a)
+    derivatives.along(problem.config.from_rows(a.array_r))
     if problem.dynamics is None or problem.dynamics.damping is None:
         return 0.0
     found = derivatives.by_values(derivatives.work, problem.dynamics.past)
@@ -303,10 +303,3 @@ def _left_behind(problem: UnitedProblem, m: ContactParameter, handed: Array) -> 
     for entry in np.ndindex(found.shape) if m.parameter in ("place", "turn") else ():
         found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
     return np.asarray(reduced(problem.comm, found))
-
-
-def _transposed(A: PETSc.Mat) -> PETSc.Mat:
-    """A matrix of its own."""
-    out = PETSc.Mat()
-    A.transpose(out)
-    return out
