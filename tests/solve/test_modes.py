@@ -9,11 +9,12 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from helpers import at, blocks, box, clamp, linear, modulus, refused, run, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 
 pytest.importorskip("slepc4py")
 COMM = MPI.COMM_WORLD
@@ -45,6 +46,44 @@ def test_a_bar():
     vectors = [problem.config.vector(f.x.array[: mass.M.getLocalSize()[0]]) for f in found.functions]
     gram = np.array([[a.dot(mass.M * b) for b in vectors] for a in vectors])
     assert np.abs(gram - np.eye(3)).max() <= 1e-8
+
+
+def test_a_bar_with_a_pressure_of_its_own():
+    """Constant in cells it changes no frequency, touching a wall; a temperature that strains the bar is refused."""
+    s, V, _, _ = column(4)
+    for field, strains in ((("DG", 0), False), (1, True)):
+        W = uem.function_space(s.mesh, [field, ("Lagrange", 1, (2,))])
+        w, (q, v), lam = fem.Function(W), ufl.TestFunctions(W), E / 3
+        p, u = ufl.split(w)
+        F = (2 * lam * ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) - p * ufl.div(v)) * ufl.dx
+        F -= ((0.1 if strains else 1.0) * ufl.div(u) * q + p / lam * q) * ufl.dx
+        bcs = [bc for x in (0.0, 0.1) for bc in clamp(W.sub(1), s.tag("side", 0, at(0, x)), 0)]
+        bcs += [*clamp(W.sub(1), s.tag("foot", 0, at(1, -1.0)), 1)]
+        contact = uem.Contact(s.tag("head", 0, at(1, 1.0)), uem.RigidPlane((0.0, 0.99), (0.0, -1.0)), max_penetration=np.inf)
+        problem = uem.UnitedProblem(F, w, displacement=1, bcs=bcs, contacts=[contact])
+        run(problem)
+        mass = uem.consistent_mass(V, RHO)
+        if strains:
+            refused(uem.InputError, "symmetric tangent", lambda problem=problem, mass=mass: uem.modes(problem, 1, mass=mass))
+            continue
+        found = uem.modes(problem, 3, mass=mass)
+        assert contact.n_active == 2
+        assert np.allclose(found.frequencies, discrete(np.arange(1, 4) * np.pi / 2.0 / 4, 0.25), rtol=1e-9)
+        # in each the pressure is that of its strain
+        pressure = [
+            uem.integrate((p + lam * ufl.div(u)) ** 2 * ufl.dx) / uem.integrate(p**2 * ufl.dx)
+            for p, u in map(ufl.split, found.functions)
+        ]
+        assert max(pressure) < 1e-12
+
+
+def test_a_mass_that_is_numbered_otherwise():
+    """That of a collapsed part of the mixed space would be at other nodes."""
+    W = uem.function_space(mesh.create_unit_square(COMM, 3, 3), [("Lagrange", 2, (2,)), 1])
+    config, own = ConfigurationAmongFields(fem.Function(W), 0), uem.function_space(W.mesh, 2, (2,))
+    uem.Dynamics(uem.lumped_mass(own, RHO)).attach(config)
+    other = uem.Dynamics(uem.lumped_mass(W.sub(0).collapse()[0], RHO))
+    refused(uem.SpaceError, "numbered otherwise", lambda: other.attach(config))
 
 
 def test_a_periodic_column():

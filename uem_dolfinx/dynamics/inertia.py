@@ -115,9 +115,10 @@ class Dynamics:
                 f"the mass has {self.mass.M.getSize()[0]} rows, the displacement {wanted[1]} components: make the mass with the "
                 "function space of the displacement"
             )
-        elif not compat.is_on(self.mass.config.V, config.mesh):
+        elif not config.numbers_as(self.mass.config.V):
             error = SpaceError(
-                "the mass is of another mesh than the displacement: make it with the function space of the displacement"
+                "the mass is of another mesh than the displacement, or numbered otherwise, as a collapsed part of a mixed space: make it "
+                "with the function space of the displacement, or uem.function_space(mesh, degree, (gdim,))"
             )
         # on other ranks the parts may be equally large by chance
         agree(config.comm, error)

@@ -70,6 +70,10 @@ class Configuration(Nodes):
         """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)`` (a view)."""
         return values.reshape(-1, self.block)
 
+    def numbers_as(self, V: Any) -> bool:
+        """Whether vectors of another space are those of the displacement's: of the same mesh and numbering, on this rank."""
+        return compat.is_on(V, self.mesh) and np.array_equal(compat.cell_dofs(V), compat.cell_dofs(self.V))
+
     def rows(self, values: AnyArray) -> Any:
         """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)`` (a view)."""
         return values.reshape(-1, self.block)

@@ -3,7 +3,8 @@
     Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    t . (u + du - u0) = s,    F_lam = dF/dlam
 
 with t the direction in which the last step went: Riks' method, the constraint a plane, solved with the one united matrix and two
-right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551].
+right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are those of the displacement: fields
+beside it follow, and have no part in t, whatever their units are.
 """
 
 from __future__ import annotations
@@ -50,11 +51,13 @@ class ArcLength:
         assert isinstance(problem.system, BodySystem)
         self._problem, self._system, self._bodies = problem, problem.system, problem.bodies
         self.factor = 0.0
-        self._direction, self._length = np.zeros(problem.config.n_owned * problem.config.gdim), 0.0
+        #: Number of the displacement's components here, which are the first of vectors.
+        self._n = problem.config.n_owned * problem.config.gdim
+        self._direction, self._length = np.zeros(self._n), 0.0
         #: Displacement at the beginning of the step.
         self._start = self._bodies.displacement()
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
-        self._change, self._slope = 0.0, problem.config.vector()
+        self._change, self._slope = 0.0, problem.config.unknowns.vector()
         self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
         self.accelerate, self.forget = self._system.accelerate, self._system.forget
         self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
@@ -65,7 +68,7 @@ class ArcLength:
 
         Args:
             factor: committed load factor.
-            direction: of unit length over all ranks, at the owned components.
+            direction: of unit length over all ranks, at the displacement's owned components.
             length: how far the displacement goes along it.
         """
         self._direction, self._length = direction, length
@@ -77,14 +80,14 @@ class ArcLength:
         self.factor = factor
         self._problem.set_load(factor)
 
-    def _along(self, way: Array) -> float:
-        """How far a way ``(n_owned * gdim,)`` goes in the step's direction (collective)."""
-        return float(reduced(self._problem.comm, self._direction @ way))
+    def _along(self, way: PETSc.Vec) -> float:
+        """How far a way goes in the step's direction (collective)."""
+        return float(reduced(self._problem.comm, self._direction @ way.array_r[: self._n]))
 
     @property
     def _missing(self) -> float:
         """How much further the displacement has to go (collective)."""
-        return self._length - self._along(self._bodies.displacement().array_r - self._start.array_r)
+        return self._length - self._along(self._bodies.displacement() - self._start)
 
     def place(self) -> None:
         """Project the contactors of displaced bodies, whose load factor has changed with the displacement."""
@@ -126,10 +129,10 @@ class ArcLength:
         free, by_load = (system.solve(problem._replace(rhs=rhs), accuracy, None) for rhs in (problem.rhs, load))
         still = load.duplicate()
         still.set(0.0)
-        along = self._along((by_load.du - system.move(state, still)).array_r)
+        along = self._along(by_load.du - system.move(state, still))
         if along == 0.0:
             raise ConvergenceError("the load does not move the bodies in the direction they went: take smaller steps")
-        self._change = (self._missing - self._along(free.du.array_r)) / along
+        self._change = (self._missing - self._along(free.du)) / along
         dq, rhs = free.dq + self._change * by_load.dq, problem.rhs + self._change * load
         return Increment(dq, system.move(state, dq), rhs, free.linear_iterations + by_load.linear_iterations, free.left)
 
@@ -162,8 +165,9 @@ class AlongArc:
                     f"arc_length leads loads, and friction of contact '{contact.name}' follows the load factor: expected friction that "
                     "does not"
                 )
-        refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out, and lead the load by a displacement")
-        self._problem, self._arc, self._owned = problem, ArcLength(problem), problem.config.n_owned * problem.config.gdim
+        if not problem.config.moves:
+            refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
+        self._problem, self._arc = problem, ArcLength(problem)
         self.tried, self.most = 0.0, MOST_STEPS
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
@@ -172,7 +176,7 @@ class AlongArc:
         Returns:
             The load factor and the history of the Newton loop.
         """
-        problem, progress, owned = self._problem, self._problem.progress, self._owned
+        problem, progress = self._problem, self._problem.progress
         number = progress.control.number
         before, self.tried = np.array(problem.committed), progress.control.length
         if problem.verbose:
@@ -180,7 +184,7 @@ class AlongArc:
         if number == 0:
             factor, iterations = self.tried, self._by_load(self.tried)
         else:
-            way = before[:owned] - progress.start[:owned]
+            way = self._way(before - progress.start)
             self._arc.begin(done, way / self._size(way), progress.reach * self.tried)
             iterations = problem.attempt(along=self._arc)
             factor = self._arc.factor
@@ -191,7 +195,7 @@ class AlongArc:
                 iterations = iterations[:-1] + self._by_load(factor)
         problem.commit()
         if number == 0:
-            progress.reach = self._size(problem.committed[:owned] - before[:owned]) / self.tried
+            progress.reach = self._size(self._way(problem.committed - before)) / self.tried
             if progress.reach == 0.0:
                 raise InputError("arc_length needs a load that moves the bodies: expected a load that F depends on")
         progress.start = before
@@ -202,6 +206,11 @@ class AlongArc:
         self._problem.set_load(factor)
         _check_values(self._problem)
         return self._problem.attempt()
+
+    def _way(self, change: Array) -> Array:
+        """That of the displacement's owned components ``(n_owned * gdim,)`` in a change of all local unknowns ``(n,)``."""
+        config = self._problem.config
+        return np.asarray(config.of(change)[: config.n_owned]).ravel()
 
     def _size(self, way: Array) -> float:
         """Length of a way ``(n_owned * gdim,)`` (collective)."""
@@ -214,8 +223,8 @@ def _check_values(problem: UnitedProblem) -> None:
     compat.set_bc_values(wanted, problem.bodies.bcs)
     with agreed(problem.comm):
         if not np.array_equal(wanted, problem.committed):
-            at = problem.config.X[int(np.flatnonzero(wanted != problem.committed)[0]) // problem.config.gdim]
+            at = problem.config.place_of(int(np.flatnonzero(wanted != problem.committed)[0]))
             raise InputError(
-                f"arc_length leads loads, and the Dirichlet values at {at} are not those of the committed displacement: expected values "
+                f"arc_length leads loads, and the Dirichlet values of {at} are not those of the committed state: expected values "
                 "that do not change with the load factor; bring them there by load_steps of its own, with arc_length=False"
             )

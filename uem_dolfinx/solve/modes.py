@@ -11,6 +11,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import given
+from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.mass import Mass
@@ -35,7 +36,7 @@ class Vibrations:
     Attributes:
         frequencies: in cycles per unit of time, ascending ``(n,)``; negative where a motion grows instead, as the equilibrium is unstable.
         eigenvalues: squares of the circular frequencies ``(n,)``.
-        functions: displacements of the modes, with ``v'Mv = 1``; their signs are arbitrary.
+        functions: displacements of the modes, with ``v'Mv = 1``, and all other fields that go with them; their signs are arbitrary.
     """
 
     frequencies: Array
@@ -48,7 +49,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
 
     Contactors that touch stay united to their targets, those that stick in all directions, those that slip along the normal alone, without
     friction; the others are free. Forces of the contact and of the bodies stiffen or soften as in the tangent of Newton's method; damping
-    is left out.
+    is left out. Other fields have no inertia, and follow the displacement as their equations say.
 
         frequencies = uem.modes(problem, 4, mass=uem.consistent_mass(V, rho)).frequencies
 
@@ -59,22 +60,26 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
 
     Raises:
         MissingBackendError: without slepc4py.
-        InputError, InputTypeError, SpaceError: if there is no mass, or it is of another space, for a displacement among other fields,
-            or for more modes than components with mass.
+        InputError, InputTypeError, SpaceError: if there is no mass, or it is of another space, for a tangent that is not symmetric, or
+            for more modes than components with mass.
         LinearSolveError: if SLEPc does not find them.
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     config, bodies, system = problem.config, problem.bodies, problem.system
     with agreed(problem.comm):
         n = given.count("n", n)
-        refuse_other_fields(config, "natural frequencies", "leave the other fields to a problem of their own")
+        if not config.moves:
+            refuse_other_fields(config, "natural frequencies", "take eigenvalues of your own")
         if mass is None and problem.dynamics is None:
             raise InputError("modes need a mass, and the problem has no dynamics: give mass=uem.consistent_mass(V, density)")
         mass = problem.dynamics.mass if mass is None and problem.dynamics is not None else mass
         given.kind("mass", mass, isinstance(mass, Mass), "a Mass, as consistent_mass returns it")
         assert mass is not None
-        if mass.M.getSizes()[0] != bodies.tangent.K.getSizes()[0]:
-            raise SpaceError("the mass is of another space than the displacement: make it with the displacement's space")
+        if not config.numbers_as(mass.config.V):
+            raise SpaceError(
+                "the mass is of another space than the displacement, or of one that is numbered otherwise, as a collapsed part of a mixed "
+                "one: make it with uem.function_space(mesh, degree, (gdim,))"
+            )
         if not isinstance(system, BodySystem):
             raise InputError("modes need contact by elimination: the default method")
     given.alike(problem.comm, "modes", n=n)
@@ -86,12 +91,13 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         rows = make_rows(
             system.over_constraints, system.pairs, lambda *_: bodies.free_rows, 0.0 * bodies.prescribed, system.linear
         )
-        curvature = curvature_of(system.pairs, config.vector(), False, False) if system.consistent_tangent else None
+        like, M = config.unknowns.vector(), config.in_rows(mass.M)
+        curvature = curvature_of(system.pairs, like, False, False) if system.consistent_tangent else None
         P = rows.frictionless
         with timed("united matrix"):
-            added = added_mass(system.linear, config.vector())
-            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, together(mass.M, added))
-    return _solve(slepc, P, A, B, n)
+            added = added_mass(system.linear, like)
+            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, together(M, added))
+    return _solve(slepc, problem, P, A, B, n)
 
 
 def _slepc() -> Any:
@@ -113,17 +119,23 @@ def _united(P: Restriction, A: PETSc.Mat) -> PETSc.Mat:
     return A
 
 
-def _solve(slepc: Any, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vibrations:
+def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vibrations:
     """Eigenvectors of lowest eigenvalues, as displacements (collective)."""
     comm, used = P.comm, P.used.ravel()
     stiffness, inertia = A.getDiagonal(), B.getDiagonal()
     moving = int(reduced(comm, int((used & (inertia.array_r > 0.0)).sum())))
     if moving < n:
         raise InputError(f"n = {n}: expected no more than {moving} modes, the number of free components with mass")
-    largest = stiffness.norm() / inertia.norm()
+    # in the displacement's rows, which come first
+    largest = problem.config.vector(stiffness.array_r[: problem.config.n_owned * problem.config.gdim]).norm() / inertia.norm()
     # idle components vibrate infinitely fast
     stiffness.array[~used] = stiffness.max()[1]
     A.setDiagonal(stiffness)
+    if not is_symmetric(A, problem.config.unknowns):
+        raise InputError(
+            "modes need a symmetric tangent, and that of this problem is not, as with a temperature that strains bodies: leave such fields "
+            "to a problem of their own"
+        )
     eps = slepc.EPS().create(comm)
     eps.setOperators(A, B)
     eps.setProblemType(slepc.EPS.ProblemType.GHEP)
@@ -155,8 +167,8 @@ def _solve(slepc: Any, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vi
     eps.destroy()
     functions = []
     for i, (_, v) in enumerate(found):
-        function = fem.Function(P.space.V, name=f"mode_{i + 1}")
-        function.x.array[: len(v.array_r)] = v.array_r
+        function, own = fem.Function(P.space.V, name=f"mode_{i + 1}"), problem.config.from_rows(v.array_r)
+        function.x.array[: len(own)] = own
         function.x.scatter_forward()
         functions.append(function)
     return Vibrations(np.sign(values) * np.sqrt(np.abs(values)) / (2.0 * np.pi), values, functions)
