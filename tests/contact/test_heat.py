@@ -16,7 +16,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from field_scenes import fields, strain, stress
-from helpers import blocks, highest, linear, modulus, refused, run, slow
+from helpers import blocks, factors, highest, linear, modulus, refused, run, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx.solve.tangent import slip_terms
@@ -48,7 +48,8 @@ class Bars:
         thermal = stress(u, self.E, self.nu) - alpha * self.E / (1 - 2 * self.nu) * T * ufl.Identity(b.gdim)
         self.F = ufl.inner(thermal, strain(v)) * ufl.dx
         self.F += modulus(b.scene, K, above * K) * ufl.inner(ufl.grad(T), ufl.grad(q)) * ufl.dx
-        ends = [uem.dirichlet(f.other, b.bottom, value=COLD), uem.dirichlet(f.other, b.top, value=HOT)]
+        self.hot = fem.Constant(b.scene.mesh, HOT)
+        ends = [uem.dirichlet(f.other, b.bottom, value=COLD), uem.dirichlet(f.other, b.top, value=self.hot)]
         self.bcs = [*f.confined(), uem.dirichlet(f.space, b.top, b.gdim - 1, -press), *ends]
         self.contact = uem.Contact(b.high, b.low, heat=uem.Conductance(h, field=1), name="bars", **how)
         self.problem = uem.UnitedProblem(self.F, f.w, displacement=0, bcs=self.bcs, contacts=[self.contact])
@@ -177,6 +178,51 @@ def test_the_tangent_is_the_residuals_derivative(coupling, degree, of_heat):
     w.sub(1).interpolate(lambda x: 7.0 + 0.0 * x[0])
     w.x.scatter_forward()
     assert highest(COMM, np.abs(heat.residual())) < 1e-12 * np.abs(by.norm())
+
+
+def test_the_tangent_by_gaps_and_pressures():
+    """A function h is differentiated at every contactor: across an open gap to rounding, exactly by pressures where these are linear."""
+    for h, gap, wanted in (
+        (lambda p, g: 3.0 * g**2, 0.1, lambda p, g: 6.0 * g),
+        (lambda p, g: 3e-4 * p**2, 0.0, lambda p, g: 6e-4 * p),
+    ):
+        bars = Bars(h, gap=gap, coupling="mortar", n=4)
+        run(bars.problem)
+        heat, c = bars.contact.pair.heat, bars.contact
+        g, p = c.pair.projection.gap, c.pressures
+        slopes = wanted(p, np.where(c.pair.united, 0.0, g)) * heat.jump() * heat.passage.areas
+        assert highest(COMM, np.abs(heat._slopes() / slopes - 1.0)) < 2.5e-8
+    bars = Bars(lambda p, g: 0.05 / (0.01 + g), gap=0.1, n=4, coupling="mortar")
+    run(bars.problem)
+    heat, unknowns, w = bars.contact.pair.heat, bars.problem.config.unknowns, bars.f.w
+    assert bars.contact.n_active == 0
+    H, _ = slip_terms(bars.problem.pairs, unknowns.vector())
+    # across the gap: weights do not change
+    n, high = bars.problem.config.n_owned, (bars.problem.config.X[:, 1] > 0.05)[:, None]
+    way = fem.Function(w.function_space)
+    way.x.array[bars.problem.config.dofs] = high * np.array([0.0, 1e-6])
+    by = H * unknowns.vector(bars.problem.config.rows(way.x.array[: len(unknowns.place)]))
+    found = []
+    for sign in (1.0, -1.0):
+        w.x.array[:] += sign * way.x.array
+        bars.problem.system.place()
+        found.append(heat.residual())
+        w.x.array[:] -= sign * way.x.array
+    assert highest(COMM, np.abs(0.5 * (found[0] - found[1]) - by.array_r)) < 1e-6 * by.norm()
+    assert by.norm() > 0.0 and (by.array_r[: 2 * n] == 0.0).all()
+
+
+@pytest.mark.parametrize("coupling", ["mortar", slow("node_to_surface")])
+def test_newtons_method_is_quadratic(coupling):
+    """Where feet stay: heat that a growing pressure lets through, and heat through a gap that it closes."""
+    bars = Bars(lambda p, g: 0.1 * p, coupling=coupling, n=4, press=0.02, alpha=1e-4, above=4.0, sliding="fixed")
+    run(bars.problem)
+    bars.hot.value = 400.0
+    history = bars.problem.solve()
+    assert len(history) <= 4 and max(factors(history)) < 1.0
+    bars = Bars(lambda p, g: 0.05 / (0.01 + g), coupling=coupling, n=4, gap=0.1, press=0.0, alpha=7e-5, above=6.0)
+    history = bars.problem.solve()
+    assert len(history) <= 5 and bars.contact.n_active == 0 and max(factors(history)) < 1.0
 
 
 class Rubbing:

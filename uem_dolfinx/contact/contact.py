@@ -365,7 +365,7 @@ class Contact(WatchedContact):
             current, surface = self.measure == "current", self.surface
             self._pair.heat = Heat(
                 self._pair, self.heat, areas=lambda: (surface.current if current else surface.reference)[nodes], current=current,
-                pressures=lambda: self.pressures,
+                pressed=self.measured_areas,
             )  # fmt: skip
             if self.heat.perfect:
                 self._pair.trial = self._pair.committed = replace(self._pair.committed, heat=np.zeros(len(nodes)))

@@ -2,8 +2,10 @@
 
 The temperature is a field beside the displacement. At every contactor i the power ``q_i A_i`` with ``q_i = h (T_i - sum_a N_a T_a)`` stands
 in the field's equations, at the contactor and with the opposite sign at what it faces. With rows ``v_i`` that make jumps of the
-unknowns these are ``sum_i v_i q_i A_i``, and their derivative is ``sum_i A_i h v_i v_i'``, symmetric. Pressures in h, and the heat of
-friction, are those that the last linearised problem has predicted. Perfect conductance unites temperatures, ``v_i' T = 0``, as gaps are
+unknowns these are ``sum_i v_i q_i A_i``, and their derivative is ``sum_i A_i h v_i v_i'``, symmetric. A conductance h(p, g) adds
+``sum_i A_i (T_i - sum_a N_a T_a) v_i (dh/dp p_i' + dh/dg g_i')``, with differences for dh/dp and dh/dg, gaps that change by
+``n (du_i - sum_a N_a du_a)``, and pressures by the rows of K at the contactors, over their areas. Pressures in h, and the heat of friction,
+are those that the last linearised problem has predicted. Perfect conductance unites temperatures, ``v_i' T = 0``, as gaps are
 closed: one unknown of each contactor that touches is eliminated, and the heat is the equation's multiplier.
 """
 
@@ -20,7 +22,7 @@ import numpy as np
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.active_set import GAP_ROUNDING
-from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics
 from uem_dolfinx.contact.laws.conductance import Conductance, value
 from uem_dolfinx.contact.sides import Sides, sides_of
 from uem_dolfinx.contact.state import PairState
@@ -33,6 +35,11 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.sliding import Sliding
+
+
+#: A conductance is differentiated over so much of the largest pressure, or of the largest gap.
+#: [derived; largest pressure or gap; test_heat.py::test_the_tangent_by_gaps_and_pressures]
+OF_CONDUCTANCE = np.finfo(float).eps ** 0.5
 
 
 class Pair(Protocol):
@@ -63,6 +70,9 @@ class Pair(Protocol):
     @property
     def off(self) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""
+
+    def pressing(self) -> tuple[Array, Array]:
+        """Forces across ``(n,)`` and along ``(n, gdim)`` the target (collective)."""
 
 
 @dataclass(frozen=True)
@@ -108,15 +118,13 @@ class Heat:
         law: what conducts.
         areas: tells integrals of the shape functions at the contactors ``(n,)`` (collective).
         current: whether they are those of the surface where it is now.
-        pressures: tells the contactors' pressures ``(n,)`` (collective).
+        pressed: tells areas that pressures are forces over ``(n,)``, zero where there is none (collective).
 
     Raises:
         InputError, SpaceError: if there is no such field, or if the target's temperature is not known, or given twice.
     """
 
-    def __init__(
-        self, pair: Pair, law: Conductance, *, areas: Callable[[], Array], current: bool, pressures: Callable[[], Array]
-    ):
+    def __init__(self, pair: Pair, law: Conductance, *, areas: Callable[[], Array], current: bool, pressed: Callable[[], Array]):
         words, config = f"contact '{pair.name}': heat", pair.config
         if not isinstance(config, ConfigurationAmongFields):
             raise InputError(
@@ -131,7 +139,7 @@ class Heat:
                 f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
             )
         self.law, self.field, self._pair = law, nodal_field(config, law.field, words), pair
-        self._areas, self._current, self._pressures = areas, current, pressures
+        self._areas, self._current, self._pressed = areas, current, pressed
         if law.perfect and self.field.weights.shape[1] > 1:
             raise SpaceError(
                 f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
@@ -201,13 +209,35 @@ class Heat:
 
     def conductances(self) -> Array:
         """At the contactors ``(n,)``, none past an end of the target (collective)."""
-        pair = self._pair
-        closed = pair.united
-        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(pair.projection.gap, 0.0))
+        return self._conductances(*self._pressures_and_gaps())
+
+    def _pressures_and_gaps(self) -> tuple[Array, Array]:
+        """At the contactors ``(n,)`` each, of which one is zero (collective)."""
+        closed = self._pair.united
+        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self._pair.projection.gap, 0.0))
         if callable(self.law.h):
-            p = np.where(closed, self._pressures(), 0.0)
+            p = np.where(closed, self._pair.pressing()[0] * self._per_area(), 0.0)
+        return p, g
+
+    def _per_area(self) -> Array:
+        """Pressures over forces ``(n,)`` (collective)."""
+        areas = self._pressed()
+        return np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)
+
+    def _conductances(self, p: Array, g: Array) -> Array:
+        pair, closed = self._pair, self._pair.united
         h = self.law.conductances(pair.config.comm, pair.name, p, g, closed)
         return np.where(closed | ~pair.off, h, 0.0)
+
+    def _slopes(self) -> Array:
+        """Derivatives of the power with the pressures of closed contactors, and with the gaps of open ones ``(n,)`` (collective)."""
+        p, g = self._pressures_and_gaps()
+        largest = reduced(self._pair.config.comm, np.array([np.abs(p).max(initial=0.0), g.max(initial=0.0)]), op=MPI.MAX)
+        at_p, at_g = OF_CONDUCTANCE * largest
+        more = np.where(self._pair.united, at_p, np.where(self._pair.projection.gap > 0.0, at_g, 0.0))
+        ahead = self._conductances(p + np.where(self._pair.united, more, 0.0), g + np.where(self._pair.united, 0.0, more))
+        slopes = (ahead - self._conductances(p, g)) / np.where(more > 0.0, more, 1.0)
+        return np.asarray(slopes * self.jump() * self.passage.areas)
 
     def jump(self) -> Array:
         """By what contactors are hotter than the target ``(n,)`` (collective)."""
@@ -268,22 +298,75 @@ class Heat:
         # what equations hand on stands in no residual
         return self.field.rows(-made if self.law.perfect else passing - made)
 
-    def tangent(self) -> tuple[Ints, Array]:
-        """Derivative of that with the temperatures: global rows ``(k, m)``, -1 for none, and blocks ``(k, m g, m g)`` (collective)."""
+    def tangent(self) -> list[tuple[Ints, Array]]:
+        """Derivatives of that with temperatures and gaps (collective).
+
+        Returns:
+            Pairs of global rows ``(k, m)``, -1 for none, and blocks ``(k, m gdim, m gdim)``.
+        """
+        at, jumps = self.passage, self._jumps()
+        kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
+        found = [_dyads(kappa, jumps, jumps)]
+        if callable(self.law.h):
+            opening = at.jump[:, None] * self._pair.projection.normal[at.row]
+            slopes = np.where(self._pair.united, 0.0, self._slopes())
+            found.append(_dyads(slopes, jumps, Terms(at.row, at.node, opening)))
+        return found
+
+    def by_forces(self, equations: Constraints, lift: Array) -> tuple[Ints, Array]:
+        """Derivatives of that with forces F at the contactors, of which multipliers are ``lift F``, as of ``tangent`` (collective).
+
+        None of degree 2, where pressures are those of several contactors' forces.
+
+        Args:
+            equations: of the interface, in the present state.
+            lift: of each ``(m, gdim)``.
+        """
+        pair, config = self._pair, self._pair.config
+        slopes = np.where(pair.trial.active & (config.degree == 1), self._slopes(), 0.0)
+        weights, own = pair.kinematics.forces_back(pair.trial, slopes * self._per_area()), equations.kind == NORMAL
+        which = equations.contactor[own]
+        return _dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
+
+    def _jumps(self) -> Terms:
+        """By which unknowns contactors are hotter than the target (collective)."""
         at, g = self.passage, self._pair.config.gdim
         known: Any = at.halo.take(self.field.terms)
         number, weight = np.hsplit(known, 2)
-        kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
-        some = (weight != 0) & (kappa[at.row] != 0)[:, None]
+        some = weight != 0
         row = np.broadcast_to(at.row[:, None], weight.shape)[some]
         number, weight = number[some].astype(np.int64), (at.jump[:, None] * weight)[some]
-        # terms of each contactor side by side
-        order = np.argsort(row, kind="stable")
-        which, first, i = np.unique(row[order], return_index=True, return_inverse=True)
-        place = np.arange(len(order)) - first[i]
-        rows = np.full((len(which), int(place.max(initial=-1)) + 1), -1, dtype=np.int64)
-        rows[i, place] = number[order] // g
-        v = np.zeros((*rows.shape, g))
-        v[i, place, number[order] % g] = weight[order]
-        jumps = v.reshape(len(which), rows.shape[1] * g)
-        return rows, kappa[which, None, None] * jumps[:, :, None] * jumps[:, None, :]
+        vector = np.zeros((len(row), g))
+        vector[np.arange(len(row)), number % g] = weight
+        return Terms(row, number // g, vector)
+
+
+class Terms(NamedTuple):
+    """Linear functions of the unknowns, one for each contactor, by their terms.
+
+    Attributes:
+        row: place of the contactor ``(k,)``.
+        node: global row of vectors ``(k,)``.
+        vector: of the components there ``(k, gdim)``.
+    """
+
+    row: Ints
+    node: Ints
+    vector: Array
+
+
+def _dyads(scale: Array, left: Terms, right: Terms) -> tuple[Ints, Array]:
+    """``sum_i scale_i v_i w_i'`` of linear functions v and w of contactors, by blocks as those of ``Heat.tangent``."""
+    row, node = (np.concatenate(both) for both in zip(left[:2], right[:2]))
+    some = np.flatnonzero(scale[row] != 0.0)
+    # terms of each contactor side by side
+    order = some[np.argsort(row[some], kind="stable")]
+    which, first, i = np.unique(row[order], return_index=True, return_inverse=True)
+    place = np.arange(len(order)) - first[i]
+    rows = np.full((len(which), int(place.max(initial=-1)) + 1), -1, dtype=np.int64)
+    rows[i, place] = node[order]
+    of_left, g = order < len(left.row), left.vector.shape[1]
+    vectors, both = np.concatenate([left.vector, right.vector])[order], np.zeros((2, *rows.shape, g))
+    both[0, i, place], both[1, i, place] = vectors * of_left[:, None], vectors * ~of_left[:, None]
+    v, w = both.reshape(2, len(which), rows.shape[1] * g)
+    return rows, scale[which, None, None] * v[:, :, None] * w[:, None, :]

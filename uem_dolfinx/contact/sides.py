@@ -32,6 +32,7 @@ class Sides:
     Attributes:
         projection: of the contactors there.
         halo: of the nodes that count.
+        node: global numbers of these, of each term ``(k,)``.
         row: place of the contactor of each term ``(k,)``.
         own: weights of the contactor's mean, zero in those of the target ``(k,)``.
         theirs: weights of the target's mean ``(k,)``.
@@ -39,6 +40,7 @@ class Sides:
 
     projection: Projection
     halo: Halo
+    node: Ints
     row: Ints
     own: Array
     theirs: Array
@@ -60,10 +62,11 @@ def sides_of(pair: Placed) -> Sides:
     """Both sides of contactors where they have been placed (collective)."""
     k = pair.kinematics
     (row, node, weight), (their_row, their_node, their_weight) = k.means()
-    none, others = np.zeros(len(row)), np.zeros(len(their_row))
+    none, others, every = np.zeros(len(row)), np.zeros(len(their_row)), np.concatenate([node, their_node])
     return Sides(
         k.projection,
-        Halo(pair.config, np.concatenate([node, their_node])),
+        Halo(pair.config, every),
+        every,
         np.concatenate([row, their_row]),
         np.concatenate([weight, others]),
         np.concatenate([none, their_weight]),

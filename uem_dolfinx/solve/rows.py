@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
@@ -23,6 +23,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import agree, reduced
 from uem_dolfinx.solve.newton import IterationState
+from uem_dolfinx.solve.tangent import contact_curvature, together
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
@@ -150,6 +151,29 @@ class BodyState(IterationState):
     rows: Rows
     added: PETSc.Mat | None
     held: PETSc.Vec | None
+
+    def with_pressures(self, pairs: Sequence[Interface], K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
+        """The state with how heat changes with pressures, as far as they are forces of single contactors (collective).
+
+        Args:
+            pairs: of all contacts.
+            K: tangent of the bodies, whose rows at the contactors tell how contact forces change.
+            G: curvature of the contact, or None.
+        """
+        state, test, parts, first = self, self.test, [], 0
+        if test.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+            return self
+        for pair, own in zip(pairs, self.rows.equations):
+            if pair.heat is not None and callable(pair.heat.law.h):
+                parts.append(pair.heat.by_forces(own, test.lift[first : first + len(own)]))
+            first += len(own)
+        if not parts:
+            return self
+        by_forces = contact_curvature(parts, self.residual)
+        for matrix in (K, G):
+            if matrix is not None:
+                state = replace(state, added=together(state.added, by_forces.matMult(matrix)))
+        return state
 
 
 def make_rows(

@@ -397,6 +397,7 @@ class BodySystem:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
         K, P, Q = self.bodies.tangent.K, state.trial, state.test
+        state = state.with_pressures(self.pairs, K, self._curvature) if self._heats else state
         curvature = together(self._curvature, state.added)
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")

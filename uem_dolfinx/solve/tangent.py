@@ -194,7 +194,7 @@ def slip_terms(
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
-    heat = [pair.heat.tangent() for pair in pairs if pair.heat is not None]
+    heat = [part for pair in pairs if pair.heat is not None for part in pair.heat.tangent()]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
     masses = [] if linear is None else linear.added_mass()
