@@ -99,7 +99,7 @@ def check_parts(what: str, form: ufl.Form, u: fem.Function) -> None:
     for f in form.coefficients():
         if f is not u and isinstance(f, fem.Function) and np.may_share_memory(f.x.array, u.x.array):
             raise InputError(
-                f"{what} holds u.sub(i) of the mixed Function u, by which it is not differentiated: expected ufl.split(u)[i]"
+                f"{what} holds u.sub(i) of the Function u, by which it is not differentiated: expected ufl.split(u)[i]"
             )
 
 
