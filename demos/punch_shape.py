@@ -45,8 +45,10 @@ HEIGHT, GAP = 0.5 * A, 0.02 * A
 mesh, tags = uem.read_gmsh(common.MESHES / "punch.geo", comm, gdim=2, parameters={"n": args.n, "gap": GAP, "width": args.width})
 V = uem.function_space(mesh, 1, (2,))
 u, v, X = fem.Function(V, name="displacement"), ufl.TestFunction(V), ufl.SpatialCoordinate(mesh)
-F = uem.LinearElastic(E, NU, kind="plane_strain").residual(u, v) * uem.dx(tags["base"])
-F += uem.LinearElastic(args.stiff * E, NU, kind="plane_strain").residual(u, v) * uem.dx(tags["punch"])
+modulus = fem.Function(uem.function_space(mesh, ("DG", 0)))
+modulus.interpolate(lambda x: np.where(x[1] > 0.5 * GAP, args.stiff * E, E))
+material = uem.LinearElastic(modulus, NU, kind="plane_strain")
+F = material.residual(u, v) * ufl.dx
 push, bottom = fem.Constant(mesh, 0.0), uem.ds(tags["punch_bottom"])
 bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["base_bottom"], 1)]
 bcs += [uem.dirichlet(V, tags["punch_top"], 0), uem.dirichlet(V, tags["punch_top"], 1, push)]
@@ -101,11 +103,12 @@ push.value = -GAP - 1e-3
 press(np.zeros(args.n + 1))
 push.value = -GAP - 1e-3 * args.pressure / state["mean"]
 press(np.zeros(args.n + 1))
-flat, before = state["evenness"], profile()
+flat, before, steps = state["evenness"], profile(), [np.zeros(args.n + 1)]
 size = args.pressure * A / E
 found = minimize(
     lambda y: (lambda J, by: (J, by * size))(*press(y * size)), np.zeros(args.n + 1), jac=True, method="L-BFGS-B",
     bounds=[(-2.0, 2.0)] * (args.n + 1), options={"maxiter": args.iterations, "ftol": 1e-12, "gtol": 1e-8, "maxcor": 30},
+    callback=lambda y: steps.append(np.array(y)),
 )  # fmt: skip
 press(found.x * size)
 shape, s = (found.x - found.x[0]) * size, knots / A
@@ -139,6 +142,13 @@ if args.plot:
             panels[1].set(xlabel="x / a", ylabel="height, in p0 a / E")
             panels[1].legend()
 if args.output:
+    film = uem.animate(
+        f"{args.output}/punch_shape.gif", state["problem"], (press(y * size) for y in steps), label="vertical pressure / p0",
+        field=-material.stress(u)[1, 1] / args.pressure, levels=np.arange(0.1, 3.0, 0.2), window=(-1.5, 1.5, -0.7, 0.55),
+        mirror=True, cells=False, arrows=False, size=(6.4, 3.0), every=2, frames_per_second=4,
+    )  # fmt: skip
+    for _ in film:
+        pass
     with uem.ResultsWriter(f"{args.output}/punch_shape", state["problem"]) as writer:
         writer.write(1.0)
 

@@ -113,7 +113,7 @@ steps = designs(problem, args.volume)
 how = {"field": rho, "label": "density", "cmap": "Greys", "scale": 0.15, "cells": False, "mirror": True}
 how["levels"] = np.linspace(0.0, 1.0, 6)
 if args.output:
-    steps = uem.animate(f"{args.output}/topology.gif", problem, steps, size=(7.2, 2.4), **how)
+    steps = uem.animate(f"{args.output}/topology.gif", problem, steps, every=2, size=(7.2, 2.4), **how)
 *_, (x, lying) = steps
 with uem.figure(args.plot, comm, panels=2, size=(6.4, 2.2)) as panels:
     uem.plot_scene(problem, panels[1], **how)
