@@ -133,6 +133,28 @@ def test_a_force_is_a_functional():
     assert float(by) == pytest.approx(uem.integrate(force), rel=1e-9)
 
 
+def test_contactors_that_are_held():
+    """Their equations move nodes of the target, of whatever rank: forward and adjoint agree, and J changes by that."""
+    b = blocks(COMM, "quadrilateral", 2, 3, overhang=0.25)
+    push = fem.Constant(b.scene.mesh, (0.0, -0.02))
+    F, J = linear(b.u, 1.0), ufl.inner(b.u, b.u) * ufl.dx
+
+    def value(h):
+        push.value[1] = -0.02 + h
+        b.u.x.array[:] = 0.0
+        bcs = [*clamp(b.V, b.bottom), uem.dirichlet(b.V, b.high, value=push)]
+        value.problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[uem.Contact(b.high, b.low)], rtol=1e-13)
+        value.problem.solve()
+        return uem.integrate(J)
+
+    differences = (value(1e-4) - value(-1e-4)) / 2e-4
+    value(0.0)
+    (by,) = uem.gradient(value.problem, J, push)
+    du = uem.tangent(value.problem, [(push, np.array([0.0, 1.0]))])
+    assert by[1] == pytest.approx(differences, rel=1e-6)
+    assert uem.integrate(ufl.derivative(J, b.u, du)) == pytest.approx(by[1], rel=1e-10)
+
+
 @pytest.mark.skipif(not has_hypre(), reason="needs hypre")
 def test_iterative_solvers():
     """CG finds the gradient that a factorisation does."""

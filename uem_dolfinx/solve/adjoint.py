@@ -158,7 +158,10 @@ class Linearised:
         return PressureSlopes(contact, self.rows.equations[self.problem.contacts.index(contact)])
 
     def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
-        """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective)."""
+        """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective with weights)."""
+        if not weights:
+            # what equations are replaced by that conflict may be of other ranks
+            return self.config.vector()
         parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.rows.equations)]
         return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
 
