@@ -21,7 +21,8 @@ from helpers import raised, refused
 from results_scenes import pressed
 
 import uem_dolfinx as uem
-from uem_dolfinx.output import drawings, films, pictures3d
+from uem_dolfinx.output import drawings, films, pictures3d, sections
+from uem_dolfinx.output import frames as frames_module
 
 pytest.importorskip("matplotlib")
 COMM = MPI.COMM_WORLD
@@ -36,9 +37,11 @@ def drawn(monkeypatch):
     """What PyVista would draw on rank 0, as keyword arguments; nothing is drawn."""
     calls = []
 
-    def images(points, faces, values, arrows, colours, box, window, view, edges):
-        calls.append(dict(x=points[0], faces=faces, values=values[0], box=box, window=window, view=view, arrows=arrows[0]))
-        return [np.zeros((2, 3, 4), np.uint8) for _ in points]
+    def images(faces, solids, look):
+        solid = solids[0]
+        calls.append(dict(x=solid.points, faces=faces, values=solid.values, box=look.box, cut=look.cut, view=look.view))
+        calls[-1] |= dict(arrows=solid.arrows, cuts=solid.cuts, rigid=solid.rigid)
+        return [np.zeros((2, 3, 4), np.uint8) for _ in solids]
 
     monkeypatch.setattr(pictures3d, "images", images)
     monkeypatch.setattr(pictures3d, "require", lambda comm: None)
@@ -61,7 +64,7 @@ def test_outside_of_the_bodies(cell, drawn, folder):
         pass
     uem.plot_scene(problem, folder / "end.png", levels=[0.0, 0.05, 0.1], view=(0.0, 0.0, 2.0))
     uem.plot_scene(problem, folder / "pressure.png", field=contact, surface=contact.contactor, levels=[0.0, 1.0], arrows=True)
-    uem.plot_scene(problem, folder / "part.png", window=(0.0, 0.5, 0.0, 1.0, 0.0, 1.0))
+    uem.plot_scene(problem, folder / "part.png", levels=[0.0, 0.05, 0.1], window=(0.0, 0.5, 0.0, 1.0, 0.0, 1.0))
     force = contact.resultant().force[2]
     X = problem.config.X[contact.nodes]
     np.testing.assert_allclose(contact.points - X, problem.u.x.array.reshape(-1, 3)[contact.nodes], atol=1e-14)
@@ -70,8 +73,13 @@ def test_outside_of_the_bodies(cell, drawn, folder):
         return
     start, end, pressure, part = drawn
     assert area(start["x"], start["faces"]).sum() == pytest.approx(12.0)
-    np.testing.assert_allclose(part["window"], [[0, 0.5], [0, 1], [0, 1]], atol=2 * drawings.EVEN)
-    assert (part["window"][:, 0] < 0).all()
+    np.testing.assert_allclose(part["box"], [[0, 0.5], [0, 1], [0, 1]], atol=2 * drawings.EVEN)
+    assert (part["box"][:, 0] < 0).all() and part["cut"] and not end["cut"]
+    # the window cuts both cubes at x = 0.5, 1 by 1.9, and the field is drawn there
+    corners, inside = part["cuts"]
+    middle = np.isclose(corners[:, :, 0], 0.5).all(axis=1)
+    assert area(corners[middle].reshape(-1, 3), np.arange(3 * middle.sum()).reshape(-1, 3)).sum() == pytest.approx(1.9)
+    np.testing.assert_allclose(inside[middle], 20.0 * 0.05 * (corners[middle][:, :, 2] + 1.0) / 0.95, atol=1e-9)
     assert area(end["x"], end["faces"]).sum() == pytest.approx(8.0 - 4.0 * 0.1 + 4.0)
     np.testing.assert_allclose(end["box"], [[0, 1], [0, 1], [-1, 0.9]], atol=4 * drawings.EVEN)
     # colours are numbered from 0; |u| grows from the bottom to the top
@@ -80,11 +88,47 @@ def test_outside_of_the_bodies(cell, drawn, folder):
     np.testing.assert_allclose(end["values"], 20.0 * 0.05 * (end["x"][:, 2] + 1.0) / 0.95, atol=1e-9)
     np.testing.assert_allclose(end["view"], [0, 0, 1])
     assert area(pressure["x"], pressure["faces"]).sum() == pytest.approx(1.0)
-    np.testing.assert_allclose(pressure["values"], force, rtol=1e-9)
+    np.testing.assert_allclose(pressure["values"], force, rtol=1e-7)
     # of even pressure: an eighth of the side, upwards like the force on the upper cube
     at, arrows = pressure["arrows"]
     assert len(at) == len(arrows) > 0 and not len(end["arrows"][0])
     np.testing.assert_allclose(arrows, np.tile([0.0, 0.0, 0.125], (len(at), 1)), atol=1e-9)
+
+
+def test_rigid_surfaces(folder):
+    """Are drawn where they have been moved to when the frame is taken, behind their surface, and each once."""
+    ball = uem.RigidSphere((0.0, 0.0, 2.0), 1.0).move((0.0, 0.0, -0.5))
+    shapes = sections.rigid_shapes([types.SimpleNamespace(target=target) for target in (ball, "a tag", ball)])
+    ball.move((0.0, 0.0, 7.0))
+    axes, points = sections.grid(np.array([[-1.0, 1.0], [-2.0, 2.0], [0.0, 3.0]]), 20)
+    assert [len(x) for x in axes] == [12, 22, 17] and len(shapes) == 1
+    np.testing.assert_allclose(points[:12, 0], axes[0])
+    behind = np.linalg.norm(points - [0.0, 0.0, 1.5], axis=1) < 1.0
+    np.testing.assert_array_equal(shapes[0].height(points) < 0, behind)
+
+
+def test_colours():
+    """Grey where there is no pressure, whose colours begin above 0; a few large values do not take all colours."""
+    values = np.concatenate([np.zeros(100), np.linspace(0.0, 1.0, 899), [50.0]])
+    frame = frames_module.Frame(np.zeros((1000, 2)), values, [], ("", 0.0), frames_module.NO_SECTION, [])
+
+    def drawn(**how):
+        known = dict(levels=10, window=None, mirror=False, percentiles=None, pressed=False, cmap="viridis")
+        return drawings.Drawn2D(types.SimpleNamespace(**(known | how)), None, [frame])
+
+    pressed, most = drawn(pressed=True), drawn(percentiles=(0.0, 99.0))
+    assert pressed.extend == "min" and 0 < pressed.bounds[0] <= drawings.EVEN * 50.0
+    assert pressed.cmap(-1.0)[:3] == pytest.approx([210 / 255] * 3)
+    assert most.extend == "max" and 0.9 < most.bounds[-1] < 1.2 and drawn().bounds[-1] >= 50.0
+    assert drawn(levels=[0.0, 1.0], pressed=True).extend == "both" and drawn(levels=[0.0, 60.0]).extend == "neither"
+
+
+def test_titles_of_frames():
+    """Digits enough to tell states apart, and a step's name before its load."""
+    assert films.titles([("time", 0.1234), ("time", 0.5)]) == ["time 0.123", "time 0.5"]
+    assert films.titles([("time", 12.3451), ("time", 12.3462)]) == ["time 12.345", "time 12.346"]
+    assert films.titles([("press, load", 1.0), ("pull, load", 1.0)]) == ["press, load 1", "pull, load 1"]
+    assert films.titles([("", 0.0)] * 2) == ["0", "0"]
 
 
 def test_pictures_of_bodies(folder):
@@ -107,6 +151,7 @@ def test_arguments_of_other_dimensions(monkeypatch, folder):
     flat, solid = pressed(COMM, "triangle"), pressed(COMM, "tetrahedron")
     given = {
         "mirror": True, "window": (0, 1, 0, 1), "view": (0, 0, 0), "field": solid.u, "levels": [1.0, 0.0],
+        "percentiles": (50, 120), "dpi": 0, "size": (1.0,),
     }  # fmt: skip
     for name, value in given.items():
         refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(solid, folder / "a.png", **{name: value}))

@@ -15,6 +15,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.frames import Frame, Gathering, Pieces
+from uem_dolfinx.output.sections import grid
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
@@ -22,6 +23,8 @@ from uem_dolfinx.solve.problem import UnitedProblem
 #: are less have no arrow.
 #: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
+#: Colour of what carries no contact pressure, and of rigid surfaces.
+NO_PRESSURE, RIGID = "#d2d2d2", "#b2b2b2"
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
 
 
@@ -31,7 +34,7 @@ class Drawing:
     def __init__(
         self, problem: UnitedProblem, *, field: Any, label: str, levels: int | Sequence[float], scale: float,
         window: Sequence[float] | None, mirror: bool, cells: bool, arrows: bool | None, cmap: str, view: str | Sequence[float] | None,
-        surface: Part | None,
+        surface: Part | None, percentiles: Sequence[float] | None, rigid: bool, triad: bool,
     ):  # fmt: skip
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         gdim, pressed = problem.config.gdim, isinstance(field, Contact)
@@ -53,6 +56,12 @@ class Drawing:
             scale = given.number("scale", scale)
             if window is not None and not (np.diff(given.vector("window", window, 2 * gdim))[::2] > 0).all():
                 raise InputError(given.sentence("window", window, "on each axis a lower bound and a larger upper one"))
+            if percentiles is not None:
+                least, most = given.vector("percentiles", percentiles, 2)
+                if not 0 <= least < most <= 100:
+                    raise InputError(
+                        given.sentence("percentiles", percentiles, "two of them, from 0 to 100, the smaller one first")
+                    )
             if gdim == 3:
                 toward = (1.0, 1.0, 1.0) if view is None or (isinstance(view, str) and view == "iso") else view
                 self.view = given.direction("view", toward, 3)  # type: ignore[arg-type]
@@ -61,8 +70,12 @@ class Drawing:
         size = "|u|" if problem.config.moves else problem.u.name
         self.label = label or (size if field is None else "contact pressure" if pressed else "")
         self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap
+        self.percentiles, self.triad, self.pressed = percentiles, triad, pressed
+        #: Width of an image of a 3D scene in points.
+        self.width = 1600
         self.comm = problem.comm
-        gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface)
+        box = None if window is None else np.reshape(window, (-1, 2))
+        gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface, box, rigid)
         self.take, self.pieces = gathering.take, gathering.pieces
 
     def over(self, frames: Sequence[Frame]) -> Drawn:
@@ -77,18 +90,27 @@ class Drawn(ABC):
     def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
         self.how, self.pieces, self.frames = how, pieces, frames
         self.box = self._everything() if how.window is None else np.reshape(how.window, (-1, 2))
+        if how.window is None and any(f.rigid for f in frames):
+            self.box = self.box + 0.06 * np.diff(self.box, axis=1).max() * np.array([-1.0, 1.0])
         # a side of the scene that the window ends at is in it, whatever rounding makes of it
         self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
         seen = np.concatenate([f.values[self._shown(f.x)] for f in frames])
         if not len(seen):
             seen = np.concatenate([f.values for f in frames])
         least, most = float(seen.min()), float(seen.max())
+        # values that are drawn as one more colour may be few
+        ends = (least, most) if how.percentiles is None else np.percentile(seen, how.percentiles)
         #: Bounds of the colours.
-        self.bounds = np.asarray(how.levels if not isinstance(how.levels, int) else _bounds(least, most, how.levels))
+        self.bounds = np.array(
+            how.levels if not isinstance(how.levels, int) else _bounds(float(ends[0]), float(ends[1]), how.levels), dtype=float
+        )
+        if how.pressed and self.bounds[0] == 0.0:
+            self.bounds[0] = EVEN * self.bounds[-1]
         #: Which ends of the colour bar have an arrow.
         self.extend = "neither"
-        if not isinstance(how.levels, int):
+        if not isinstance(how.levels, int) or how.percentiles is not None or how.pressed:
             self.extend = ("neither", "min", "max", "both")[int(least < self.bounds[0]) + 2 * int(most > self.bounds[-1])]
+        self.cmap = _colours(how.cmap, how.pressed)
 
     def _everything(self) -> Array:
         """Bounds of what is in any frame ``(gdim, 2)``."""
@@ -130,6 +152,14 @@ def _bounds(least: float, most: float, levels: int) -> Array:
     return np.asarray(MaxNLocator(levels).tick_values(least, most))
 
 
+def _colours(name: str, pressed: bool) -> Any:
+    """A colour map, of pressures with grey where there is none."""
+    from matplotlib.cm import ScalarMappable
+
+    colours = ScalarMappable(cmap=name).cmap
+    return colours.with_extremes(under=NO_PRESSURE) if pressed else colours
+
+
 class Drawn2D(Drawn):
     """Coloured cells, their edges, the colour bar, contact forces as arrows."""
 
@@ -155,11 +185,12 @@ class Drawn2D(Drawn):
         for side in self.sides:
             x = frame.x * [side, 1.0]
             coloured = ax.tricontourf(
-                *x.T, self.pieces.faces, frame.values, levels=self.bounds, cmap=how.cmap, extend=self.extend
+                *x.T, self.pieces.faces, frame.values, levels=self.bounds, cmap=self.cmap, extend=self.extend
             )
             if how.cells:
                 ax.add_collection(LineCollection(x[self.pieces.edges], colors="k", linewidths=0.25, alpha=0.35))
         ax.figure.colorbar(coloured, ax=ax, label=how.label, shrink=0.85)
+        self._draw_rigid(ax, frame)
         ax.set(xlim=self.box[0], ylim=self.box[1], aspect="equal", xlabel="x", ylabel="y")
         at, arrows = self._arrows(frame)
         for side in self.sides if len(at) else ():
@@ -167,6 +198,17 @@ class Drawn2D(Drawn):
                 *(at * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=1.0,
                 color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
             )  # fmt: skip
+
+    def _draw_rigid(self, ax: Any, frame: Frame) -> None:
+        """Rigid targets, hatched behind their surface."""
+        for shape in frame.rigid:
+            (x, y), points = grid(self.box, 400)
+            if self.how.mirror:
+                points[:, 0] = np.abs(points[:, 0])
+            height = shape.height(points).reshape(len(y), len(x))
+            if np.nanmin(height) < 0 < np.nanmax(height):
+                ax.contourf(x, y, height, levels=[np.nanmin(height), 0.0], colors=RIGID, hatches=["////"], alpha=0.6, zorder=0.5)
+                ax.contour(x, y, height, levels=[0.0], colors="k", linewidths=0.8, zorder=2)
 
 
 class Drawn3D(Drawn):
@@ -178,18 +220,40 @@ class Drawn3D(Drawn):
         from matplotlib.colors import BoundaryNorm, ListedColormap
 
         n = len(self.bounds) - 1
-        colours = ListedColormap(ScalarMappable(cmap=how.cmap).cmap(np.linspace(0.0, 1.0, n)))
+        colours = ListedColormap(self.cmap(np.linspace(0.0, 1.0, n))).with_extremes(under=self.cmap.get_under())
         self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
-        between = [np.interp(f.values, self.bounds, np.arange(n + 1.0)) for f in frames]
-        box = None if how.window is None else self.box
-        arrows = [self._arrows(f) for f in frames]
-        images = pictures3d.images(
-            [f.x for f in frames], pieces.faces, between, arrows, colours, self.box, box, how.view, how.cells
+        look = pictures3d.Look(
+            colours, NO_PRESSURE if how.pressed else None, self.box, how.window is not None, how.view, how.cells, how.width
         )
+        solids = [
+            pictures3d.Solid(f.x, self._between(f.values), (f.cuts[0], self._between(f.cuts[1])), self._arrows(f), f.rigid)
+            for f in frames
+        ]
+        images = pictures3d.images(pieces.faces, solids, look)
         self.images = {id(f): image for f, image in zip(frames, images)}
+
+    def _between(self, values: Array) -> Array:
+        """Values as the number of their colour from 0, below 0 where a pressure is none."""
+        number = np.interp(values, self.bounds, np.arange(len(self.bounds)))
+        return np.where(values < self.bounds[0], -1.0, number) if self.how.pressed else number
 
     def draw(self, ax: Any, frame: Frame) -> None:
         """Draw a frame into a panel."""
         ax.imshow(self.images[id(frame)])
         ax.axis("off")
         ax.figure.colorbar(self.colours, ax=ax, label=self.how.label, shrink=0.85, extend=self.extend, spacing="proportional")
+        if self.how.triad:
+            _draw_triad(ax, self.how.view)
+
+
+def _draw_triad(ax: Any, view: Array) -> None:
+    """The axes of the scene as the eye sees them, in a corner of the panel."""
+    right, up = pictures3d.screen(view)
+    inset = ax.inset_axes((-0.06, -0.06, 0.16, 0.16))
+    for name, axis in zip("xyz", np.eye(3)):
+        to = np.array([axis @ right, axis @ up])
+        inset.annotate("", to, (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "lw": 1.0, "color": "k", "shrinkA": 0, "shrinkB": 0})
+        if np.linalg.norm(to) > 0.2:
+            inset.text(*(1.35 * to), name, ha="center", va="center", fontsize=8)
+    inset.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5), aspect="equal")
+    inset.axis("off")

@@ -34,7 +34,8 @@ def animate(
 ) -> Iterator[T]:
     """Yield the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
 
-    All frames have the same window, colours and lengths of arrows::
+    All frames have the same window, colours and lengths of arrows, and a title with the load factor or time, with as many digits as
+    tell them apart::
 
         for step in uem.animate("out/snap.gif", problem, uem.load_steps(problem, 20), field=stress, label="stress"):
             ...
@@ -67,7 +68,7 @@ def animate(
         every = given.count("every", every)
         given.vector("size", size, 2)
         rate = given.number("frames_per_second", frames_per_second, given.POSITIVE)
-        known = dict(plot_scene.__kwdefaults__ or {})
+        known = {name: value for name, value in (plot_scene.__kwdefaults__ or {}).items() if name not in ("size", "dpi")}
         for name in how:
             given.word("argument of animate", name, ("every", "frames_per_second", "size", *known))
     on_rank_0(problem.comm, f"the film {path} cannot be written", lambda: _prepare(path))
@@ -80,7 +81,7 @@ def _film(path: Path, drawing: Drawing, steps: Iterable[T], every: int, rate: fl
     try:
         for number, step in enumerate(steps):
             if number % every == 0:
-                frames.append(drawing.take(_title(number, step)))
+                frames.append(drawing.take(_state(number, step)))
             yield step
     except BaseException:
         # ranks may leave the loop at different times: nothing here is collective
@@ -96,11 +97,22 @@ def _film(path: Path, drawing: Drawing, steps: Iterable[T], every: int, rate: fl
             raise OutputError(f"the film {path} cannot be written ({error}): {REMEDY}") from error
 
 
-def _title(number: int, step: object) -> str:
-    """What a frame is called."""
+def _state(number: int, step: object) -> tuple[str, float]:
+    """What tells the state after a step from others: a word and a number."""
     if isinstance(step, TimeStep):
-        return f"time {step.time:.3g}"
-    return f"load {step.factor:.3g}" if isinstance(step, LoadStep) else f"step {number + 1}"
+        return "time", step.time
+    if isinstance(step, LoadStep):
+        return f"{step.step}, load" if step.step else "load", step.factor
+    return "step", number + 1
+
+
+def titles(states: list[tuple[str, float]]) -> list[str]:
+    """Words and numbers of states, with as few digits, but three, as tell different ones apart."""
+    for digits in range(3, 17):
+        found = [f"{word} {number:.{digits}g}".strip() for word, number in states]
+        if len(set(found)) == len(set(states)):
+            break
+    return found
 
 
 def _prepare(path: Path) -> None:
@@ -125,12 +137,14 @@ def _write(path: Path, drawing: Drawing, frames: list[Frame | None], rate: float
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     canvas = new_canvas(f"the film {path}", size)
+    # smaller than a picture
+    drawing.width = round(1.25 * 100 * size[0])
     drawn = drawing.over(taken)
     writer = (PillowWriter if path.suffix == ".gif" else FFMpegWriter)(fps=rate)
     with writer.saving(canvas, str(path), 100):
-        for frame in taken:
+        for frame, title in zip(taken, titles([frame.state for frame in taken])):
             canvas.clear()
             ax = canvas.subplots()
             drawn.draw(ax, frame)
-            ax.set_title(frame.title)
+            ax.set_title(title)
             writer.grab_frame()

@@ -15,12 +15,15 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.tags import Part, as_tag
+from uem_dolfinx.output.sections import Shape, rigid_shapes, section, tetrahedra
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
 TRIANGLES = {"triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]]}
 #: Vertices in their order around a facet or a 2D cell, by their number.
 AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
+#: Corners and values of no triangle.
+NO_SECTION = (np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,17 @@ class Frame:
         x: displaced vertices ``(n, gdim)``.
         values: of the field there ``(n,)``.
         forces: positions, forces and pressures of the contactors, one for each contact.
-        title: which state it is.
+        state: what tells which state it is, a word and a number.
+        cuts: triangles ``(k, 3, 3)`` in which the window cuts the bodies of a 3D scene, and the field at their corners ``(k, 3)``.
+        rigid: rigid targets where they are.
     """
 
     x: Array
     values: Array
     forces: list[tuple[Array, Array, Array]]
-    title: str
+    state: tuple[str, float]
+    cuts: tuple[Array, Array]
+    rigid: list[Shape]
 
 
 class Gathering:
@@ -62,11 +69,28 @@ class Gathering:
         scale: magnification of the displacement.
         arrows: whether contact forces are wanted.
         surface: facets of a 3D scene that are wanted; None takes the whole outside.
+        window: bounds of what is wanted ``(gdim, 2)``, where bodies of a 3D scene are cut; None cuts nothing.
+        rigid: whether rigid targets are wanted.
     """
 
-    def __init__(self, problem: UnitedProblem, field: Any, scale: float, arrows: bool, surface: Part | None):
-        self.problem, self.field, self.scale, self.arrows = problem, field, scale, arrows
+    def __init__(
+        self,
+        problem: UnitedProblem,
+        field: Any,
+        scale: float,
+        arrows: bool,
+        surface: Part | None,
+        window: Array | None,
+        rigid: bool,
+    ):
+        self.problem, self.field, self.scale, self.arrows, self.rigid = problem, field, scale, arrows, rigid
         mesh = problem.config.mesh
+        solid = problem.config.gdim == 3 and surface is None and window is not None
+        #: Where bodies are cut, and their tetrahedra.
+        self._planes = (
+            [(axis, bound) for axis, ends in enumerate(window) for bound in ends] if solid and window is not None else []
+        )
+        self._cells = tetrahedra(mesh) if solid else np.zeros((0, 4), np.int64)
         faces, edges = boundary(mesh, surface) if problem.config.gdim == 3 else None, np.zeros((0, 4), np.int64)
         if faces is None:
             faces, edges = _vertex_cells(mesh)
@@ -79,16 +103,17 @@ class Gathering:
             starts = np.cumsum([0, *(n for n, _, _ in parts)])
             self.pieces = Pieces(*(np.concatenate([p[k] + start for p, start in zip(parts, starts)]) for k in (1, 2)))
 
-    def take(self, title: str = "") -> Frame | None:
+    def take(self, state: tuple[str, float] = ("", 0.0)) -> Frame | None:
         """The present state on rank 0, None elsewhere (collective)."""
         comm, used = self.problem.comm, self._used
-        x, values = vertex_positions(self.problem, self.scale)[used], vertex_values(self.problem, self.field)[used]
-        parts = comm.gather((x, values))
+        x, values = vertex_positions(self.problem, self.scale), vertex_values(self.problem, self.field)
+        cuts = [section(x, values, self._cells, *plane) for plane in self._planes]
+        parts = comm.gather((x[used], values[used], *(np.concatenate(c) for c in zip(*cuts, NO_SECTION))))
         forces = [gather_contactors(contact, self.scale) for contact in self.problem.contacts] if self.arrows else []
         if parts is None:
             return None
-        x, values = (np.concatenate(part) for part in zip(*parts))
-        return Frame(x, values, forces, title)
+        x, values, *cut = (np.concatenate(part) for part in zip(*parts))
+        return Frame(x, values, forces, state, (cut[0], cut[1]), rigid_shapes(self.problem.contacts) if self.rigid else [])
 
 
 def vertex_values(problem: UnitedProblem, field: Any) -> Array:

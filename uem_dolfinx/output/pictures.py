@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import MissingBackendError, OutputError
@@ -51,7 +52,7 @@ def new_canvas(what: str, size: tuple[float, float]) -> Any:
 
 @contextmanager
 def figure(
-    path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8)
+    path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
 ) -> Iterator[list[Any]]:
     """Canvas with panels side by side, saved at the end; the backend of matplotlib stays as it is (collective).
 
@@ -60,6 +61,7 @@ def figure(
         comm: communicator; rank 0 draws, and to it alone everything is gathered.
         panels: number of panels.
         size: width and height of a panel in inches.
+        dpi: points of the picture per inch; ``.pdf`` and ``.svg`` have lines instead, but for images of 3D scenes.
 
     Yields:
         The panels: matplotlib Axes on rank 0, None elsewhere. Hand them to :func:`plot_scene` and :func:`plot_pressure`.
@@ -71,25 +73,30 @@ def figure(
     """
     with agreed(comm):
         drawn = path is not None and comm.rank == 0
-        canvas = new_canvas(f"the picture {path}", (panels * size[0], size[1])) if drawn else None
+        width, height = given.vector("size", size, 2)
+        dpi = given.number("dpi", dpi, given.POSITIVE)
+        canvas = new_canvas(f"the picture {path}", (panels * width, height)) if drawn else None
     with agreed(comm):
         if path is None or canvas is None:
             yield [None] * panels
             return
+        canvas.set_dpi(dpi)
         yield list(np.atleast_1d(canvas.subplots(1, panels)))
         try:
             if isinstance(path, (str, Path)):
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
-            canvas.savefig(path, format=None if isinstance(path, (str, Path)) else "png", dpi=150, bbox_inches="tight")
+            canvas.savefig(path, format=None if isinstance(path, (str, Path)) else "png", dpi=dpi, bbox_inches="tight")
         except OSError as error:
             raise OutputError(f"the picture {path} cannot be written ({error}): {REMEDY}") from error
 
 
 @contextmanager
-def _panel(picture: str | Path | BinaryIO | Any, comm: MPI.Comm) -> Iterator[Any]:
+def _panel(
+    picture: str | Path | BinaryIO | Any, comm: MPI.Comm, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
+) -> Iterator[Any]:
     """The panel that is given, or the one of a picture of this name; what is raised in drawing is raised on all ranks (collective)."""
     if isinstance(picture, (str, Path, BytesIO)):
-        with figure(picture, comm) as (panel,):
+        with figure(picture, comm, size=size, dpi=dpi) as (panel,):
             yield panel
     else:
         with agreed(comm):
@@ -111,6 +118,11 @@ def plot_scene(
     cmap: str = "viridis",
     view: str | Sequence[float] | None = None,
     surface: Part | None = None,
+    percentiles: Sequence[float] | None = None,
+    rigid: bool = True,
+    triad: bool = True,
+    size: tuple[float, float] = (6.4, 4.8),
+    dpi: float = 150,
 ) -> Picture | None:
     """Draw a scene where it is now, coloured by a field: the cells of a 2D scene, the outside of a 3D one (collective).
 
@@ -119,11 +131,12 @@ def plot_scene(
         picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
             Jupyter shows it.
         field: scalar UFL expression, averaged at the nodes of each body; a scalar Lagrange Function, drawn with its values at the
-            vertices; a contact or a list of them, for their pressure; None is the size of the displacement.
+            vertices; a contact or a list of them, for their pressure, grey where there is none; None is the size of the displacement.
         label: of the colour bar.
         levels: number of colours, or their bounds.
         scale: magnification of the displacement.
-        window: ``(x_min, x_max, y_min, y_max)`` to show, in 3D with ``z_min, z_max``; None shows everything.
+        window: ``(x_min, x_max, y_min, y_max)`` to show, in 3D with ``z_min, z_max``, where bodies are cut open and the field is drawn
+            on the sections; None shows everything.
         mirror: draw the reflection at ``x = 0`` too, for half models; 2D only.
         cells: draw the edges of the cells.
         arrows: draw the contact forces per tributary area, on the contactors; the default in 2D. In 3D they are seen with the contactor
@@ -131,6 +144,12 @@ def plot_scene(
         cmap: colour map.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
         surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or what a contact takes; 3D only.
+        percentiles: two of the values shown between which the colours lie, such as ``(1, 99)``, so that a few large values, as at
+            corners, do not take them all; None takes all values.
+        rigid: draw rigid targets.
+        triad: draw the axes in a corner; 3D only.
+        size: width and height in inches; of a panel it is that of :func:`figure`.
+        dpi: points per inch; of a panel it is that of :func:`figure`.
 
     Returns:
         The picture if it has neither name nor panel.
@@ -141,11 +160,13 @@ def plot_scene(
     """
     drawing = Drawing(
         problem, field=field, label=label, levels=levels, scale=scale, window=window, mirror=mirror, cells=cells, arrows=arrows,
-        cmap=cmap, view=view, surface=surface,
+        cmap=cmap, view=view, surface=surface, percentiles=percentiles, rigid=rigid, triad=triad,
     )  # fmt: skip
     frame, file = drawing.take(), BytesIO()
-    with _panel(file if picture is ... else picture, problem.comm) as panel:
+    with _panel(file if picture is ... else picture, problem.comm, size, dpi) as panel:
         if panel is not None and frame is not None:
+            # margins are cut off
+            drawing.width = max(drawing.width, round(2.0 * panel.get_window_extent().width))
             drawing.over([frame]).draw(panel, frame)
     return Picture(file.getvalue()) if picture is ... else None
 

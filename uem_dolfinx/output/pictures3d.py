@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -14,6 +15,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.errors import InputError, MissingBackendError
+from uem_dolfinx.output.sections import Shape, grid
 from uem_dolfinx.parallel import agree
 
 
@@ -39,29 +41,55 @@ def require(comm: MPI.Comm) -> None:
     agree(comm, error)
 
 
-def images(
-    points: Sequence[Array],
-    faces: Ints,
-    values: Sequence[Array],
-    arrows: Sequence[tuple[Array, Array]],
-    colours: Any,
-    box: Array,
-    window: Array | None,
-    view: Array,
-    edges: bool,
-) -> list[Array]:
+@dataclass(frozen=True)
+class Look:
+    """What all images of a film have in common.
+
+    Attributes:
+        colours: matplotlib's colour map, with its number of colours.
+        below: colour of values below 0; None is the first of the map.
+        box: bounds of what is looked at ``(3, 2)``.
+        cut: whether the surface is cut off at them.
+        view: direction from the scene to the eye ``(3,)``.
+        edges: draw the edges of the facets.
+        width: of an image before its margins are cut off, in points.
+    """
+
+    colours: Any
+    below: str | None
+    box: Array
+    cut: bool
+    view: Array
+    edges: bool
+    width: int
+
+
+@dataclass(frozen=True)
+class Solid:
+    """The scene in one state.
+
+    Attributes:
+        points: vertices ``(n, 3)``.
+        values: there, from 0 to the number of colours ``(n,)``.
+        cuts: triangles in which bodies are cut open ``(k, 3, 3)``, and values at their corners ``(k, 3)``.
+        arrows: where they begin, and from there to their tips ``(m, 3)``.
+        rigid: rigid surfaces.
+    """
+
+    points: Array
+    values: Array
+    cuts: tuple[Array, Array]
+    arrows: tuple[Array, Array]
+    rigid: Sequence[Shape]
+
+
+def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:
     """One image of a surface for each state, all from the same place and of the same size.
 
     Args:
-        points: vertices in each state ``(n, 3)``.
-        faces: vertices in their order around each facet ``(m, 3 or 4)``.
-        values: at the vertices in each state ``(n,)``, from 0 to the number of colours.
-        arrows: in each state where they begin, and from there to their tips ``(k, 3)``.
-        colours: matplotlib's colour map, with its number of colours.
-        box: bounds of what is looked at ``(3, 2)``.
-        window: the same where the surface is cut off at them; None draws it whole.
-        view: direction from the scene to the eye ``(3,)``.
-        edges: draw the edges of the facets.
+        faces: vertices in their order around each facet ``(n, 3 or 4)``.
+        solids: the states.
+        look: what they have in common.
 
     Returns:
         Images ``(height, width, 4)``, with their margins cut off.
@@ -69,39 +97,87 @@ def images(
     Raises:
         InputError: if nothing is in the window.
     """
-    import pyvista
-
-    # films are smaller
-    size = (1600, 1200) if len(points) == 1 else (800, 600)
-    table = np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel()
-    found = []
-    for x, v, (at, to) in zip(points, values, arrows):
-        surface = pyvista.PolyData(x, table)
-        surface["values"] = v
-        for axis, (low, high) in enumerate(() if window is None else window):
-            for bound, side in ((low, -1.0), (high, 1.0)):
-                surface = surface.clip(normal=side * np.eye(3)[axis], origin=bound * np.eye(3)[axis])
-        if not surface.n_cells:
-            raise InputError(f"window = {np.ravel(box).tolist()}: no part of the scene is in it")
-        with _quiet():
-            plotter = pyvista.Plotter(off_screen=True, window_size=size)
-            plotter.add_mesh(
-                surface, scalars="values", cmap=colours, n_colors=colours.N, clim=(0, colours.N), show_scalar_bar=False, show_edges=edges,
-                edge_color="black", edge_opacity=0.35, line_width=size[0] / 1600, ambient=0.7, diffuse=0.3, specular=0.0,
-            )  # fmt: skip
-            shown = ((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)
-            if shown.any():
-                plotter.add_arrows(
-                    at[shown], to[shown], color="white", show_edges=True, edge_color="gray", line_width=size[0] / 1600
-                )
-            up = (0.0, 0.0, 1.0) if np.hypot(*view[:2]) > 0 else (0.0, 1.0, 0.0)
-            plotter.view_vector(view, up)
-            plotter.reset_camera(bounds=box.ravel())
-            found.append(np.array(plotter.screenshot(None, transparent_background=True, return_img=True)))
-            plotter.close()
+    with _quiet():
+        found = [_image(faces, solid, look) for solid in solids]
     seen = np.any([image[..., 3] > 0 for image in found], axis=0)
     rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
     return [image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] for image in found]
+
+
+def screen(view: Array) -> tuple[Array, Array]:
+    """Directions to the right and upwards of an eye in this direction from the scene."""
+    up = np.array([0.0, 0.0, 1.0] if np.hypot(*view[:2]) > 0 else [0.0, 1.0, 0.0])
+    right = np.cross(up, view)
+    right /= np.linalg.norm(right)
+    return right, np.cross(view, right) / np.linalg.norm(view)
+
+
+def _image(faces: Ints, solid: Solid, look: Look) -> Array:
+    """The image of one state."""
+    import pyvista
+
+    line = look.width / 1600
+    plotter = pyvista.Plotter(off_screen=True, window_size=(look.width, 3 * look.width // 4))
+    skin = _polygons(solid.points, faces, solid.values)
+    corners = np.arange(3 * len(solid.cuts[0])).reshape(-1, 3)
+    section = _polygons(solid.cuts[0].reshape(-1, 3), corners, solid.cuts[1].ravel())
+    parts = [(_inside(surface, look), edges) for surface, edges in ((skin, look.edges), (section, False))]
+    if not any(surface.n_cells for surface, _ in parts):
+        raise InputError(f"window = {np.ravel(look.box).tolist()}: no part of the scene is in it")
+    for surface, edges in parts:
+        if surface.n_cells:
+            n = look.colours.N
+            plotter.add_mesh(
+                surface, scalars="values", cmap=look.colours, n_colors=n, clim=(0, n), below_color=look.below, show_scalar_bar=False,
+                show_edges=edges, edge_color="black", edge_opacity=0.3, line_width=line, ambient=0.75, diffuse=0.25, specular=0.0,
+            )  # fmt: skip
+    outline = parts[0][0].extract_feature_edges(
+        feature_angle=35.0, boundary_edges=True, manifold_edges=False, non_manifold_edges=False
+    )
+    if outline.n_cells:
+        plotter.add_mesh(outline, color="black", line_width=2.0 * line)
+    for shape in solid.rigid:
+        _add_rigid(plotter, shape, look)
+    at, to = solid.arrows
+    shown = ((at >= look.box[:, 0]) & (at <= look.box[:, 1])).all(axis=1)
+    if shown.any():
+        plotter.add_arrows(at[shown], to[shown], color="white", show_edges=True, edge_color="gray", line_width=line)
+    plotter.enable_anti_aliasing("ssaa")
+    plotter.view_vector(look.view, screen(look.view)[1])
+    plotter.reset_camera(bounds=look.box.ravel())
+    image = np.array(plotter.screenshot(None, transparent_background=True, return_img=True))
+    plotter.close()
+    return image
+
+
+def _polygons(points: Array, faces: Ints, values: Array) -> Any:
+    """PyVista's surface of these facets."""
+    import pyvista
+
+    surface = pyvista.PolyData(points, np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel())
+    surface["values"] = values
+    return surface
+
+
+def _inside(surface: Any, look: Look) -> Any:
+    """What of a surface is in the window."""
+    for axis, (low, high) in enumerate(look.box if look.cut else ()):
+        for bound, side in ((low, -1.0), (high, 1.0)):
+            if surface.n_cells:
+                surface = surface.clip(normal=side * np.eye(3)[axis], origin=bound * np.eye(3)[axis])
+    return surface
+
+
+def _add_rigid(plotter: Any, shape: Shape, look: Look) -> None:
+    """A rigid surface in the box, where its function vanishes; bodies are seen through it."""
+    import pyvista
+
+    axes, points = grid(look.box, 60)
+    volume = pyvista.RectilinearGrid(*axes)
+    volume["height"] = shape.height(points)
+    surface = volume.contour([0.0], scalars="height")
+    if surface.n_cells:
+        plotter.add_mesh(surface, color="lightsteelblue", opacity=0.45, show_scalar_bar=False, smooth_shading=True)
 
 
 @contextmanager
