@@ -14,7 +14,9 @@ Options:
 # A shallow clamped arch with the middle line w = e/2 (1 + cos kx), k = 2 pi / L, carries the dead load q cos kx. Shallow arches
 # under it keep their shape, w = a/2 (1 + cos kx), and
 #
-#     q = E A k^4 ((e - a) t^2 / 24 + a (e^2 - a^2) / 32).
+# $$
+# q = E A k^4 \left( \frac{(e - a)\, t^2}{24} + \frac{a\,(e^2 - a^2)}{32} \right).
+# $$
 #
 # From a limit point on the load has to fall, lest the arch jump; where it would rise again, the arch comes upon a floor. With
 # `arc_length=True` the first load step alone is made by its load. All others go as far in displacement, and find the load.

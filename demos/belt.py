@@ -13,7 +13,9 @@ Options:
 # A thin belt lies around half of a fixed pulley. Its slack end is pulled by the force T2, its tight end is drawn down until the belt slips
 # everywhere. Where the tension is T, the belt presses the pulley by p = T/R per length, and friction mu p makes T grow along the belt by
 #
-#     dT / dphi = mu T,    T1 / T2 = exp(mu phi)
+# $$
+# \frac{dT}{d\varphi} = \mu T, \qquad \frac{T_1}{T_2} = e^{\mu \varphi}
+# $$
 #
 # (Euler, 1769; Eytelwein, 1808). Before, slip begins at the tight end and eats its way round: behind it the belt still sticks under T2.
 # Friction acts on the inside of the belt, half its thickness t below its axis, which makes the exponent smaller by t / (2 R) of itself.

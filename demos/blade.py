@@ -15,7 +15,9 @@ Options:
 # one structure. Natural frequencies are those of small vibrations about this state: contactors that stick are united in all components,
 # those that slip along the normal alone. With P of that state
 #
-#     P'KP q = omega^2 P'MP q
+# $$
+# P^\mathsf{T} K P\, q = \omega^2 P^\mathsf{T} M P\, q
+# $$
 #
 # which SLEPc solves. As long as all flanks stick, the frequencies must be those of blade and disc in one piece.
 

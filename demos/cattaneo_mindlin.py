@@ -17,17 +17,25 @@ Options:
 # friction do not disturb each other: the pressure stays Hertz', and with f(r; c) = (c/a) sqrt(1 - r^2/c^2) within c, zero outside, the
 # friction is
 #
-#     q / (mu p0) = f(r; a) - f(r; c),    c = a (1 - Q / (mu P))^(1/2),    under a sphere c = a (1 - Q / (mu P))^(1/3),
+# $$
+# \frac{q}{\mu p_0} = f(r; a) - f(r; c),
+# \qquad c = a \left(1 - \frac{Q}{\mu P}\right)^{1/2}, \quad \text{under a sphere } c = a \left(1 - \frac{Q}{\mu P}\right)^{1/3},
+# $$
 #
 # with stick within c and slip outside. On the way back from Q1 everything sticks at first, then slips from the edge inwards the other way:
 #
-#     q / (mu p0) = f(r; a) - f(r; c1) - 2 (f(r; a) - f(r; b)),    b = a (1 - (Q1 - Q) / (2 mu P))^(1/2 or 1/3),
+# $$
+# \frac{q}{\mu p_0} = f(r; a) - f(r; c_1) - 2\,(f(r; a) - f(r; b)),
+# \qquad b = a \left(1 - \frac{Q_1 - Q}{2 \mu P}\right)^{1/2 \text{ or } 1/3},
+# $$
 #
 # and so on in each reversal (Cattaneo, 1938; Mindlin, J. Appl. Mech. 16, 259, 1949; Mindlin and Deresiewicz, J. Appl. Mech. 20, 327, 1953;
 # Johnson, Contact Mechanics, 7.2 to 7.4). The loop of force and displacement closes. Under the sphere distant points of both bodies move
 # against each other by
 #
-#     delta = 3 mu P (2 - nu) / (8 G a) (1 - (c/a)^2),
+# $$
+# \delta = \frac{3 \mu P (2 - \nu)}{8 G a} \left(1 - \frac{c^2}{a^2}\right),
+# $$
 #
 # and by twice the half of that in each reversal. Its bodies are 200 contact radii large, and half of both is modelled. Mindlin lets
 # all points slip along the push; across it the bodies would move by a part of nu / (4 - 2 nu), which he leaves aside.

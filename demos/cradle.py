@@ -17,7 +17,10 @@ Options:
 # rho c v / 2, for as long as waves take to the free ends and back, 2 L / c, and the force hands on all of the momentum. The far end of
 # the second bar moves with v from t_1 + L / c on and reaches the third one after another gap / v, and so on:
 #
-#     contact k lasts from t_k = k gap / v + (k - 1) L / c to t_k + 2 L / c,    r_k(t) = (t - t_k) c / (2 L), within 0 and 1
+# $$
+# \text{contact } k \text{ lasts from } t_k = \frac{k\, g}{v} + \frac{(k - 1) L}{c} \text{ to } t_k + \frac{2 L}{c},
+# \qquad r_k(t) = \frac{(t - t_k)\, c}{2 L} \text{ within 0 and 1}
+# $$
 #
 # is the part of the momentum that it has handed on, and bar k has the mean velocity v (r_(k-1) - r_k), with r_0 = 1 for the first
 # and r_N = 0 for the last. In the end the last bar has v, and the others rest without vibration.

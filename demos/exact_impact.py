@@ -13,12 +13,14 @@ Options:
 # falls with a velocity of 10 under a gravity of 10 from 3.5805 above the ground. The spring yields at a force of 150. With the
 # displacement u upwards, omega = sqrt(200) and each phase's own time, the motion is
 #
-#     fall            -10 t - 5 t^2
-#     elastic         -3.5805 - (13.1/omega) sin omega t + 0.05 cos omega t - 0.05
-#     plastic         -4.3305 + 70 t^2 - 8.608717 t
-#     unloading       -3.845179 - 0.7 cos omega t - 0.05
-#     flight          -3.845179 + 9.874209 t - 5 t^2
-#     second contact  -3.845179 - (9.874209/omega) sin omega t + 0.05 cos omega t - 0.05
+# | phase | position |
+# |---|---|
+# | fall | $-10\, t - 5\, t^2$ |
+# | elastic | $-3.5805 - \frac{13.1}{\omega} \sin \omega t + 0.05 \cos \omega t - 0.05$ |
+# | plastic | $-4.3305 + 70\, t^2 - 8.608717\, t$ |
+# | unloading | $-3.845179 - 0.7 \cos \omega t - 0.05$ |
+# | flight | $-3.845179 + 9.874209\, t - 5\, t^2$ |
+# | second contact | $-3.845179 - \frac{9.874209}{\omega} \sin \omega t + 0.05 \cos \omega t - 0.05$ |
 #
 # Here the spring is a quadrilateral 20 wide and `length` high in plane stress, free sideways, with half the mass at each of its
 # upper nodes, upwards only. Its Green-Lagrange strain differs from shortening over length by a part of 0.75 / (2 length).

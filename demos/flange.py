@@ -20,7 +20,9 @@ Options:
 #
 # As long as nothing opens or slips, the structure is linear and the bolt carries
 #
-#     F = F_0 + phi P
+# $$
+# F = F_0 + \varphi P
+# $$
 #
 # with phi from one solve of the linear structure, in which all faces are tied. The joint itself carries F - P. Its pads are pulled
 # beside their middle: they open from the pipe outwards, and then the bolt takes up ever more, as it is pried.

@@ -17,7 +17,9 @@ Options:
 #
 # Half-spaces under the line load P would touch over the half width a and press each other with at most p0, after Hertz:
 #
-#     p0 = sqrt(P E* / (pi R)),    a = 2 P / (pi p0),    1/E* = 2 (1 - nu^2) / E.
+# $$
+# p_0 = \sqrt{\frac{P E^*}{\pi R}}, \qquad a = \frac{2 P}{\pi p_0}, \qquad \frac{1}{E^*} = \frac{2 (1 - \nu^2)}{E}.
+# $$
 #
 # Nothing but the slopes of facets tells where along the block it comes to rest. With either coupling, `node_to_surface` or
 # `--coupling mortar`, P is the weight.

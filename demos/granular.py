@@ -16,12 +16,17 @@ Options:
 #
 # Rows of elastic discs fall into a box of three rigid planes. Which of them will meet is not known beforehand, and need not be:
 #
-#     contact = uem.GeneralContact(rigid=walls, friction=mu)
+# ```python
+# contact = uem.GeneralContact(rigid=walls, friction=mu)
+# ```
 #
 # The discs move in a viscous medium, whose drag on a volume is gamma rho v, and their material is viscous as well, so that they come
 # to rest. Two sums need no reference solution. In every step the momentum grows by what the weight W, the medium and the contacts give,
 #
-#     p(n+1) - p(n) = dt W + dt (f(n) + f(n+1)) / 2 - dt (d(n) + d(n+1)) / 2,    d = gamma rho int v dx,
+# $$
+# p_{n+1} - p_n = \Delta t\, W + \frac{\Delta t}{2} (f_n + f_{n+1}) - \frac{\Delta t}{2} (d_n + d_{n+1}),
+# \qquad d = \gamma \rho \int v\, dx,
+# $$
 #
 # where f is the sum of all nodal contact forces, in which those between the discs must cancel. At rest the floor, with the
 # friction of the walls, carries the weight.

@@ -14,7 +14,10 @@ Options:
 # block's bottom slides on rollers and x = 0 is a plane of symmetry. Half-spaces under the line load P would, after Hertz,
 # touch over the half width a and press each other with
 #
-#     p(x) = p0 sqrt(1 - x^2/a^2),    p0 = sqrt(P E* / (pi R)),    a = 2 P / (pi p0),    1/E* = 2 (1 - nu^2) / E.
+# $$
+# p(x) = p_0 \sqrt{1 - \frac{x^2}{a^2}}, \qquad p_0 = \sqrt{\frac{P E^*}{\pi R}}, \qquad a = \frac{2 P}{\pi p_0},
+# \qquad \frac{1}{E^*} = \frac{2 (1 - \nu^2)}{E}.
+# $$
 #
 # The bodies are finite, so P comes from the computation, and the pressure is compared with Hertz at that P.
 

@@ -12,7 +12,9 @@ Options:
 # A rigid paraboloid of radius R = 0.5 is pressed by d = 0.02 into an elastic block, of which a quarter is modelled,
 # [0, 1]^2 x [-1, 0], with hexahedra that get smaller towards the origin. The surface z = 0 must stay below the indenter,
 #
-#     u_z <= h(x, y) = -d + (x^2 + y^2) / (2 R).
+# $$
+# u_z \le h(x, y) = -d + \frac{x^2 + y^2}{2 R}.
+# $$
 #
 # The penalty method presses with pen <u_z - h>+ wherever the surface has gone too far, so it needs the overlap it forbids, and
 # a number. The united elements eliminate u_z at the nodes that press. The exact solution of the discrete problem on the default

@@ -14,7 +14,10 @@ Options:
 # the flat top of the half sphere moves down by d, the block's bottom stays at its height. Hertz, for half-spaces that approach
 # each other by d, has
 #
-#     a = sqrt(R d),    F = 4/3 E* sqrt(R) d^(3/2),    p0 = 3 F / (2 pi a^2),    1/E* = 2 (1 - nu^2) / E.
+# $$
+# a = \sqrt{R d}, \qquad F = \frac{4}{3} E^* \sqrt{R}\, d^{3/2}, \qquad p_0 = \frac{3 F}{2 \pi a^2},
+# \qquad \frac{1}{E^*} = \frac{2 (1 - \nu^2)}{E}.
+# $$
 #
 # The displacements around a contact fade like 1/r only, so a finite body is stiffer than a half-space, by a part of the order of
 # a/R. The sphere here is 200 contact radii large, which leaves about 0.3 % of it in the force; the error of the mesh is larger, and

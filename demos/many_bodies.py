@@ -16,7 +16,9 @@ Options:
 # Rows of elastic discs whose neighbours move towards each other and collide, all at once, and stay in contact while waves run through
 # them and back. Five discs make a row, and rows are added. With one declaration for all of them,
 #
-#     contact = uem.GeneralContact(friction=mu)
+# ```python
+# contact = uem.GeneralContact(friction=mu)
+# ```
 #
 # a step should take time in proportion to the number of bodies, as it does without contact. Only pairs that come near each other are
 # looked at, and dense matrices are at most of the bodies that touch. Times are those of the processor, of the slowest rank.

@@ -12,7 +12,9 @@ Options:
 # Two unit blocks lie one upon the other between lateral rollers. The lower one stands on rollers too, and a pressure p = 1 acts on
 # the top of the upper one. Nothing holds the upper block but the contact, through which p must pass unchanged:
 #
-#     sigma_zz = -p    everywhere.
+# $$
+# \sigma_{zz} = -p \quad \text{everywhere.}
+# $$
 #
 # Contactors are nodes, and each hands its force to the target's nodes with the weights of the target's shape functions. The target
 # receives a constant pressure exactly if every function of its surface is one of the contactor's surface too, that is, if the

@@ -15,7 +15,9 @@ Options:
 # A disc of radius b + delta sits in a ring of radii b and c, of other elastic constants. After Lamé the disc shrinks and the ring
 # grows under the pressure p between them by
 #
-#     u_disc = p b (1 - nu_1') / E_1',    u_ring = p b ((c^2 + b^2) / (c^2 - b^2) + nu_2') / E_2',
+# $$
+# u_{disc} = \frac{p\, b\, (1 - \nu_1')}{E_1'}, \qquad u_{ring} = \frac{p\, b}{E_2'} \left( \frac{c^2 + b^2}{c^2 - b^2} + \nu_2' \right),
+# $$
 #
 # where in plane strain E' = E / (1 - nu^2) and nu' = nu / (1 - nu). Both make up for the interference: u_disc + u_ring = delta gives
 # p. There is no other load: both meshes overlap at the start, and the first solve takes the overlap away.

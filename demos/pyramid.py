@@ -16,7 +16,10 @@ Options:
 # with what the disc above on the same side hands on and w / sqrt 3 more, so that the k-th disc from the top of a side pushes with
 # k w / sqrt 3, and
 #
-#     the floor carries n (n + 1) w / 2,    each wall floor(n^2 / 4) w / (2 sqrt 3)    for n discs in the lowest row.
+# $$
+# F_{floor} = \frac{n (n + 1)}{2} w,
+# \qquad F_{wall} = \left\lfloor \frac{n^2}{4} \right\rfloor \frac{w}{2 \sqrt 3} \quad \text{for } n \text{ discs in the lowest row.}
+# $$
 #
 # For n = 4 the outer discs of the lowest row touch the inner ones, which are pushed outwards as well.
 #

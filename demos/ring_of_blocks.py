@@ -15,7 +15,9 @@ Options:
 # A disc is cut into sectors that meet in its centre. Each lies with its last side, as contactor, on the first side of the next one, its
 # target, all the way round. The rim is pushed inwards by eps R, so that the whole disc shrinks evenly,
 #
-#     u = -eps x,    sigma = -p,    p = 2 eps (lambda + mu)    in plane strain,
+# $$
+# u = -\varepsilon x, \qquad \sigma = -p, \qquad p = 2 \varepsilon (\lambda + \mu) \quad \text{in plane strain,}
+# $$
 #
 # and every side carries p, whatever the number of sectors and wherever their nodes are.
 #
@@ -23,7 +25,9 @@ Options:
 # the second's, that of the second in terms of the third's, and the last one's in terms of the first's: for three sectors each follows
 # the next by cos 120 degrees. Such rings have no order of elimination; they are solved as a small system, `algebra/rings.py`:
 #
-#     A du = W C (1 - L A) du - W gap,    W = (1 - C L)^-1
+# $$
+# A\, du = W C (1 - L A)\, du - W g, \qquad W = (1 - C L)^{-1}
+# $$
 #
 # With nodes the meshes match at the sides; with `--coupling mortar` give `--more 1`, which divides every sector more finely than the
 # one before: pressures stay even all the same.

@@ -13,11 +13,15 @@ Options:
 # A disc with a narrow hole, of radii R and r, lies on a rough rigid plane, which is tilted by alpha at once. With `k = (1 + r^2/R^2) / 2`
 # its moment of inertia over m R^2, a rigid disc rolls with the acceleration
 #
-#     g sin(alpha) / (1 + k)        while        tan(alpha) < mu (1 + 1/k),
+# $$
+# \frac{g \sin \alpha}{1 + k} \quad \text{while} \quad \tan \alpha < \mu \left(1 + \frac{1}{k}\right),
+# $$
 #
 # which is 2/3 g sin(alpha) up to 3 mu without a hole. Beyond, friction is not enough: it slides and turns with
 #
-#     g (sin(alpha) - mu cos(alpha)),        angular acceleration  mu g cos(alpha) / (k R).
+# $$
+# g\, (\sin \alpha - \mu \cos \alpha), \qquad \text{angular acceleration } \frac{\mu\, g \cos \alpha}{k R}.
+# $$
 #
 # This disc is elastic: it rests on some of its nodes, whose anchors it leaves one after the other as it rolls over them.
 

@@ -20,7 +20,10 @@ Options:
 # The trapezoidal rule does not keep the angular momentum `L(x, v) = sum m x x v` itself: that swings by what is of second order in the
 # step. But its states are the midpoints of a path of the midpoint rule, which does: from step to step, to rounding,
 #
-#     L(x - v dt/2, v - a dt/2) at n+1  =  the same at n  +  dt (moment of the wall's forces at n).
+# $$
+# L_{n+1} = L_n + \Delta t\, m_n,
+# \qquad L = L\!\left(x - \frac{\Delta t}{2} v,\; v - \frac{\Delta t}{2} a\right), \quad m_n \text{ the moment of the wall's forces at } n.
+# $$
 #
 # Friction takes energy, and no more than there was.
 

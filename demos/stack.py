@@ -14,7 +14,9 @@ Options:
 # Three unit blocks stand between lateral rollers, the lowest on the ground. Their Young's moduli alternate between 1 and `ratio`;
 # the top of the stack is pushed down by d. Held at its sides, a block is an oedometer of modulus
 #
-#     M = E (1 - nu) / ((1 + nu) (1 - 2 nu)),
+# $$
+# M = \frac{E (1 - \nu)}{(1 + \nu)(1 - 2 \nu)},
+# $$
 #
 # so that the stack is three springs in series, which carry F = d / (1/M1 + 1/M2 + 1/M3), and interface k settles by
 # F (1/M1 + ... + 1/Mk). The meshes grow finer from the bottom to the top, and every block rests with its bottom, as contactor, on

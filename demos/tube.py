@@ -18,7 +18,9 @@ Options:
 #
 # The reference is the inextensible elastica of a quarter of the tube, with the thickness of the wall t between the middles of both sides:
 #
-#     x' = cos a, y' = sin a, a' = k,    EI k' = N sin a - Q cos a,    N' = -p sin a, Q' = p cos a
+# $$
+# x' = \cos a, \quad y' = \sin a, \quad a' = k, \quad E I\, k' = N \sin a - Q \cos a, \quad N' = -p \sin a, \quad Q' = p \cos a
+# $$
 
 # %%
 import common

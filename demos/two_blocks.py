@@ -14,8 +14,9 @@ Options:
 # M = E (1 - nu) / ((1 + nu) (1 - 2 nu)). The lower one stands on the ground; the top of the upper one is pushed down by d.
 # Shortened by e, a block pushes back with
 #
-#     linear:                  F = M e
-#     St Venant-Kirchhoff:     F = M e (1 - e) (2 - e) / 2
+# $$
+# F = M e \quad \text{(linear)}, \qquad F = \frac{M}{2}\, e\, (1 - e)(2 - e) \quad \text{(St Venant-Kirchhoff)}
+# $$
 #
 # and the interface moves down by e of the lower block, so that the linear blocks carry F = d k1 k2 / (k1 + k2). Multipliers
 # and penalties lose digits as the blocks' stiffnesses drift apart; elimination has no parameter that could.

@@ -18,11 +18,15 @@ Options:
 # The slab method takes stresses to be the same over the height. Equilibrium of a slab of the width dx, perfectly plastic with the yield
 # stress Y, gives the pressure over x and the mean of it [Hosford and Caddell, Metal Forming, ch. 7]
 #
-#     p = 2/sqrt(3) Y exp(2 mu (b/2 - x) / h),    mean p = 2/sqrt(3) Y (exp(q) - 1) / q,    q = mu b / h,
+# $$
+# p = \frac{2 Y}{\sqrt 3} e^{2 \mu (b/2 - x) / h}, \qquad \bar p = \frac{2 Y}{\sqrt 3} \frac{e^q - 1}{q}, \qquad q = \frac{\mu b}{h},
+# $$
 #
 # where the width b grows as the height h shrinks. `--kind axisymmetric` makes the billet a disc of the same section, for which
 #
-#     p = Y exp(2 mu (a - r) / h),    mean p = 2 Y (exp(q) - 1 - q) / q^2,    q = 2 mu a / h
+# $$
+# p = Y e^{2 \mu (a - r) / h}, \qquad \bar p = 2 Y \frac{e^q - 1 - q}{q^2}, \qquad q = \frac{2 \mu a}{h}
+# $$
 #
 # with the radius a. The method knows nothing of the shear beside the tools and of bulging sides, and is good to some per cent where the
 # billet is wider than high. With `--hardening` the mean strain ln(h0 / h) tells the yield stress.

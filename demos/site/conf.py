@@ -1,4 +1,4 @@
-"""Settings of the documentation: Sphinx with MyST; the demos are read as the notebooks that they are.
+"""Settings of the documentation: Sphinx with MyST; the demos are read as the notebooks that they are, see ``reading``.
 
 .ci/site builds it. Pages lie here, in the demos and in the package; what is generated goes to the folder that is asked for.
 """
@@ -16,11 +16,20 @@ author = "uem_dolfinx contributors"
 copyright = f"2025-2026, {author}"
 version = release = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["version"]
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_design"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_design",
+]
 root_doc = "site/index"
 # the demos are written as scripts with cells; pages show them, and do not run them
 nb_custom_formats = {".py": "reading.demo"}
 nb_execution_mode = "off"
+nb_code_prompt_show = "Show the code"
+nb_code_prompt_hide = "Hide the code"
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
 exclude_patterns = ["common.py", "benchmarks/**.py", "site/*.py", "**/__pycache__/**", "**/results/**"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
@@ -29,6 +38,10 @@ myst_heading_anchors = 4
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
+# types by the names that they have in the code
+autodoc_type_aliases = {name: name for name in ("Field", "Part", "Value", "Array", "Indices", "OfPressureAndGap")}
+autodoc_type_aliases |= {"npt.ArrayLike": "ArrayLike", "FrictionLaw": "FrictionLaw"}
+autosummary_generate = False
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 add_module_names = False
@@ -36,17 +49,28 @@ add_module_names = False
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "uem_dolfinx"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 
 
 def with_pages(app, name: str, source: list[str]) -> None:
-    """Let the pages of the demos follow the gallery."""
+    """The gallery as cards, and what the front page has from the README."""
     if name == "README":
-        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
+        source[0] = reading.cards()
+    if name == "site/index":
+        source[0] = reading.front(source[0]).replace("<!-- version -->", version)
+
+
+def with_groups(app, page, template, context, doctree) -> None:
+    """The groups of the gallery in the sidebar."""
+    if "furo_navigation_tree" in context:
+        context["furo_navigation_tree"] = reading.in_groups(context["furo_navigation_tree"])
 
 
 def setup(app):
     """Formulas as MathML, which browsers draw themselves."""
     app.connect("source-read", with_pages)
+    app.connect("html-page-context", with_groups, priority=900)
     app.add_html_math_renderer("mathml", (reading.formula, None), (reading.formula, None))

@@ -1,9 +1,12 @@
-"""How the demos become pages: their cells, without the module's docstring, and with their pictures."""
+"""How the demos and the gallery become pages: the scene and its picture first, code that fits the column, what is not the scene folded."""
 
 from __future__ import annotations
 
 import ast
+import re
+import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import jupytext
@@ -14,9 +17,11 @@ from nbformat import NotebookNode
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 
+DEMOS = Path(__file__).parents[1]
+
 
 def options(text: str) -> str:
-    """A folded table of a demo's own options, what they mean and their defaults; nothing without any."""
+    """A table of a demo's own options, which is what to vary, what they mean and their defaults; nothing without any."""
     tree, rows = ast.parse(text), []
     explained = common.explanations(ast.get_docstring(tree))
     for call in ast.walk(tree):
@@ -25,13 +30,106 @@ def options(text: str) -> str:
                 choices = isinstance(option.value, ast.Tuple)
                 values = " or ".join(f"`{ast.unparse(v)}`" for v in (option.value.elts if choices else [option.value]))
                 rows.append(f"| `--{option.arg.replace('_', '-')}` | {explained.get(option.arg, '')} | {values} |")
-    head = ":::{dropdown} Options\n| option | meaning | default, the first of several choices |\n|---|---|---|\n"
-    return head + "\n".join(rows) + "\n:::\n" if rows else ""
+    head = "**Options**, beside `--plot FILE.png`, `--json FILE` and `--output DIR`:\n\n"
+    head += "| option | meaning | default, the first of several choices |\n|---|---|---|\n"
+    return head + "\n".join(rows) + "\n" if rows else ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A demo in the gallery.
+
+    Attributes:
+        name: of its file.
+        pictures: lines of Markdown that show them.
+        text: what it is.
+        measured: what was measured, with the text's last sentence before it.
+    """
+
+    name: str
+    pictures: list[str]
+    text: str
+    measured: str
+
+    @property
+    def title(self) -> str:
+        """The heading of the demo's page."""
+        return re.search(r"^# # (.*)$", (DEMOS / f"{self.name}.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
+
+    def card(self) -> str:
+        """A card with the title, the first picture and the text without its links."""
+        picture = re.match(r"!\[(.*)\]\((.*)\)", self.pictures[0]) if self.pictures else None
+        image = f":img-top: {picture[2]}\n:img-alt: {picture[1]}\n" if picture else ""
+        text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", self.text)
+        return f":::{{grid-item-card}} {self.title}\n:link: {self.name}\n:link-type: doc\n{image}\n{text}\n:::\n"
+
+
+def gallery() -> tuple[str, dict[str, tuple[str, list[Entry]]]]:
+    """The gallery's first lines, and of each group its own first lines and its demos."""
+    start, *groups = re.split(r"^## ", (DEMOS / "README.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    found = {}
+    for group in groups:
+        head, *demos = re.split(r"^### ", group, flags=re.MULTILINE)
+        title, _, about = head.partition("\n")
+        entries = []
+        for one in demos:
+            lines = [line for line in one.splitlines()[1:] if line]
+            text, _, measured = " ".join(line for line in lines if not line.startswith("![")).partition("*Measured:*")
+            name = re.match(r"\[(\w+)\.py\]", one)[1]
+            entries.append(Entry(name, [line for line in lines if line.startswith("![")], text.strip(), measured.strip()))
+        found[title.strip()] = (about.strip(), entries)
+    return start, found
+
+
+def cards() -> str:
+    """The page of the gallery: for each group of demos a grid of cards."""
+    start, groups = gallery()
+    parts = [start]
+    for title, (about, entries) in groups.items():
+        inside = "\n".join(entry.card() for entry in entries)
+        pages = "\n".join(entry.name for entry in entries)
+        parts.append(f"## {title}\n\n{about}\n\n::::{{grid}} 1 2 2 3\n:gutter: 3\n\n{inside}::::\n")
+        parts.append(f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n")
+    return "\n".join(parts)
+
+
+def in_groups(navigation: str) -> str:
+    """The sidebar with the names of the gallery's groups before the first demo of each."""
+    for title, (_, entries) in gallery()[1].items():
+        link = rf'<a [^>]*href="(?:(?:[^"]*/)?{entries[0].name}\.html|#)"[^>]*>{re.escape(entries[0].title)}<'
+        label = f'<li class="toctree-l2 group">{title}</li>'
+        navigation = re.sub(
+            rf'<li class="toctree-l2[^"]*">{link}', lambda found, label=label: label + found[0], navigation, count=1
+        )
+    return navigation
+
+
+def front(text: str) -> str:
+    """The site's first page with the script and the table of couplings of the README."""
+    readme = (DEMOS.parent / "README.md").read_text(encoding="utf-8")
+    script = re.search(r"```python\n(.*?)```\n", readme, re.DOTALL)[1]
+    table = re.search(r"^\| \| node_to_surface \|.*?\n\n", readme, re.DOTALL | re.MULTILINE)[0]
+    return text.replace("<!-- script -->", f"```python\n{fitting(script)}```").replace("<!-- couplings -->", table)
+
+
+def fitting(text: str) -> str:
+    """Code of a demo with lines of 88 characters."""
+    text = re.sub(r"  # fmt: skip$", "", text, flags=re.MULTILINE)
+    command = ["ruff", "format", "--isolated", "--line-length", "88", "-"]
+    return subprocess.run(command, input=text, check=True, capture_output=True, text=True).stdout
+
+
+def machinery(source: str) -> bool:
+    """Whether a cell is none of the scene: imports and options, tables, files, pictures, what is asserted."""
+    if re.match("(import|from) ", source):
+        return True
+    parts = r"^(if args\.(plot|output)|( {4})?assert |common\.report\(|results = )"
+    return bool(re.search(parts, source, re.MULTILINE)) and not re.search("^(def|class) ", source, re.MULTILINE)
 
 
 def demo(text: str) -> NotebookNode:
-    """The notebook of a demo; its docstring comes after the title, as the line that runs it and the options."""
-    notebook = jupytext.reads(text, fmt="py:percent")
+    """The notebook of a demo: title, picture, what was measured, the line that runs it and its options; then its cells."""
+    notebook = jupytext.reads(fitting(text), fmt="py:percent")
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook.metadata["language_info"] = {"name": "python"}
     if notebook.cells[0].cell_type == "code" and notebook.cells[0].source.startswith('"""'):
@@ -39,7 +137,13 @@ def demo(text: str) -> NotebookNode:
         run = next((line for line in docstring.splitlines() if line.startswith(("python3 ", "mpirun "))), "")
         title, _, rest = notebook.cells[0].source.partition("\n")
         shown = f"```sh\n{run}\n```\n" if run else ""
-        notebook.cells[0].source = f"{title}\n\n{shown}\n{options(text)}\n{rest}"
+        entry = next((e for _, entries in gallery()[1].values() for e in entries if f"# {e.title}" == title), None)
+        pictures = "\n\n".join(entry.pictures) if entry else ""
+        measured = f"**Measured:** {entry.measured}\n" if entry and entry.measured else ""
+        notebook.cells[0].source = f"{title}\n{rest}\n\n{pictures}\n\n{measured}\n{shown}\n{options(text)}"
+    for cell in notebook.cells:
+        if cell.cell_type == "code" and machinery(cell.source):
+            cell.metadata["tags"] = ["hide-input"]
     return notebook
 
 
