@@ -103,13 +103,19 @@ common.report(args, results)
 if args.plot:
     with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as panels:
         if panels[0] is not None:
-            panels[0].plot(t, v1, label="lower bar")
-            panels[0].plot(t, v2, label="upper bar")
+            swap = [0.0, meet, meet + 2 * L / c, t[-1]]
+            for v, label, ends in ((v1, "lower bar", (args.v1, args.v2)), (v2, "upper bar", (args.v2, args.v1))):
+                panels[0].plot(swap, np.repeat(ends, 2), color="0.3", lw=2.5, alpha=0.4, label="exact" if v is v2 else None)
+                panels[0].plot(t, v, label=label)
             panels[0].set(xlabel="time", ylabel="mean velocity")
             panels[0].legend(frameon=False)
-            panels[1].plot(t, force / width ** (d - 1))
-            panels[1].axhline(rho * c * (args.v1 - args.v2) / 2, color="0.3", lw=1)
-            panels[1].set(xlabel="time", ylabel="contact pressure")
+            given = rho * c * (args.v1 - args.v2) / 2 * width ** (d - 1) * 2 * L / c
+            impulse = np.array([row[0][1] for row in book.impulses])
+            panels[1].plot(swap, (0.0, 0.0, 1.0, 1.0), color="0.3", lw=2.5, alpha=0.4, label="exact")
+            panels[1].plot([row.time for row in book.rows], impulse / given, color="C2", label="impulse on the upper bar")
+            total = np.abs(momentum - momentum[0]).max() / given
+            panels[1].set(xlabel="time", ylabel="impulse of the contact / exact", title=f"momentum lost: {total:.0e}")
+            panels[1].legend(frameon=False)
             for ax in panels:
                 ax.grid(alpha=0.25)
 

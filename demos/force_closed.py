@@ -95,9 +95,12 @@ common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# Lines of equal shear stress at the contact, and the contact pressure.
+# Lines of equal shear stress at the contact, and the contact pressures of both couplings, of which the other one is solved for here.
 
 # %%
+if args.output:
+    with uem.ResultsWriter(f"{args.output}/force_closed", problem) as writer:
+        writer.write(steps[-1])
 if args.plot:
     a = float(2 * P[1] / (np.pi * p0))
     s = material.stress(u)
@@ -107,12 +110,19 @@ if args.plot:
             problem, left, field=shear, label="largest shear stress / $p_0$", levels=np.linspace(0.0, 0.3, 13),
             window=(-2.2 * a, 2.2 * a, -2.4 * a, 1.6 * a),
         )  # fmt: skip
+        window = (-1.5 * a, 1.5 * a)
         uem.plot_pressure(
-            contact, right, reference=lambda x: p0 * np.sqrt(np.maximum(1 - (x / a) ** 2, 0)), reference_label="Hertz"
+            contact, right, reference=lambda x: p0 * np.sqrt(np.maximum(1 - (x / a) ** 2, 0)), reference_label="Hertz",
+            contact_label=args.coupling, window=window,
         )  # fmt: skip
-if args.output:
-    with uem.ResultsWriter(f"{args.output}/force_closed", problem) as writer:
-        writer.write(steps[-1])
+        u.x.array[:] = 0.0
+        name = "mortar" if args.coupling == "node_to_surface" else "node_to_surface"
+        other = uem.Contact(contactor=tags["disc_arc"], target=tags["block_top"], coupling=name, normals=args.normals)
+        for _ in uem.load_steps(
+            uem.UnitedProblem(F, u, bcs=bcs, contacts=[other], load=load, petsc_options_prefix="other_"), args.steps
+        ):
+            pass
+        uem.plot_pressure(other, right, contact_label=name, window=window)
 
 # %%
 assert results["force_error"] < 1e-8

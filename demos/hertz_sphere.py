@@ -51,7 +51,7 @@ F_hertz = 4 / 3 * E_star * np.sqrt(R) * args.d**1.5
 
 
 # %%
-def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
+def solve(h: float, coupling: str = args.coupling) -> tuple[uem.UnitedProblem, dict[str, float]]:
     """Press the bodies together on a mesh of size h: the problem and the figures measured."""
     mesh, tags = uem.read_gmsh(
         common.MESHES / "hertz_sphere.geo", comm, gdim=3,
@@ -67,7 +67,9 @@ def solve(h: float) -> tuple[uem.UnitedProblem, dict[str, float]]:
         uem.dirichlet(V, tags["block_bottom"], 2),
         uem.dirichlet(V, tags["sphere_top"], 2, -args.d),
     ]
-    contact = uem.Contact(contactor=tags["sphere_cap"], target=tags["block_top"], coupling=args.coupling, normals=args.normals)
+    contact = uem.Contact(
+        contactor=tags["sphere_cap"], target=tags["block_top"], coupling=coupling, normals=args.normals, name=coupling
+    )
     problem = uem.UnitedProblem(
         residual, u, bcs=bcs, contacts=[contact], petsc_options_prefix="sphere_", petsc_options=common.cg(), verbose=args.verbose
     )
@@ -111,6 +113,7 @@ common.report(args, {"P_hertz": float(F_hertz), "a_hertz": float(a), **rows[-1],
 
 # %% [markdown]
 # ## The picture
+# Pressures of both couplings, and the stress over p0 in the quarter, cut open around the contact.
 
 # %%
 if args.output:
@@ -131,12 +134,13 @@ if args.plot:
             left.set_xlabel("cells per contact radius")
             left.set_ylabel("error of the force against Hertz")
             left.grid(alpha=0.25)
-        uem.plot_pressure(problem.contacts, right, window=(0.0, 1.3 * a), reference_label="Hertz",
+        other = solve(args.h, "mortar" if args.coupling == "node_to_surface" else "node_to_surface")[0]
+        uem.plot_pressure([*problem.contacts, *other.contacts], right, window=(0.0, 1.3 * a), reference_label="Hertz",
                           reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)))  # fmt: skip
         if solid:
             box = a * np.array([0.0, 1.6, 0.0, 1.6, -1.2, 1.2])
             uem.plot_scene(problem, scene[0], field=von_mises / p0, label="von Mises stress / p0", window=box, levels=10,
-                           view=(-1.0, -1.6, 0.5))  # fmt: skip
+                           cells=False, view=(-1.0, -1.6, 0.5))  # fmt: skip
 
 # %%
 errors = [abs(r["error"]) for r in rows]

@@ -57,6 +57,7 @@ def solve(
     quads: int = args.quads,
     moved: float = 0.0,
     width: float = 1.0,
+    coupling: str = args.coupling,
 ) -> tuple[uem.UnitedProblem, fem.Function, float, float]:
     """Press the blocks together.
 
@@ -68,6 +69,7 @@ def solve(
         quads: 1 for quadrilaterals and hexahedra.
         moved: how far nodes are moved at random, over the size of a cell.
         width: of the lower block, at least 1; what the upper one leaves uncovered is loaded by p.
+        coupling: nodes on facets, or mortar.
 
     Returns:
         The problem, its vertical stress over p in each cell, the error of that, and the strict error.
@@ -87,7 +89,7 @@ def solve(
     bcs = [uem.dirichlet(V, tags["bottom_1"], dim - 1)]
     bcs += [uem.dirichlet(V, tags[sides], i) for i, sides in enumerate(("sides_x", "sides_y")[: dim - 1])]
     lower, upper = tags["top_1"], tags["bottom_2"]
-    contacts = [uem.Contact(*((lower, upper) if side == "lower" else (upper, lower)), coupling=args.coupling) for side in passes]
+    contacts = [uem.Contact(*((lower, upper) if side == "lower" else (upper, lower)), coupling=coupling) for side in passes]
     # the stress is exact but for rounding; CG leaves more
     problem = uem.UnitedProblem(
         F, u, bcs=bcs, contacts=contacts, petsc_options_prefix="patch_", petsc_options=common.direct(), verbose=args.verbose
@@ -151,20 +153,21 @@ common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# The vertical stress over p with linear triangles: in a single pass, with the finer body as contactor, and in two passes; with
-# mortar in a single pass with either body as contactor.
+# The vertical stress over p with linear triangles: nodes in a single pass, with the finer body as contactor, and in two passes, and
+# mortar in a single pass.
 
 # %%
 if args.plot or args.output:
-    shown = {"finer as contactor": ("upper",), "two passes": ("lower", "upper")}
-    if args.coupling == "mortar":
-        shown = {"finer as contactor": ("upper",), "coarser as contactor": ("lower",)}
-    solved = [solve(2, 1, others, passes) for passes in shown.values()]
+    nodes = "node_to_surface"
+    shown = {"nodes": (nodes, ("upper",)), "nodes, two passes": (nodes, ("lower", "upper")), "mortar": ("mortar", ("upper",))}
+    solved = [solve(2, 1, others, passes, coupling=coupling) for coupling, passes in shown.values()]
     if args.plot:
         levels = np.linspace(-1.055, -0.945, 12)
-        with uem.figure(args.plot, comm, panels=2) as panels:
-            for panel, (problem, stress, *_), label in zip(panels, solved, shown):
-                uem.plot_scene(problem, panel, field=stress, label=f"$\\sigma_{{yy}} / p$, {label}", levels=levels)
+        with uem.figure(args.plot, comm, panels=3, size=(3.6, 4.8)) as panels:
+            for panel, (problem, stress, error, _), label in zip(panels, solved, shown):
+                uem.plot_scene(problem, panel, field=stress, label="$\\sigma_{yy} / p$", levels=levels, cmap="RdBu_r")
+                if panel is not None:
+                    panel.set_title(f"{label}\nerror {error:.0e}")
     if args.output:
         with uem.ResultsWriter(f"{args.output}/patch_test", solved[-1][0]) as writer:
             writer.write(1.0)

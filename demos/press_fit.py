@@ -65,7 +65,7 @@ p = args.delta / (b * ((1 - nu_1) / E_1 + ((c**2 + b**2) / (c**2 - b**2) + nu_2)
 
 
 # %%
-def solve(h: float) -> tuple[uem.UnitedProblem, uem.LinearElastic, dict[str, float]]:
+def solve(h: float, coupling: str = args.coupling) -> tuple[uem.UnitedProblem, uem.LinearElastic, dict[str, float]]:
     """Let the disc and the ring find each other on a mesh of size h: problem, material and figures measured."""
     mesh, tags = uem.read_gmsh(
         common.MESHES / "press_fit.geo", comm, gdim=2,
@@ -80,7 +80,7 @@ def solve(h: float) -> tuple[uem.UnitedProblem, uem.LinearElastic, dict[str, flo
     F = material.residual(u, v) * ufl.dx
     bcs = [uem.dirichlet(V, tags["symmetry_x"], 0), uem.dirichlet(V, tags["symmetry_y"], 1)]
     contact = uem.Contact(
-        contactor=tags["disc_arc"], target=tags["ring_bore"], coupling=args.coupling, sliding=args.sliding, normals=args.normals,
+        contactor=tags["disc_arc"], target=tags["ring_bore"], coupling=coupling, name=coupling, sliding=args.sliding, normals=args.normals,
         max_penetration=0.01 * b,
     )  # fmt: skip
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], petsc_options_prefix="press_", verbose=args.verbose)
@@ -118,7 +118,7 @@ common.report(args, {"pressure_lame": float(p), **rows[-1], "meshes": rows})
 
 # %% [markdown]
 # ## The picture
-# The radial stress, the same on both sides of the interface, and the nodal pressures over the angle in degrees.
+# The radial stress, the same on both sides of the interface, and the nodal pressures over the angle in degrees, with either coupling.
 
 # %%
 if args.plot:
@@ -126,8 +126,10 @@ if args.plot:
     radial = ufl.dot(x, material.stress(problem.u) * x) / (ufl.dot(x, x) * p)
     with uem.figure(args.plot, comm, panels=2) as (left, right):
         uem.plot_scene(problem, left, field=radial, label="radial stress / p", levels=np.linspace(-1.1, 0.1, 13), arrows=False)
+        other = solve(args.h, "mortar" if args.coupling == "node_to_surface" else "node_to_surface")[0]
         uem.plot_pressure(
-            problem.contacts, right, along=lambda x: np.degrees(np.arctan2(x[:, 1], x[:, 0])), along_label="angle in degrees",
+            [*problem.contacts, *other.contacts], right,
+            along=lambda x: np.degrees(np.arctan2(x[:, 1], x[:, 0])), along_label="angle in degrees",
             reference=lambda angle: np.full_like(angle, p), reference_label="Lamé", window=(0.0, 90.0),
         )  # fmt: skip
 if args.output:

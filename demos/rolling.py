@@ -132,14 +132,15 @@ common.report(args, results)
 if args.plot:
     with uem.figure(args.plot, comm, panels=2, size=(6.4, 4.0)) as (left, right):
         if left:
-            for lines in curves[1][3]:
-                left.plot(*lines.transpose(2, 1, 0), color="C1", lw=0.8)
+            for k, lines in enumerate(curves[1][3]):
+                left.plot(*lines.transpose(2, 1, 0), color="C1", lw=1.0, alpha=0.25 + 0.75 * (k + 1) / len(curves[1][3]))
             left.axhline(-R, color="0.3", lw=2)
+            left.set_title(f"tan(alpha) = {rows[1]['tan(alpha)/mu']:.2f} mu: it rolls, at equal times")
             left.set_aspect("equal")
             for (t, x, exact, _), row in zip(curves, rows):
                 (line,) = right.plot(t, x, label=f"tan(alpha) = {row['tan(alpha)/mu']:.2f} mu")
                 right.plot(t[::10], exact * t[::10] ** 2 / 2, "o", ms=3, color=line.get_color())
-            right.set(xlabel="time", ylabel="way, dots: rigid disc")
+            right.set(xlabel="time", ylabel="displacement along the plane; dots: rigid disc")
             right.legend(frameon=False)
 
 # %%

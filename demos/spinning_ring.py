@@ -118,16 +118,27 @@ results = {
 }
 common.report(args, results)
 
+# %% [markdown]
+# ## The picture
+# Rings at equal times, each drawn beside the one before.
+
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=len(pictures), size=(4.0, 3.6)) as panels:
-        for ax, (mu, frames) in zip(panels, pictures.items()):
-            if ax:
+    with uem.figure(args.plot, comm, panels=2, size=(6.4, 3.8)) as (left, right):
+        if left:
+            for row, (mu, frames) in enumerate(pictures.items()):
                 for k, lines in enumerate(frames):
-                    ax.plot(*lines.transpose(2, 1, 0), color=str(0.8 - 0.8 * k / len(frames)), lw=1.0)
-                ax.axhline(-1.0 - gap, color="0.3", lw=2)
-                ax.set_aspect("equal")
-                ax.set_title(f"mu = {mu}")
+                    left.plot(*(lines + [2.3 * k, -2.6 * row]).transpose(2, 1, 0), color=f"C{row}", lw=0.8)
+                left.plot([-1.4, 2.3 * len(frames)], 2 * [-1.0 - gap - 2.6 * row], color="0.3", lw=2)
+                left.text(-1.6, -2.6 * row, f"mu = {mu}", ha="right", va="center")
+            left.set_aspect("equal")
+            left.axis("off")
+            mus, ratios = np.array([(row["mu"], row["impulse ratio"]) for row in rows]).T
+            right.plot([0.0, 1.0], [0.0, 1.0], color="0.3", lw=1, label="mu: it slips all the while")
+            right.plot(mus, ratios, "o", label="rings")
+            right.set(xlabel="mu", ylabel="impulse along the wall / normal to it")
+            right.grid(alpha=0.25)
+            right.legend(frameon=False)
 
 # %%
 assert results["cone_excess"] < 1e-10 and results["momentum_error"] < 1e-10 and results["angular_momentum_error"] < 1e-10, results

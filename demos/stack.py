@@ -94,10 +94,22 @@ results = {
 }
 common.report(args, results)
 
+# %% [markdown]
+# ## The picture
+# The hard block settles without being shortened.
+
 # %%
 if args.plot:
     if dim == 2:
-        uem.plot_scene(problem, args.plot, label="settlement")
+        x, down = (comm.gather(part) for part in (problem.config.X[:, 1], -problem.config.displacement[:, 1]))
+        with uem.figure(args.plot, comm, panels=2, size=(4.2, 4.8)) as (left, right):
+            uem.plot_scene(problem, left, field=-u[1], label="settlement")
+            if right is not None:
+                right.plot(np.concatenate(down), np.concatenate(x), ".", ms=4, label="nodes")
+                right.plot([0.0, *settlement], range(4), color="0.25", lw=1, label="three springs in series")
+                right.set(xlabel="settlement", ylabel="y")
+                right.grid(alpha=0.25)
+                right.legend(frameon=False)
     else:
         solid = common.draws_3d()
         with uem.figure(args.plot, comm, panels=2 if solid else 1) as panels:

@@ -104,11 +104,24 @@ ratios = [10.0**k for k in range(-9, 10, 3)]
 rows = [solve(ratio, law, contactor)[1] for law in LAWS for contactor in ("upper", "lower") for ratio in ratios]
 common.report(args, {"rows": rows})
 
+# %% [markdown]
+# ## The picture
+# The upper block ten times softer than the lower one, and the errors of the table.
+
 # %%
 if args.plot or args.output:
     problem, _ = solve(0.1, "st_venant_kirchhoff", "upper")
     if args.plot:
-        uem.plot_scene(problem, args.plot, field=-problem.u[1], label="settlement")
+        with uem.figure(args.plot, comm, panels=2, size=(4.8, 4.4)) as (left, right):
+            uem.plot_scene(problem, left, field=-problem.u[1], label="settlement")
+            for law in LAWS if right is not None else ():
+                for side, marker in (("upper", "o-"), ("lower", "s--")):
+                    errors = [max(row["error"], 1e-17) for row in rows if (row["law"], row["contactor"]) == (law, side)]
+                    right.loglog(ratios, errors, marker, ms=4, label=f"{law.replace('_', ' ')}, {side} as contactor")
+            if right is not None:
+                right.set(xlabel="E above / E below", ylabel="error of the interface displacement", ylim=(1e-17, 1e-1))
+                right.grid(alpha=0.25)
+                right.legend(frameon=False)
     if args.output:
         with uem.ResultsWriter(f"{args.output}/two_blocks", problem) as writer:
             writer.write(1.0)

@@ -60,7 +60,7 @@ density = rubber.energy(u) / E
 look = {
     "field": density,
     "label": "strain energy density / E",
-    "percentiles": (0, 99.5),
+    "percentiles": (0, 99),
     "cells": False,
     "view": (0.5, -1.2, 0.3),
 }

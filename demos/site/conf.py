@@ -10,6 +10,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 import reading
+from sphinx.ext.napoleon import GoogleDocstring
+from sphinx.util.inspect import TypeAliasForwardRef
 
 project = "uem_dolfinx"
 author = "uem_dolfinx contributors"
@@ -53,6 +55,16 @@ html_static_path = ["site.css"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
+
+
+def whole(docstring: GoogleDocstring) -> tuple[str, list[str]]:
+    """The docstring of a property, whose first line may have a colon; it has no type of its own."""
+    lines = docstring._dedent(docstring._consume_to_end())
+    return "", GoogleDocstring(lines, docstring._config).lines()
+
+
+GoogleDocstring._consume_inline_attribute = whole
+TypeAliasForwardRef.__repr__ = lambda self: self.name
 
 
 def with_pages(app, name: str, source: list[str]) -> None:

@@ -76,7 +76,7 @@ class LinearEquations(Protocol):
 
 
 class Equation:
-    """A linear equation between displacements of nodes: ``sum_k c_k . u(place_k) = b``.
+    """A linear equation between displacements of nodes: ``sum_k inner(c_k, u(place_k)) = b``.
 
         uem.Equation([(tags["tip"], (0, 1)), ((0.0, 1.0), (0, -2))])                       # u_y of the tip is twice that at (0, 1)
         uem.Equation([(tags["top"], (0, 1)), (tags["corner"], (0, -1))], b=0.0)            # the top stays level

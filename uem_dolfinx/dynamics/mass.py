@@ -316,7 +316,7 @@ class Mass:
 
 
 def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
-    """``rho u . v`` integrated over the reference configuration (collective).
+    """``rho inner(u, v)`` integrated over the reference configuration (collective).
 
     Args:
         V: space of the displacement.

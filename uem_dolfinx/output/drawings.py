@@ -20,7 +20,7 @@ from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it; forces that
-#: are less have no arrow.
+#: are less have no arrow; points that are nearer are one where outlines are looked for.
 #: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
 #: Colour of what carries no contact pressure, and of rigid surfaces.
@@ -223,7 +223,7 @@ class Drawn3D(Drawn):
         colours = ListedColormap(self.cmap(np.linspace(0.0, 1.0, n))).with_extremes(under=self.cmap.get_under())
         self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
         look = pictures3d.Look(
-            colours, NO_PRESSURE if how.pressed else None, self.box, how.window is not None, how.view, how.cells, how.width
+            colours, NO_PRESSURE if how.pressed else None, self.box, how.window is not None, how.view, how.cells, how.width, EVEN
         )
         solids = [
             pictures3d.Solid(f.x, self._between(f.values), (f.cuts[0], self._between(f.cuts[1])), self._arrows(f), f.rigid)

@@ -178,6 +178,7 @@ def plot_pressure(
     along: Callable[[Array], Array] | None = None,
     reference: Callable[[Array], Array] | None = None,
     reference_label: str = "reference",
+    contact_label: str = "contactors",
     label: str = "contact pressure",
     along_label: str | None = None,
     window: tuple[float, float] | None = None,
@@ -192,6 +193,7 @@ def plot_pressure(
             from the axis through the origin, ``sqrt(x^2 + y^2)``.
         reference: exact pressure as a function of that coordinate.
         reference_label: in the legend.
+        contact_label: in the legend; several contacts have their names there. More may be drawn into the same panel.
         label: of the pressure axis.
         along_label: of the other axis.
         window: part of the coordinate to show; None shows half as much again as the pressed part.
@@ -222,7 +224,7 @@ def plot_pressure(
             for contact, (s, p) in zip(pairs, curves):
                 if mirror:
                     s, p = np.concatenate([-s, s]), np.concatenate([p, p])
-                ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else "contactors", zorder=2)
+                ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else contact_label, zorder=2)
             ax.set(xlim=window, xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
             # room above pressures that are all the same
             ax.set_ylim(0.0, max(ax.get_ylim()[1], 1.05 * max(float(p.max(initial=0.0)) for _, p in curves)))

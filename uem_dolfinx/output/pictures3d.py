@@ -53,6 +53,7 @@ class Look:
         view: direction from the scene to the eye ``(3,)``.
         edges: draw the edges of the facets.
         width: of an image before its margins are cut off, in points.
+        same: points that are nearer than this part of the scene's size are one.
     """
 
     colours: Any
@@ -62,6 +63,7 @@ class Look:
     view: Array
     edges: bool
     width: int
+    same: float
 
 
 @dataclass(frozen=True)
@@ -131,11 +133,10 @@ def _image(faces: Ints, solid: Solid, look: Look) -> Array:
                 surface, scalars="values", cmap=look.colours, n_colors=n, clim=(0, n), below_color=look.below, show_scalar_bar=False,
                 show_edges=edges, edge_color="black", edge_opacity=0.3, line_width=line, ambient=0.75, diffuse=0.25, specular=0.0,
             )  # fmt: skip
-    outline = parts[0][0].extract_feature_edges(
-        feature_angle=35.0, boundary_edges=True, manifold_edges=False, non_manifold_edges=False
-    )
-    if outline.n_cells:
-        plotter.add_mesh(outline, color="black", line_width=2.0 * line)
+    for surface in (skin, section):
+        outline = _inside(_outline(surface, look.same), look)
+        if outline.n_cells:
+            plotter.add_mesh(outline, color="black", line_width=2.0 * line)
     for shape in solid.rigid:
         _add_rigid(plotter, shape, look)
     at, to = solid.arrows
@@ -157,6 +158,14 @@ def _polygons(points: Array, faces: Ints, values: Array) -> Any:
     surface = pyvista.PolyData(points, np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel())
     surface["values"] = values
     return surface
+
+
+def _outline(surface: Any, same: float) -> Any:
+    """Edges of a surface, whose facets may come from several ranks, at which it ends or turns."""
+    whole = surface.clean(tolerance=same, absolute=False)
+    if whole.n_cells:
+        whole = whole.compute_normals(point_normals=False, consistent_normals=True, non_manifold_traversal=False)
+    return whole.extract_feature_edges(feature_angle=35.0, boundary_edges=True, manifold_edges=False, non_manifold_edges=False)
 
 
 def _inside(surface: Any, look: Look) -> Any:

@@ -76,10 +76,15 @@ def section(x: Array, values: Array, cells: Ints, axis: int, bound: float) -> tu
         which = behind == number
         order = np.argsort(height[which], axis=1)
         at, h = np.take_along_axis(cells[which], order, axis=1), np.take_along_axis(height[which], order, axis=1)
-        a, b = np.transpose(edges)
-        t = h[:, a] / (h[:, a] - h[:, b])
-        corners = x[at[:, a]] + t[:, :, None] * (x[at[:, b]] - x[at[:, a]])
-        there = values[at[:, a]] + t * (values[at[:, b]] - values[at[:, a]])
+        begin, end = np.transpose(edges)
+        # an edge has the same point in all its cells, to the last digit: from its lower end, by x, then y, then z
+        turned = np.sign(x[at[:, end]] - x[at[:, begin]]) @ [4.0, 2.0, 1.0] < 0
+        begin, end = (np.where(turned, first, second) for first, second in ((end, begin), (begin, end)))
+        a, b = (np.take_along_axis(at, side, axis=1) for side in (begin, end))
+        h_a, h_b = (np.take_along_axis(h, side, axis=1) for side in (begin, end))
+        t = h_a / (h_a - h_b)
+        corners = x[a] + t[:, :, None] * (x[b] - x[a])
+        there = values[a] + t * (values[b] - values[a])
         for k in range(1, len(edges) - 1):
             points.append(corners[:, [0, k, k + 1]])
             found.append(there[:, [0, k, k + 1]])
