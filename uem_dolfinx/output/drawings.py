@@ -91,7 +91,8 @@ class Drawn(ABC):
         self.how, self.pieces, self.frames = how, pieces, frames
         self.box = self._everything() if how.window is None else np.reshape(how.window, (-1, 2))
         if how.window is None and any(f.rigid for f in frames):
-            self.box = self.box + 0.06 * np.diff(self.box, axis=1).max() * np.array([-1.0, 1.0])
+            sides = np.diff(self.box, axis=1)
+            self.box = self.box + np.minimum(0.06 * sides.max(), 0.25 * sides) * np.array([-1.0, 1.0])
         # a side of the scene that the window ends at is in it, whatever rounding makes of it
         self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
         seen = np.concatenate([f.values[self._shown(f.x)] for f in frames])
