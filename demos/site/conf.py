@@ -75,6 +75,19 @@ def with_pages(app, name: str, source: list[str]) -> None:
         source[0] = reading.front(source[0]).replace("<!-- version -->", version)
 
 
+def without_internals(app, what, name, obj, options, lines: list[str]) -> None:
+    """Leave out of a class what its page excludes of the attributes that the docstring lists."""
+    hidden, kept, left_out = options.exclude_members or (), [], False
+    for line in lines:
+        if line.startswith(".. attribute:: "):
+            left_out = line.split()[2] in hidden
+        elif line and not line.startswith(" "):
+            left_out = False
+        if not left_out:
+            kept.append(line)
+    lines[:] = kept
+
+
 def with_groups(app, page, template, context, doctree) -> None:
     """The groups of the gallery in the sidebar."""
     if "furo_navigation_tree" in context:
@@ -85,4 +98,5 @@ def setup(app):
     """Formulas as MathML, which browsers draw themselves."""
     app.connect("source-read", with_pages)
     app.connect("html-page-context", with_groups, priority=900)
+    app.connect("autodoc-process-docstring", without_internals, priority=900)
     app.add_html_math_renderer("mathml", (reading.formula, None), (reading.formula, None))
