@@ -1,4 +1,4 @@
-"""A solid tyre pressed onto the road: rubber at large strain, hexahedra, CG with multigrid, a film; `--n 2.13` has half a million unknowns.
+"""A solid tyre pressed onto the road: rubber at large strain, hexahedra, CG with multigrid, a film.
 
 mpirun -n 2 python3 demos/tyre.py --plot tyre.png
 
@@ -29,7 +29,7 @@ from dolfinx import fem
 
 import uem_dolfinx as uem
 
-args = common.arguments(__doc__, n=1.0, steps=6, d=0.16, film="")
+args = common.arguments(__doc__, n=0.6, steps=4, d=0.16, film="")
 E, nu, thickness, height = 6e6, 0.45, 0.1, 0.2  # Pa, m
 
 # %% [markdown]
