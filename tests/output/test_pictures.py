@@ -110,7 +110,7 @@ def test_rigid_surfaces(folder):
 def test_colours():
     """Grey where there is no pressure, whose colours begin above 0; a few large values do not take all colours."""
     values = np.concatenate([np.zeros(100), np.linspace(0.0, 1.0, 899), [50.0]])
-    frame = frames_module.Frame(np.zeros((1000, 2)), values, [], ("", 0.0), frames_module.NO_SECTION, [])
+    frame = frames_module.Frame(np.zeros((1000, 2)), values, [], ("", 0.0), (np.zeros((0, 3, 3)), np.zeros((0, 3))), [])
 
     def drawn(**how):
         known = dict(levels=10, window=None, mirror=False, percentiles=None, pressed=False, cmap="viridis")

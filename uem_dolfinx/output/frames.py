@@ -15,15 +15,13 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.tags import Part, as_tag
-from uem_dolfinx.output.sections import Shape, rigid_shapes, section, tetrahedra
+from uem_dolfinx.output.sections import Shape, rigid_shapes, sections, solid_cells
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
 TRIANGLES = {"triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]]}
 #: Vertices in their order around a facet or a 2D cell, by their number.
 AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
-#: Corners and values of no triangle.
-NO_SECTION = (np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
@@ -86,11 +84,11 @@ class Gathering:
         self.problem, self.field, self.scale, self.arrows, self.rigid = problem, field, scale, arrows, rigid
         mesh = problem.config.mesh
         solid = problem.config.gdim == 3 and surface is None and window is not None
-        #: Where bodies are cut, and their tetrahedra.
+        #: Where bodies are cut, and their cells.
         self._planes = (
             [(axis, bound) for axis, ends in enumerate(window) for bound in ends] if solid and window is not None else []
         )
-        self._cells = tetrahedra(mesh) if solid else np.zeros((0, 4), np.int64)
+        self._cells = solid_cells(mesh) if solid else {}
         faces, edges = boundary(mesh, surface) if problem.config.gdim == 3 else None, np.zeros((0, 4), np.int64)
         if faces is None:
             faces, edges = _vertex_cells(mesh)
@@ -107,8 +105,7 @@ class Gathering:
         """The present state on rank 0, None elsewhere (collective)."""
         comm, used = self.problem.comm, self._used
         x, values = vertex_positions(self.problem, self.scale), vertex_values(self.problem, self.field)
-        cuts = [section(x, values, self._cells, *plane) for plane in self._planes]
-        parts = comm.gather((x[used], values[used], *(np.concatenate(c) for c in zip(*cuts, NO_SECTION))))
+        parts = comm.gather((x[used], values[used], *sections(x, values, self._cells, self._planes)))
         forces = [gather_contactors(contact, self.scale) for contact in self.problem.contacts] if self.arrows else []
         if parts is None:
             return None

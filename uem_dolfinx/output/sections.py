@@ -13,13 +13,8 @@ from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 
-#: Tetrahedra of a cell by its vertices; those of a hexahedron are around its diagonal.
-TETRAHEDRA = {
-    "tetrahedron": [[0, 1, 2, 3]],
-    "hexahedron": [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]],
-}
-#: Edges that a plane cuts, in their order around the section, by the number of vertices behind it; vertices by their height.
-CUT = {1: [(0, 1), (0, 2), (0, 3)], 2: [(0, 2), (0, 3), (1, 3), (1, 2)], 3: [(0, 3), (1, 3), (2, 3)]}
+#: VTK's type of a solid cell, and its vertices in VTK's order.
+SOLIDS = {"tetrahedron": (10, [0, 1, 2, 3]), "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6])}
 
 
 @dataclass(frozen=True)
@@ -50,42 +45,36 @@ def grid(box: Array, cells: int) -> tuple[list[Array], Array]:
     return axes, np.column_stack([a.ravel() for a in all_axes])
 
 
-def tetrahedra(mesh: Any) -> Ints:
-    """Owned cells as tetrahedra by d.o.f. of the P1 space ``(n, 4)``."""
-    dofs = compat.cell_dofs(compat.function_space(mesh, 1))[: mesh.topology.index_map(3).size_local].astype(np.int64)
-    return np.concatenate([dofs[:, part] for part in TETRAHEDRA[compat.cell_name(mesh)]])
+def solid_cells(mesh: Any) -> dict[int, Ints]:
+    """Owned cells by d.o.f. of the P1 space, as VTK numbers their vertices, by their type there ``{type: (n, n_vertices)}``."""
+    kind, order = SOLIDS[compat.cell_name(mesh)]
+    dofs = compat.cell_dofs(compat.function_space(mesh, 1))[: mesh.topology.index_map(3).size_local]
+    return {kind: dofs[:, order].astype(np.int64)}
 
 
-def section(x: Array, values: Array, cells: Ints, axis: int, bound: float) -> tuple[Array, Array]:
-    """Where the plane ``x[axis] = bound`` cuts tetrahedra.
+def sections(x: Array, values: Array, cells: dict[int, Ints], planes: Sequence[tuple[int, float]]) -> tuple[Array, Array]:
+    """Where planes ``x[axis] = bound`` cut solid cells, by PyVista.
 
     Args:
         x: their vertices ``(n, 3)``.
         values: a field there ``(n,)``.
-        cells: vertices of each ``(m, 4)``.
-        axis: which coordinate is constant.
-        bound: its value.
+        cells: as of ``solid_cells``.
+        planes: axis and bound of each.
 
     Returns:
-        Triangles of the section ``(k, 3, 3)`` and the field at their corners ``(k, 3)``.
+        Triangles of the sections ``(k, 3, 3)`` and the field at their corners ``(k, 3)``.
     """
     points, found = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
-    height = x[cells, axis] - bound
-    behind = (height < 0).sum(axis=1)
-    for number, edges in CUT.items():
-        which = behind == number
-        order = np.argsort(height[which], axis=1)
-        at, h = np.take_along_axis(cells[which], order, axis=1), np.take_along_axis(height[which], order, axis=1)
-        begin, end = np.transpose(edges)
-        # an edge has the same point in all its cells, to the last digit: from its lower end, by x, then y, then z
-        turned = np.sign(x[at[:, end]] - x[at[:, begin]]) @ [4.0, 2.0, 1.0] < 0
-        begin, end = (np.where(turned, first, second) for first, second in ((end, begin), (begin, end)))
-        a, b = (np.take_along_axis(at, side, axis=1) for side in (begin, end))
-        h_a, h_b = (np.take_along_axis(h, side, axis=1) for side in (begin, end))
-        t = h_a / (h_a - h_b)
-        corners = x[a] + t[:, :, None] * (x[b] - x[a])
-        there = values[a] + t * (values[b] - values[a])
-        for k in range(1, len(edges) - 1):
-            points.append(corners[:, [0, k, k + 1]])
-            found.append(there[:, [0, k, k + 1]])
+    if planes and any(len(some) for some in cells.values()):
+        import pyvista
+
+        solid = pyvista.UnstructuredGrid(cells, x)
+        solid.point_data["field"] = values
+        for axis, bound in planes:
+            normal = np.eye(3)[axis]
+            cut = solid.slice(normal=normal, origin=bound * normal).triangulate()
+            if cut.n_points:
+                corners = cut.faces.reshape(-1, 4)[:, 1:]
+                points.append(np.asarray(cut.points, dtype=float)[corners])
+                found.append(np.asarray(cut.point_data["field"], dtype=float)[corners])
     return np.concatenate(points), np.concatenate(found)
