@@ -123,7 +123,7 @@ def test_contactors_that_are_left_inside(depth, free, left_out, refused, size):
     seen = SimpleNamespace(
         name=pair.name, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), movable=np.full(n, free),
         redundant=np.full(n, left_out), trial=SimpleNamespace(active=np.ones(n, bool)),
-        projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)), torn=lambda: np.zeros(n),
+        projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)), torn=lambda: np.zeros(n), kinematics=pair.kinematics,
     )  # fmt: skip
     if refused:
         raised(uem.ConflictError, "inside the target", lambda: checks.check_prescribed(seen))
