@@ -6,13 +6,12 @@ Three tests to read first: ``test_as_declared_by_hand``, ``test_discs_in_motion`
 from __future__ import annotations
 
 from collections import Counter
-from itertools import product
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-from body_scenes import Bodies, Discs, ball, close, dimension, surface_of
+from body_scenes import Bodies, Discs, ball, close, dimension, grid, oedometer, surface_of
 from dolfinx import fem
 from helpers import M, blocks, box, clamp, highest, linear, modulus, run, slow, st_venant
 
@@ -91,27 +90,6 @@ def test_lists_with_nothing_on_them_cost_nothing(monkeypatch):
 
 
 # -- closed forms ----------------------------------------------------------------------------------------------------------
-
-
-def grid(cell, n, counts, **how):
-    """Unit boxes in a grid, with ``n`` divisions in turn: side by side, one above the other, in 3D one behind the other as well."""
-    g = dimension(cell)
-    places = list(product(*map(range, counts)))
-    bodies = [box(cell, np.array(p, float), np.array(p) + 1.0, [n[k % len(n)]] * g) for k, p in enumerate(places)]
-    return Bodies(cell, bodies, **how), places
-
-
-def oedometer(b, places, counts, settlement):
-    """Rollers at all outer sides, the top pushed down."""
-    bcs = []
-    for k, place in enumerate(places):
-        for axis in range(b.g):
-            if place[axis] == 0:
-                bcs += clamp(b.V, b.side(k, axis, 0.0), axis)
-            if place[axis] == counts[axis] - 1:
-                end = b.side(k, axis, float(counts[axis]))
-                bcs += clamp(b.V, end, axis, value=-settlement if axis == b.g - 1 else 0.0)
-    return bcs
 
 
 GRIDS = [

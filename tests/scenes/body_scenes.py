@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 from mpi4py import MPI
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
-from helpers import at, box, highest, linear, modulus, scene, st_venant
+from helpers import at, box, clamp, highest, linear, modulus, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -123,3 +125,24 @@ class Discs:
         F = st_venant(u, modulus(self.b.s, *[1e4] * len(self.surfaces)))
         moves = uem.Dynamics(uem.lumped_mass(V, 1.0), gravity=(-0.5, -2.0), contactors="massy")
         return uem.UnitedProblem(F, u, contacts=contacts, dynamics=moves, rtol=1e-11)
+
+
+def grid(cell, n, counts, **how):
+    """Unit boxes in a grid, with ``n`` divisions in turn: side by side, one above the other, in 3D one behind the other as well."""
+    g = dimension(cell)
+    places = list(product(*map(range, counts)))
+    bodies = [box(cell, np.array(p, float), np.array(p) + 1.0, [n[k % len(n)]] * g) for k, p in enumerate(places)]
+    return Bodies(cell, bodies, **how), places
+
+
+def oedometer(b, places, counts, settlement):
+    """Rollers at all outer sides, the top pushed down."""
+    bcs = []
+    for k, place in enumerate(places):
+        for axis in range(b.g):
+            if place[axis] == 0:
+                bcs += clamp(b.V, b.side(k, axis, 0.0), axis)
+            if place[axis] == counts[axis] - 1:
+                end = b.side(k, axis, float(counts[axis]))
+                bcs += clamp(b.V, end, axis, value=-settlement if axis == b.g - 1 else 0.0)
+    return bcs

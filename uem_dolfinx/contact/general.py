@@ -1,7 +1,8 @@
 """General contact: the surfaces of all bodies against each other and against rigid ones, by one declaration.
 
 Of two bodies the nodes of one follow the facets of the other; an order of all bodies tells which, so that none follow each other in a
-ring. A node may touch as many bodies at once as others meet it in a corner of a grid of blocks, each by a contact of its own.
+ring. A node may touch as many bodies at once as others meet it in a corner of a grid of blocks, each by a contact of its own. With
+mortar there is a contact for each body that others follow.
 """
 
 from __future__ import annotations
@@ -17,82 +18,27 @@ from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
-from uem_dolfinx.contact.kinematics import Kinematics
+from uem_dolfinx.contact.general_parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import Resultant, sum_up
 from uem_dolfinx.contact.touching import Touch, forces_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.projection import Target
+from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.pair_friction import FrictionOfPairs
-    from uem_dolfinx.geometry.neighbours import Neighbours
     from uem_dolfinx.geometry.skin import Skin
 
 
-class _Part(Contact):
-    """One of the contacts that a general contact consists of."""
-
-    of_all_surfaces = True
-
-    def friction_values(self) -> Array:
-        """Values that friction has at this rank's contactors, by whatever pair."""
-        return super().friction_values() if self._by_pairs is None else self._by_pairs.values.ravel()
-
-    def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
-        """Values at contactors ``(n,)``, of pairs those to begin with; None if none has friction (collective)."""
-        if self._by_pairs is None or self._pair is not None:
-            return super()._friction_at(law, nodes, at)
-        if not reduced(self.config.comm, bool(self._by_pairs.at(nodes).any()), op=MPI.LOR):
-            return None
-        return self._by_pairs.now(np.full(len(nodes), -1))
-
-
-class RigidContact(_Part):
-    """One of the contacts that a general contact consists of: every node against a rigid surface."""
-
-
-class AmongContact(_Part):
-    """One of the contacts that a general contact consists of: every node against one body near it."""
-
-    def __init__(self, general: GeneralContact, neighbours: Neighbours, number: int, **options: Any):
-        from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
-
-        skin = neighbours.skin
-        quadratic = skin.config.degree == 2
-        coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
-        name = general.name if number == 0 else f"{general.name} {number + 1}"
-        super().__init__(skin.tag, skin.tag, coupling=coupling, name=name, **options)
-        self._neighbours, self._number = neighbours, number
-
-    def _sides(self, config: Configuration) -> tuple[Indices, Target]:
-        from uem_dolfinx.geometry.neighbours import Neighbour
-
-        return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
-
-    def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
-        from uem_dolfinx.contact.among_bodies import NothingNear
-
-        if self._by_pairs is None:
-            return super()._friction_now(kinematics)
-        return None if isinstance(kinematics, NothingNear) else self._by_pairs.now(kinematics.projection.facet)
-
-    def begin(self) -> None:
-        """Take the contact for that of a problem that is complete (collective)."""
-        super().begin()
-        # every node is beside something, and every corner of one body within the surface of all
-        self._corners = None
-
-    def look_at_ends(self) -> None:
-        """Contactors come and go past the edges of bodies."""
+#: Two sets of facets that never touch each other, as local nodes and this rank's facets of both.
+Apart = tuple[Bools, Bools, Bools, Bools]
 
 
 class GeneralContact:
@@ -113,6 +59,8 @@ class GeneralContact:
         friction: as of ``Contact``, for all; or by pairs, ``{(one, other): value, ..., None: value of all others}``, with names of
             bodies, or parts of facets or of cells, or one of the rigid surfaces, and values of one law. Of several pairs that hold the
             first counts; what no pair names has none without ``None``.
+        coupling: ``"node_to_surface"``, or ``"mortar"``, for a few bodies on meshes that do not match: each body is then a target of its
+            own that all others are compared with. No body touches itself.
         normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
         max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
         measure: as of ``Contact``.
@@ -132,6 +80,7 @@ class GeneralContact:
         self_contact: bool | Sequence[Part] = False,
         bodies: dict[str, Part] | None = None,
         friction: Field | FrictionLaw | dict[Any, Field | FrictionLaw] = 0.0,
+        coupling: str = "node_to_surface",
         normals: str = "facet",
         max_penetration: float | None = None,
         measure: str = "reference",
@@ -149,7 +98,11 @@ class GeneralContact:
             named = isinstance(bodies, dict) and all(isinstance(key, str) for key in bodies)
             given.kind("bodies", bodies, bodies is None or named, "names and parts, {name: part}, or None")
             self._pairs = self._friction_of_pairs(friction)
+            self.coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
             self.normals = given.word("normals", normals, ("facet", "averaged"))
+            for word, handed, usual in (("normals", normals, "facet"), ("self_contact", self_contact, False)):
+                if coupling == "mortar" and handed != usual:
+                    raise InputError(f"{word} = {given.shown(handed)} does not go with coupling = 'mortar': leave it out")
             self.measure = given.word("measure", measure, ("reference", "current"))
             if max_penetration is not None:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
@@ -185,7 +138,6 @@ class GeneralContact:
             TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
             SurfaceError: if nothing is left that may touch, or a body has two names.
         """
-        from uem_dolfinx.geometry.neighbours import Neighbours
         from uem_dolfinx.geometry.skin import Skin
 
         self.taken, self._config = True, config
@@ -210,21 +162,51 @@ class GeneralContact:
             )
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
-            body = skin.body_of_node[nodes]
-            own = nodes[(place[body] < with_facets.max()) | itself[body] | skin.corners[nodes]]
             apart = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
-            # as many bodies as others meet one in a corner of a grid of blocks
-            n_lists = 2**config.gdim - 1
-            neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
-            parts += [AmongContact(self, neighbours, k, normals=self.normals, **options) for k in range(n_lists)]
+            among = self._mortar if self.coupling == "mortar" else self._nodes
+            parts += among(nodes, place, itself, apart, bound, options)
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
-            parts.append(RigidContact(surface, target, name=f"{self.name} on {name}", **options))
+            parts.append(RigidContact(surface, target, coupling=self.coupling, name=f"{self.name} on {name}", **options))
         if self._pairs is not None:
             self._give_friction(parts)
         self._parts = parts
         return parts
+
+    def _nodes(
+        self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
+    ) -> list[Contact]:
+        """Contacts of nodes with bodies (collective); arguments as those of ``Neighbours``, ``nodes`` are all on the surfaces."""
+        from uem_dolfinx.geometry.neighbours import Neighbours
+
+        skin = self._skin
+        body = skin.body_of_node[nodes]
+        own = nodes[(place[body] < place[skin.size > 0].max()) | itself[body] | skin.corners[nodes]]
+        # as many bodies as others meet one in a corner of a grid of blocks
+        n_lists = 2**self._config.gdim - 1
+        neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
+        return [AmongContact(neighbours, k, name=self._name(k), normals=self.normals, **options) for k in range(n_lists)]
+
+    def _mortar(
+        self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
+    ) -> list[Contact]:
+        """Contacts of facets with each body that others follow (collective); arguments as of ``_nodes``."""
+        from uem_dolfinx.contact.among_mortar import Body
+        from uem_dolfinx.geometry.faces import classes_of_facets, facets_by_class, surface_of
+
+        skin, found, order = self._skin, list[Contact](), np.argsort(place)
+        classes = classes_of_facets(skin)
+        for body in order[skin.size[order] > 0].tolist():
+            tag = surface_of(skin, skin.body == body)
+            for contactor in facets_by_class(skin, *classes, place[skin.body] < place[body]):
+                target = Body(skin, TargetFacets(self._config, tag), body, apart, bound)
+                found.append(MortarContact(contactor, tag, target, name=self._name(len(found)), **options))
+        return found
+
+    def _name(self, k: int) -> str:
+        """Of the k-th of the contacts between bodies."""
+        return f"{self.name} {k + 1}" if k else self.name
 
     def _give_friction(self, parts: Sequence[Contact]) -> None:
         """Tell the contacts what friction pairs have (collective)."""

@@ -180,6 +180,10 @@ class Mortar(Contactors):
         rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
         return replace(rows, facing=facing)
 
+    def told(self, facets: Ints) -> Array | None:
+        """What tells which facets of the target those of the contactor ``(m,)`` may touch ``(m, k)``; None where they may touch all."""
+        return None
+
     def _offsets(self, facets: Ints) -> Array | None:
         """Offsets at the nodes of facets ``(m, nn)``; None for none (collective)."""
         if self.offset is None:
@@ -224,7 +228,7 @@ class Mortar(Contactors):
         assert isinstance(self.target, MeshTarget)
         shape = self.target.shape
         keys = self.surface.keys[facets]
-        found = find_opposite(self.target, planes, x, reach, (keys, self.faced))
+        found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.told(facets))
         e = found.facet
         s = overlap(planes.take(e), (self.surface.shape, x[e]), (shape, found.x), self.surface.sign[facets[e]])
         # what lies behind the facets in reach is no contact

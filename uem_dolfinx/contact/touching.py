@@ -50,7 +50,9 @@ def forces_of_pairs(
         i = np.flatnonzero(pair.trial.active)
         target = pair.target
         second = np.full(len(i), skin.n_bodies + k)
-        if isinstance(target, MeshTarget):
+        if hasattr(target, "body"):
+            second = np.full(len(i), target.body)
+        elif isinstance(target, MeshTarget):
             second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
         first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
         rows = np.column_stack([np.ones(len(i)), force, moments(config.of_circles(pair.points[i]) - centre, force)])

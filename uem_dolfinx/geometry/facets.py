@@ -64,6 +64,8 @@ class TargetFacets:
         self.dofs = cell_dofs[self.cells[:, None], _facet_closure(config, self.shape)[self.sides]]
         self.nodes = config.to_global(self.dofs)
         self._refuse_inner()
+        #: Local numbers of the facets in the mesh ``(m,)``.
+        self.entities: Indices = tag.entities[own]
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
         self.open_nodes = self._open_nodes()

@@ -44,7 +44,9 @@ class Opposite:
 
 
 @timed("search")
-def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array, faced: tuple[Ints, Ints] | None = None) -> Opposite:
+def find_opposite(
+    target: MeshTarget, planes: Planes, x: Array, reach: Array, faced: tuple[Ints, Ints] | None = None, told: Array | None = None
+) -> Opposite:
     """Target facets that face contactor facets and may lie upon them, no farther than ``reach (m,)`` along the normal (collective).
 
     Args:
@@ -54,22 +56,32 @@ def find_opposite(target: MeshTarget, planes: Planes, x: Array, reach: Array, fa
         reach: lengths ``(m,)``.
         faced: what tells the contactor facets in any partition ``(m,)``, and by these keys the contactor and target facets that have
             faced each other before ``(p, 2)``; None if none have.
+        told: what tells which of the target's facets they may touch ``(m, k)``, as its ``allowed``; None if all.
     """
     comm = target.comm
     middle = x.mean(axis=1)
     radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1, initial=0.0)
     here = target.facets.x
     asked = [middle, radius, reach, planes.normal]
+    told = np.zeros((len(x), 0)) if told is None else told
     if comm.size == 1:
-        i, f = _candidates(target, here, *asked)
+        i, f = _allowed(target, told, *_candidates(target, here, *asked))
         return _facing(target.shape, planes, faced, i, here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     near = _boxes_near(target, here, middle, radius + reach)
     exchange = Exchange(comm, [np.flatnonzero(n) for n in near])
     mine = np.arange(len(x))
-    *arrived, row, rank = exchange.send(*asked, mine, np.full(len(x), comm.rank))
-    i, f = _candidates(target, here, *arrived)
+    *arrived, told, row, rank = exchange.send(*asked, told, mine, np.full(len(x), comm.rank))
+    i, f = _allowed(target, told, *_candidates(target, here, *arrived))
     found = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     return _facing(target.shape, planes, faced, *found)
+
+
+def _allowed(target: MeshTarget, told: Array, facet: Ints, opposite: Ints) -> tuple[Ints, Ints]:
+    """Those pairs of facets that may touch each other, by what contactor facets have ``told (m, k)``."""
+    if not told.shape[1]:
+        return facet, opposite
+    may = target.allowed(told[facet], opposite)
+    return facet[may], opposite[may]
 
 
 def _facing(

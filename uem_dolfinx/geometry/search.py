@@ -158,6 +158,10 @@ class MeshTarget:
         """Whether contactors of whom this was ``told (k,)`` may touch this rank's facets ``(k,)``."""
         return np.ones(len(told), bool)
 
+    def allowed(self, told: Array, facet: Ints) -> Bools:
+        """Whether contactor facets of which this was ``told (k, m)`` may touch this rank's facets ``(k,)``."""
+        return np.ones(len(facet), bool)
+
     def of_facets(self, facet: Ints, values: AnyArray) -> Any:
         """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
         return self.facets.values_at(facet, values)

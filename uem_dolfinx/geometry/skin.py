@@ -169,10 +169,13 @@ class Skin(TargetFacets):
             self._spread[there] = spread_of(sums)
         return self._spread
 
-    def middles(self, x: Array) -> tuple[Array, Array]:
-        """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
+    def middles(self, x: Array, sign: Array | None = None) -> tuple[Array, Array]:
+        """Middles and outward unit normals there of facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each.
+
+        ``sign (m,)`` turns normals outwards; None where they are those of this rank.
+        """
         tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
-        return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
+        return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * (self.sign if sign is None else sign)[:, None]
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).

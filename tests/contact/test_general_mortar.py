@@ -1,0 +1,71 @@
+"""General contact by mortar: exact on meshes that do not match, as pairs by hand, the same on any ranks."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from body_scenes import Discs, close, grid, oedometer
+from helpers import M, highest, run, slow
+
+import uem_dolfinx as uem
+
+COMM = MPI.COMM_WORLD
+GRIDS = [
+    ("quadrilateral", (2, 2), (2, 3, 3, 2)), ("hexahedron", (1, 2, 2), (2, 3, 1, 2)), ("triangle", (1, 4), (3, 4)),
+    ("hexahedron", (2, 2, 2), (1,)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("cell,counts,n", GRIDS, ids=str)
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_uniform_strain_on_meshes_that_do_not_match(cell, counts, n, mu):
+    """Blocks side by side and one on another: one strain in all of them, through sides, edges and points where they meet."""
+    (b, places), strain = grid(cell, n, counts), 0.01
+    contact = uem.GeneralContact(coupling="mortar", friction=mu)
+    problem = b.problem([contact], oedometer(b, places, counts, strain * counts[-1]), rtol=1e-12)
+    run(problem)
+    exact = np.zeros_like(problem.config.X)
+    exact[:, -1] = -strain * problem.config.X[:, -1]
+    assert highest(COMM, np.abs(problem.config.displacement - exact)) < 1e-12
+    forces = [contact.between(f"body {k + 1}").force for k in range(len(places))]
+    assert np.abs(sum(forces)).max() < 1e-13 and max(np.abs(f).max() for f in forces) > 0.9 * M * strain
+
+
+@pytest.mark.parametrize("rows,columns,end", [(2, 1, 0.12), slow(3, 2, 0.6)])
+def test_discs_as_declared_by_hand(rows, columns, end):
+    """Every step, iteration and displacement is that of pairs declared by hand."""
+    discs, found = Discs(rows, columns), []
+    for general in (True, False):
+        if general:
+            contacts = [uem.GeneralContact(rigid=discs.walls(), friction=discs.mu, coupling="mortar")]
+        else:
+            contacts = discs.contacts(False)
+            for contact in contacts:
+                contact.coupling = "mortar"
+        problem = discs.problem(contacts)
+        steps = [
+            (s.time, s.newton_iterations, sum(c.n_active for c in problem.contacts)) for s in uem.time_steps(problem, 0.01, end)
+        ]
+        found.append((problem.u, steps))
+    (u, one), (v, other) = found
+    assert one == other and max(n for _, _, n in one) >= 2
+    close(u, v)
+
+
+def test_what_it_does_not_go_with():
+    """Self contact and averaged normals are refused by name."""
+    for how in ({"self_contact": True}, {"normals": "averaged"}):
+        with pytest.raises(uem.InputError, match=f"{next(iter(how))} = .*mortar"):
+            uem.GeneralContact(coupling="mortar", **how)
+
+
+def test_excluded_parts_do_not_touch():
+    """Two blocks that are pushed through each other where their parts are excluded, or left to a contact of their own."""
+    (b, places), strain = grid("quadrilateral", (2, 3), (1, 2)), 0.01
+    low, high = b.side(0, 1, 1.0), b.side(1, 1, 1.0)
+    contact = uem.GeneralContact(coupling="mortar", exclude=[(low, high)])
+    problem = b.problem([contact], oedometer(b, places, (1, 2), 2 * strain), rtol=1e-12)
+    run(problem)
+    assert contact.n_active == 0 and highest(COMM, np.abs(problem.u.x.array)) == pytest.approx(2 * strain, rel=1e-9)

@@ -1,0 +1,76 @@
+"""Smooth faces of the surfaces of many bodies, in few classes: where edges are sharp, facets of different classes meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.parallel import reduced
+
+
+def facets_by_class(skin: Skin, classes: Ints, count: int, which: Bools) -> list[Tag]:
+    """Some of this rank's facets ``(m,)`` as surfaces, one for each of so many ``classes (m,)`` that has any (collective)."""
+    some = reduced(skin.config.comm, np.bincount(classes[which], minlength=count)) > 0
+    return [surface_of(skin, which & (classes == k)) for k in np.flatnonzero(some)]
+
+
+def surface_of(skin: Skin, which: Bools) -> Tag:
+    """Some of this rank's facets ``(m,)`` as a surface."""
+    return replace(skin.tag, entities=np.sort(skin.entities[which]))
+
+
+def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
+    """A class for each facet of this rank ``(m,)``, and the number of classes (collective).
+
+    Facets that meet at a smooth edge are of one class, those of two faces that meet at a sharp edge of two. The faces take the first
+    class that none beside them has, one by one in the order of what tells facets in any partition. Only the list of faces that meet at
+    sharp edges is known to all ranks. A face that goes round and meets itself at a sharp edge is of one class all the same.
+    """
+    face, count = _faces(skin)
+    first = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first, face, skin.keys)
+    first = reduced(skin.config.comm, first, op=MPI.MIN)
+    facet, side = np.nonzero(skin.sharp_sides & (skin.across >= 0))
+    meeting = np.unique(np.column_stack([face[facet], skin.values_at(skin.across[facet, side], face)]), axis=0)
+    meeting = np.concatenate(skin.config.comm.allgather(meeting))
+    beside: list[set[int]] = [set() for _ in range(count)]
+    for a, b in meeting[meeting[:, 0] != meeting[:, 1]].tolist():
+        beside[a].add(b)
+    given = np.full(count, -1)
+    for one in np.argsort(first).tolist():
+        taken = {int(given[other]) for other in beside[one]}
+        given[one] = next(k for k in range(count) if k not in taken)
+    return given[face], int(given.max(initial=0)) + 1
+
+
+def _faces(skin: Skin) -> tuple[Ints, int]:
+    """The smooth face of each facet of this rank ``(m,)``, alike on all ranks, and their number (collective)."""
+    comm, n = skin.config.comm, len(skin.dofs)
+    smooth, begin = ~skin.sharp_sides & (skin.across >= 0), skin.first[comm.rank]
+    facet, side = np.nonzero(smooth)
+    other = skin.across[facet, side]
+    here = (other >= begin) & (other < begin + n)
+    count, piece = _connected(n, [np.column_stack([facet[here], other[here] - begin])])
+    sizes = comm.allgather(count)
+    mine = piece + sum(sizes[: comm.rank])
+    theirs = skin.values_at(other, mine)
+    links = np.unique(np.column_stack([mine[facet], theirs])[~here], axis=0)
+    count, whole = _connected(sum(sizes), comm.allgather(links))
+    return whole[mine], count
+
+
+def _connected(n: int, links: Sequence[Ints]) -> tuple[int, Ints]:
+    """Number of components of a graph of n nodes with these ``links (k, 2)``, and that of each node ``(n,)``."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate(links)
+    count, label = connected_components(coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n)), directed=False)
+    return int(count), label.astype(np.int64)
