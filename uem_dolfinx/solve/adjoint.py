@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +70,19 @@ class Motion(NamedTuple):
     reactions: PETSc.Vec
 
 
+#: Derivatives of problems, compiled for their gradients so far.
+_KEPT: WeakKeyDictionary[UnitedProblem, Derivatives] = WeakKeyDictionary()
+
+
+def _derivatives_of(problem: UnitedProblem) -> Derivatives:
+    """Of its residual and of functionals, those of the last gradient among them."""
+    F, kept = problem.bodies.F, _KEPT.get(problem)
+    if kept is None or kept.F is not F:
+        kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
+    kept.begin()
+    return kept
+
+
 class Linearised:
     """The united problem linearised at the state of equilibrium, which is left as it was in the end (collective).
 
@@ -91,7 +105,7 @@ class Linearised:
         # of the displacement's components here, which are the first of vectors
         self._n = problem.config.n_owned * problem.config.gdim
         self.F = problem.bodies.F
-        self.derivatives = derivatives or Derivatives(self.F, problem.u.function_space, problem.config.V)
+        self.derivatives = derivatives or _derivatives_of(problem)
 
     def __enter__(self) -> Linearised:
         try:

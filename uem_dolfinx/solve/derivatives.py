@@ -29,17 +29,23 @@ class Derivatives:
         V: of the displacement, by whose nodes places are told.
 
     Attributes:
+        F: likewise.
         test: test function of F.
         a: the field, a Function of W.
         work: F along it, a functional.
     """
 
     def __init__(self, F: ufl.Form, W: fem.FunctionSpace, V: fem.FunctionSpace):
-        self.test, self.a, self._V = F.arguments()[0], fem.Function(W), V
+        self.F, self.test, self.a, self._V = F, F.arguments()[0], fem.Function(W), V
         self.work = ufl.replace(F, {self.test: self.a})
         self._comm = V.mesh.comm
         #: Compiled derivatives, None for those that vanish, with the form and the control that their keys number.
         self._known: dict[tuple[Any, ...], tuple[Any, ufl.Form, Any]] = {}
+        self._used: set[tuple[Any, ...]] = set()
+
+    def begin(self) -> None:
+        """Go on with what has been asked for since this was called last, and forget the rest: functionals come and go."""
+        self._known, self._used = {key: self._known[key] for key in self._used}, set()
 
     def along(self, values: Array) -> None:
         """Take the residual's work along a field with these owned values (collective)."""
@@ -52,6 +58,7 @@ class Derivatives:
         if key not in self._known:
             found = make()
             self._known[key] = None if found is None else forms.form(found), form, m
+        self._used.add(key)
         return self._known[key][0]
 
     def by_values(self, form: ufl.Form, m: fem.Function, test: Any = None) -> Array | None:
