@@ -65,16 +65,7 @@ def test_as_declared_by_hand(cell, n_low, n_high, degree, mu):
 @pytest.mark.parametrize("rows,columns,end", [(2, 1, 0.12), slow(3, 2, 0.6)])
 def test_discs_in_motion(rows, columns, end):
     """Every step, iteration and displacement is that of pairs declared by hand."""
-    discs, found = Discs(rows, columns), []
-    for general in (True, False):
-        problem = discs.problem(discs.contacts(general))
-        steps = [
-            (s.time, s.newton_iterations, sum(c.n_active for c in problem.contacts)) for s in uem.time_steps(problem, 0.01, end)
-        ]
-        found.append((problem.u, steps))
-    (u, one), (v, other) = found
-    assert one == other and max(n for _, _, n in one) >= 2
-    close(u, v)
+    Discs(rows, columns).move_alike(end)
 
 
 def test_lists_with_nothing_on_them_cost_nothing(monkeypatch):

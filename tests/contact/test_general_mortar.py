@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from body_scenes import Discs, close, grid, oedometer
+from body_scenes import Discs, grid, oedometer
 from helpers import M, highest, run, slow
 
 import uem_dolfinx as uem
@@ -36,22 +36,7 @@ def test_uniform_strain_on_meshes_that_do_not_match(cell, counts, n, mu):
 @pytest.mark.parametrize("rows,columns,end,mu", [(2, 1, 0.12, 0.2), slow(3, 2, 0.3, 0.0)])
 def test_discs_as_declared_by_hand(rows, columns, end, mu):
     """Every step, iteration and displacement is that of pairs declared by hand."""
-    discs, found = Discs(rows, columns, mu=mu), []
-    for general in (True, False):
-        if general:
-            contacts = [uem.GeneralContact(rigid=discs.walls(), friction=discs.mu, coupling="mortar")]
-        else:
-            contacts = discs.contacts(False)
-            for contact in contacts:
-                contact.coupling = "mortar"
-        problem = discs.problem(contacts)
-        steps = [
-            (s.time, s.newton_iterations, sum(c.n_active for c in problem.contacts)) for s in uem.time_steps(problem, 0.01, end)
-        ]
-        found.append((problem.u, steps))
-    (u, one), (v, other) = found
-    assert one == other and max(n for _, _, n in one) >= 2
-    close(u, v)
+    Discs(rows, columns, mu=mu).move_alike(end, "mortar")
 
 
 def test_what_it_does_not_go_with():

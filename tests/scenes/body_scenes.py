@@ -113,12 +113,27 @@ class Discs:
         self.walls = lambda: [uem.RigidPlane((0, 0.0), (0, 1)), uem.RigidPlane((-0.49, 0), (1, 0))]
         self.mu, self.surfaces = mu, [surface_of(b.s, k) for k in range(len(middles))]
 
-    def contacts(self, general):
+    def contacts(self, general, coupling="node_to_surface"):
+        how = {"friction": self.mu, "coupling": coupling}
         if general:
-            return [uem.GeneralContact(rigid=self.walls(), friction=self.mu)]
+            return [uem.GeneralContact(rigid=self.walls(), **how)]
         s, every = self.surfaces, all_facets(self.b.s.mesh)
-        pairs = [uem.Contact(a, b, friction=self.mu) for k, a in enumerate(s) for b in s[k + 1 :]]
-        return pairs + [uem.Contact(every, wall, friction=self.mu, name=f"wall {k}") for k, wall in enumerate(self.walls())]
+        pairs = [uem.Contact(a, b, **how) for k, a in enumerate(s) for b in s[k + 1 :]]
+        return pairs + [uem.Contact(every, wall, name=f"wall {k}", **how) for k, wall in enumerate(self.walls())]
+
+    def move_alike(self, end, coupling="node_to_surface"):
+        """Every step, iteration and displacement of one declaration is that of pairs declared by hand."""
+        found = []
+        for general in (True, False):
+            problem = self.problem(self.contacts(general, coupling))
+            steps = [
+                (s.time, s.newton_iterations, sum(c.n_active for c in problem.contacts))
+                for s in uem.time_steps(problem, 0.01, end)
+            ]
+            found.append((problem.u, steps))
+        (u, one), (v, other) = found
+        assert one == other and max(n for _, _, n in one) >= 2
+        close(u, v)
 
     def problem(self, contacts):
         V, u = self.b.V, fem.Function(self.b.V)

@@ -73,10 +73,6 @@ class NothingNear(NodalKinematics):
         """They stay where they are."""
         return self
 
-    def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
-        """They follow nothing."""
-        return self, state, False
-
     def predicted(self, du: Array) -> Array:
         """The gap to nothing, as large as the model ``(n,)``."""
         return self.gap
@@ -87,10 +83,6 @@ class NothingNear(NodalKinematics):
 
     def at_end(self, state: PairState) -> Bools:
         """None is held by an end ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    def near(self, state: PairState) -> Bools:
-        """None is near anything ``(n,)``."""
         return np.zeros(len(self.gap), bool)
 
     def return_vectors(self, state: PairState) -> Array:

@@ -16,10 +16,10 @@ from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.weighted_gaps import MortarKinematics
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.facets import TargetFacets, heights
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.geometry.skin import Apart, Skin
 
 
 class Body(MeshTarget):
@@ -33,27 +33,24 @@ class Body(MeshTarget):
         overlap: bound on what facets may be inside it at the start, a length.
     """
 
-    def __init__(
-        self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[tuple[Bools, Bools, Bools, Bools]], overlap: float
-    ):
+    def __init__(self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[Apart], overlap: float):
         super().__init__(facets)
-        self.skin, self.body, self._overlap = skin, body, overlap
+        self.skin, self._overlap = skin, overlap
         own = np.flatnonzero(skin.body == body)
         #: Numbers of its facets among those of all bodies, over all ranks ``(m,)``.
         self.numbers: Ints = skin.first[skin.config.comm.rank] + own
         #: Sets of nodes, and of all bodies' facets, that never touch facets of this body, with these.
         self._apart = [sets for a, f, b, h in apart for sets in ((a, f, h[own]), (b, h, f[own]))]
-        self._committed = skin.config.x.copy()
+        self._planes = facets.middles(facets.x)
 
     def commit(self) -> None:
         """A step has been kept, or is gone back to."""
-        self._committed, self._overlap = self.skin.config.x.copy(), 0.0
+        self._planes, self._overlap = self.facets.middles(self.facets.x), 0.0
 
-    def told_of(self, surface: TargetFacets, which: Ints) -> Array:
-        """Of some facets of a surface ``(k,)``, for ``allowed``: where their middles were, and the sets they are in ``(k, gdim + s)``."""
-        number = np.searchsorted(self.skin.entities, surface.entities[which])
-        sets = [facets[number] for _, facets, _ in self._apart]
-        return np.column_stack([self._committed[surface.dofs[which]].mean(axis=1), *sets])
+    def sets_of(self, surface: TargetFacets) -> Bools:
+        """Which facets of a surface are in the sets that never touch some of this body's ``(m, s)``."""
+        number = np.searchsorted(self.skin.entities, surface.entities)
+        return np.column_stack([np.zeros((len(number), 0), dtype=bool), *(facets[number] for _, facets, _ in self._apart)])
 
     def excluded(self, nodes: Indices, facet: Ints) -> Bools:
         """Which local nodes ``(n,)`` never touch the facets with these numbers that are nearest to them ``(n,)`` (collective)."""
@@ -63,15 +60,13 @@ class Body(MeshTarget):
         return out
 
     def allowed(self, told: Array, facet: Ints) -> Bools:
-        """See ``MeshTarget``; ``told`` is that of ``told_of``."""
-        g = self.skin.config.gdim
-        middle, normal = self.skin.middles(self._committed[self.dofs], self.facets.sign)
-        height = np.einsum("kg,kg->k", told[:, :g] - middle[facet], normal[facet])
+        """See ``MeshTarget``; of contactor facets are told where their middles were, and their sets ``(k, gdim + s)``."""
+        where, sets = np.split(told, [self.skin.config.gdim], axis=1)
         # facets of one side reach round it, below the planes of each other; those of the other side are behind the cells
-        may = np.asarray(height >= -np.maximum(self.facets.depth[facet], self._overlap))
+        may = heights(where, facet, self._planes) >= -np.maximum(self.facets.depth[facet], self._overlap)
         for k, (_, _, facets) in enumerate(self._apart):
-            may &= ~((told[:, g + k] > 0) & facets[facet])
-        return may
+            may &= ~((sets[:, k] > 0) & facets[facet])
+        return np.asarray(may)
 
 
 @dataclass(frozen=True)
@@ -93,6 +88,7 @@ class AmongBodiesMortar(Mortar):
     def __init__(self, config: Configuration, nodes: Indices, target: Body, **how: Any):
         super().__init__(config, nodes, target, **how)
         self._at_edge = target.skin.on_sides(target.skin.sharp_sides)[nodes]
+        self._sets, self._middles = target.sets_of(self.surface), self.surface.x.mean(axis=1)
 
     def place(self, points: Array, state: PairState) -> MortarKinematics:
         """Project contactors and find the segments of their facets (collective); see ``Discretisation``."""
@@ -103,10 +99,11 @@ class AmongBodiesMortar(Mortar):
         return FacesOnBody(**vars(found), out=out & ~found.rows.covered)
 
     def told(self, facets: Ints) -> Array:
-        """What tells which facets of the body may be opposite to these, see ``Body.told_of`` ``(m, k)``."""
-        return self.target.told_of(self.surface, facets)
+        """What tells which facets of the body may be opposite to these, see ``Body.allowed`` ``(m, k)``."""
+        return np.column_stack([self._middles[facets], self._sets[facets]])
 
     def commit(self) -> None:
         """Contactors are in front of facets from where they are now."""
         super().commit()
+        self._middles = self.surface.x.mean(axis=1)
         self.target.commit()

@@ -34,11 +34,7 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.pair_friction import FrictionOfPairs
-    from uem_dolfinx.geometry.skin import Skin
-
-
-#: Two sets of facets that never touch each other, as local nodes and this rank's facets of both.
-Apart = tuple[Bools, Bools, Bools, Bools]
+    from uem_dolfinx.geometry.skin import Apart, Skin
 
 
 class GeneralContact:
@@ -199,8 +195,8 @@ class GeneralContact:
         classes = classes_of_facets(skin)
         for body in order[skin.size[order] > 0].tolist():
             tag = surface_of(skin, skin.body == body)
+            target = Body(skin, TargetFacets(self._config, tag), body, apart, bound)
             for contactor in facets_by_class(skin, *classes, place[skin.body] < place[body]):
-                target = Body(skin, TargetFacets(self._config, tag), body, apart, bound)
                 found.append(MortarContact(contactor, tag, target, name=self._name(len(found)), **options))
         return found
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.law import FrictionLaw
@@ -46,7 +46,24 @@ class RigidContact(GeneralPart):
     """One of the contacts that a general contact consists of: every node against a rigid surface."""
 
 
-class AmongContact(GeneralPart):
+class BodiesContact(GeneralPart):
+    """One of the contacts that a general contact consists of: of bodies with bodies."""
+
+    def on_skin(self, facet: Ints) -> Ints:
+        """Numbers among the facets of all bodies of those that contactors are on ``(n,)``, -1 for none (collective)."""
+        return facet
+
+    def _friction_now(self, kinematics: Kinematics) -> Array | None:
+        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
+        if self._by_pairs is None:
+            return super()._friction_now(kinematics)
+        return None if kinematics.idle else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
+
+    def look_at_ends(self) -> None:
+        """Contactors come and go past the edges of bodies."""
+
+
+class AmongContact(BodiesContact):
     """One of the contacts that a general contact consists of: every node against one body near it."""
 
     def __init__(self, neighbours: Neighbours, number: int, **options: Any):
@@ -63,23 +80,14 @@ class AmongContact(GeneralPart):
 
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
 
-    def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
-        if self._by_pairs is None:
-            return super()._friction_now(kinematics)
-        return None if kinematics.idle else self._by_pairs.now(kinematics.projection.facet)
-
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete (collective)."""
         super().begin()
         # every node is beside something, and every corner of one body within the surface of all
         self._corners = None
 
-    def look_at_ends(self) -> None:
-        """Contactors come and go past the edges of bodies."""
 
-
-class MortarContact(GeneralPart):
+class MortarContact(BodiesContact):
     """One of the contacts that a general contact consists of: facets of all bodies that follow one body, of smooth faces, against it."""
 
     def __init__(self, contactor: Tag, target: Tag, body: Body, **options: Any):
@@ -96,11 +104,6 @@ class MortarContact(GeneralPart):
         surface = TargetFacets(self.config, self.contactor, "contactor")
         return AmongBodiesMortar(self.config, nodes, target, surface=surface, **how), None
 
-    def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
-        if self._by_pairs is None:
-            return super()._friction_now(kinematics)
-        return self._by_pairs.now(self._body.of_facets(kinematics.projection.facet, self._body.numbers))
-
-    def look_at_ends(self) -> None:
-        """Contactors come and go past the edges of bodies."""
+    def on_skin(self, facet: Ints) -> Ints:
+        """See ``BodiesContact``."""
+        return np.asarray(self._body.of_facets(facet, self._body.numbers))

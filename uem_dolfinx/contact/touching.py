@@ -9,8 +9,8 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general_parts import BodiesContact
 from uem_dolfinx.contact.results import moments
-from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.skin import Skin
 
 
@@ -48,12 +48,9 @@ def forces_of_pairs(
     for k, part in enumerate(parts):
         pair = part.pair
         i = np.flatnonzero(pair.trial.active)
-        target = pair.target
         second = np.full(len(i), skin.n_bodies + k)
-        if hasattr(target, "body"):
-            second = np.full(len(i), target.body)
-        elif isinstance(target, MeshTarget):
-            second = np.asarray(target.of_facets(pair.projection.facet[i], skin.body))
+        if isinstance(part, BodiesContact):
+            second = skin.values_at(part.on_skin(pair.projection.facet[i]), skin.body)
         first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
         rows = np.column_stack([np.ones(len(i)), force, moments(config.of_circles(pair.points[i]) - centre, force)])
         keys, inverse = np.unique(first * n + second, return_inverse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
 from mpi4py import MPI
@@ -35,36 +36,54 @@ _FOUND: WeakKeyDictionary[Nodes, tuple[Ints, int]] = WeakKeyDictionary()
 
 
 def find_bodies(nodes: Nodes) -> tuple[Ints, int]:
-    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective; found once).
-
-    Every rank labels its own pieces; only the list of pieces that share nodes across ranks is known to all.
-    """
+    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective; found once)."""
     if nodes not in _FOUND:
         _FOUND[nodes] = _find_bodies(nodes)
     return _FOUND[nodes]
 
 
 def _find_bodies(nodes: Nodes) -> tuple[Ints, int]:
+    cells, label = compat.cell_dofs(nodes.V), fem.Function(nodes.V)
+    view = label.x.array.reshape(-1, nodes.block)
+
+    def shared(mine: Ints) -> Ints:
+        """What owners call the pieces of nodes here."""
+        view[:, 0] = mine
+        label.x.scatter_forward()
+        return np.column_stack([mine, view[:, 0].astype(np.int64)])
+
+    return connected(nodes.comm, nodes.n_local, np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()]), shared)
+
+
+def connected(comm: MPI.Comm, n: int, links: Ints, shared: Callable[[Ints], Ints]) -> tuple[Ints, int]:
+    """What is connected over all ranks: the number of the component of each of n items of this rank ``(n,)``, and how many (collective).
+
+    Every rank labels its own pieces; only the list of pieces that are connected across ranks is known to all.
+
+    Args:
+        comm: communicator.
+        n: number of items of this rank.
+        links: pairs of these ``(k, 2)``.
+        shared: makes of the labels of this rank's items ``(n,)``, unlike those of other ranks, pairs of labels ``(l, 2)`` of items here
+            and there that are connected; asked for on several ranks alone (collective).
+    """
+    count, piece = _components(n, links)
+    if comm.size == 1:
+        return piece, count
+    sizes = comm.allgather(count)
+    mine = piece + sum(sizes[: comm.rank])
+    count, whole = _components(sum(sizes), np.concatenate(comm.allgather(np.unique(shared(mine), axis=0))))
+    return whole[mine], count
+
+
+def _components(n: int, links: Ints) -> tuple[int, Ints]:
+    """Number of components of a graph of n nodes with these ``links (k, 2)``, and that of each node ``(n,)``."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    comm, cells = nodes.comm, compat.cell_dofs(nodes.V)
-    pairs = np.column_stack([cells[:, :-1].ravel(), cells[:, 1:].ravel()])
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(nodes.n_local,) * 2)
-    n_pieces, piece = connected_components(graph, directed=False)
-    if comm.size == 1:
-        return piece.astype(np.int64), int(n_pieces)
-    sizes = comm.allgather(n_pieces)
-    mine = piece + sum(sizes[: comm.rank])
-    label = fem.Function(nodes.V)
-    view = label.x.array.reshape(-1, nodes.block)
-    view[:, 0] = mine
-    label.x.scatter_forward()
-    links = np.unique(np.column_stack([mine, view[:, 0].astype(np.int64)]), axis=0)
-    links = np.concatenate(comm.allgather(links))
-    total = sum(sizes)
-    count, body = connected_components(coo_matrix((np.ones(len(links)), links.T), shape=(total, total)), directed=False)
-    return body[mine].astype(np.int64), int(count)
+    graph = coo_matrix((np.ones(len(links)), links.T), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label.astype(np.int64)
 
 
 def body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:

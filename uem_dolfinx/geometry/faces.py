@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from mpi4py import MPI
@@ -10,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.geometry.bodies import connected
 from uem_dolfinx.geometry.skin import Skin
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
@@ -52,25 +52,13 @@ def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
 
 def _faces(skin: Skin) -> tuple[Ints, int]:
     """The smooth face of each facet of this rank ``(m,)``, alike on all ranks, and their number (collective)."""
-    comm, n = skin.config.comm, len(skin.dofs)
-    smooth, begin = ~skin.sharp_sides & (skin.across >= 0), skin.first[comm.rank]
-    facet, side = np.nonzero(smooth)
+    n, begin = len(skin.dofs), skin.first[skin.config.comm.rank]
+    facet, side = np.nonzero(~skin.sharp_sides & (skin.across >= 0))
     other = skin.across[facet, side]
     here = (other >= begin) & (other < begin + n)
-    count, piece = _connected(n, [np.column_stack([facet[here], other[here] - begin])])
-    sizes = comm.allgather(count)
-    mine = piece + sum(sizes[: comm.rank])
-    theirs = skin.values_at(other, mine)
-    links = np.unique(np.column_stack([mine[facet], theirs])[~here], axis=0)
-    count, whole = _connected(sum(sizes), comm.allgather(links))
-    return whole[mine], count
 
+    def shared(mine: Ints) -> Ints:
+        """What the ranks of facets across call the pieces of these."""
+        return np.column_stack([mine[facet], skin.values_at(other, mine)])
 
-def _connected(n: int, links: Sequence[Ints]) -> tuple[int, Ints]:
-    """Number of components of a graph of n nodes with these ``links (k, 2)``, and that of each node ``(n,)``."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.concatenate(links)
-    count, label = connected_components(coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n)), directed=False)
-    return int(count), label.astype(np.int64)
+    return connected(skin.config.comm, n, np.column_stack([facet[here], other[here] - begin]), shared)

@@ -149,6 +149,11 @@ class TargetFacets:
         """Outward unit normals of the facets at their nodes, each its own ``(m, nn, gdim)``."""
         return unit(self._area_vectors(self.x))
 
+    def middles(self, x: Array) -> tuple[Array, Array]:
+        """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
+        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
+        return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
+
     def _area_vectors(self, x: Array) -> Array:
         """Outward normals at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``, as long as the facets are large."""
         return self.sign[:, None, None] * nodal_area_vectors(self.shape, x)
@@ -181,6 +186,12 @@ class TargetFacets:
         """Outward normals at the nodes, as long as the facets are large, and beside them their lengths ``(m, nn, gdim + 1)``."""
         vectors = self._area_vectors(self.x)
         return np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2)
+
+
+def heights(points: Array, facet: Ints, planes: tuple[Array, Array]) -> Array:
+    """How high ``points (k, gdim)`` are over some of the ``planes`` through facets, as of ``TargetFacets.middles`` ``(k,)``."""
+    middle, normal = planes
+    return np.asarray(np.einsum("kg,kg->k", points - middle[facet], normal[facet]))
 
 
 def spread_of(sums: Array) -> Array:

@@ -19,11 +19,11 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, balls_that_meet
-from uem_dolfinx.geometry.facets import FacetData
+from uem_dolfinx.geometry.facets import FacetData, heights
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import Feet, MeshTarget, box_distances
 from uem_dolfinx.geometry.shapes import closest_point
-from uem_dolfinx.geometry.skin import Skin
+from uem_dolfinx.geometry.skin import Apart, Skin
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, gathered, reduced
 
@@ -110,7 +110,7 @@ class Neighbours:
     """
 
     def __init__(
-        self, skin: Skin, nodes: Indices, place: Ints, apart: Sequence[tuple[Bools, Bools, Bools, Bools]], overlap: float, n_lists: int,
+        self, skin: Skin, nodes: Indices, place: Ints, apart: Sequence[Apart], overlap: float, n_lists: int,
         itself: Bools,
     ):  # fmt: skip
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
@@ -292,8 +292,7 @@ class Neighbours:
     def _in_front(self, points: Array, facet: Ints) -> Bools:
         """Which nodes at ``points (k, gdim)`` were in front of this rank's facets ``(k,)``."""
         skin = self.skin
-        middle, normal = skin.middles(self._committed[skin.dofs])
-        height = np.einsum("kg,kg->k", points - middle[facet], normal[facet])
+        height = heights(points, facet, skin.middles(self._committed[skin.dofs]))
         return np.asarray(height >= -BEHIND * np.minimum(skin.depth, skin.radius)[facet])
 
     def _first_of_itself(self, of: Asking, node: Ints, facet: Ints, cosines: Array) -> Bools:

@@ -14,7 +14,6 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
-from uem_dolfinx.geometry.shapes import unit_normals
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced, sums_by_keys
@@ -26,6 +25,10 @@ SHARP_EDGE = 0.7
 #: input tells who follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
 ALIKE_IN_SIZE = 1.5
+
+
+#: Two sets of facets that never touch each other, as local nodes and this rank's facets of both.
+Apart = tuple[Bools, Bools, Bools, Bools]
 
 
 class Skin(TargetFacets):
@@ -168,14 +171,6 @@ class Skin(TargetFacets):
             there, sums = self._of_one_face(self._areas_beside())
             self._spread[there] = spread_of(sums)
         return self._spread
-
-    def middles(self, x: Array, sign: Array | None = None) -> tuple[Array, Array]:
-        """Middles and outward unit normals there of facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each.
-
-        ``sign (m,)`` turns normals outwards; None where they are those of this rank.
-        """
-        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
-        return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * (self.sign if sign is None else sign)[:, None]
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).

@@ -6,6 +6,7 @@ Stress and tangent enter forms as Functions known at quadrature points.
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -321,7 +322,7 @@ class VonMises:
         """Stress and tangent at the present displacement, from the committed history; NotFiniteError if they are not (collective)."""
         with timed("return mapping"):
             with np.errstate(over="ignore", invalid="ignore"):
-                trial = self._return(self._points.evaluate(self._strain), *self._committed())
+                trial = self._returned()
                 stress = trial.stress.copy()
                 if self.kind != "plane_stress":
                     stress[:, :3] += (self._bulk[:, None] * (self._volume_changes() @ self._spread.T)).reshape(-1, 1)
@@ -331,16 +332,15 @@ class VonMises:
                 self._points.write(f, values)
             self._points.write(self.stress, stress)
 
-    def _return(self, strain: Array, plastic_strain: Array, peeq: Array) -> Any:
-        """Stress, history and tangent at strains ``(n_points, size)``, from a committed history as ``_committed`` has it."""
-        plane, E, nu = self.kind == "plane_stress", self._E, self._nu
-        if self._layers is not None:
-            before = strain, plastic_strain, peeq
-            return self._layers.plane_stress_return(*before, E, nu) if plane else self._layers.radial_return(*before, self._mu)
-        law = *self._curve.parameters.values(), self._modulus
-        if plane:
-            return plane_stress_return(strain, plastic_strain, peeq, E, nu, *law)
-        return radial_return(strain, plastic_strain, peeq, self._mu, *law)
+    def _returned(self) -> Returned:
+        """Stress, history and tangent at the present displacement, from the committed history."""
+        plane, begin, layers = self.kind == "plane_stress", self.begins_with(), self._layers
+        returned: Callable[..., Returned] = plane_stress_return if plane else radial_return
+        if layers is None:
+            return returned(*begin, self._modulus)
+        returned = layers.plane_stress_return if plane else layers.radial_return
+        # yield stresses are the layers' own
+        return returned(*begin[: -len(self._curve.parameters)])
 
     def _committed(self) -> tuple[Array, Array]:
         """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, of layers one after another."""

@@ -13,8 +13,8 @@ from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 
-#: VTK's type of a solid cell, and its vertices in VTK's order.
-SOLIDS = {"tetrahedron": (10, [0, 1, 2, 3]), "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6])}
+#: VTK's types of solid cells.
+SOLIDS = {"tetrahedron": 10, "hexahedron": 12}
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def grid(box: Array, cells: int) -> tuple[list[Array], Array]:
 
 def solid_cells(mesh: Any) -> dict[int, Ints]:
     """Owned cells by d.o.f. of the P1 space, as VTK numbers their vertices, by their type there ``{type: (n, n_vertices)}``."""
-    kind, order = SOLIDS[compat.cell_name(mesh)]
+    cell = compat.cell_name(mesh)
     dofs = compat.cell_dofs(compat.function_space(mesh, 1))[: mesh.topology.index_map(3).size_local]
-    return {kind: dofs[:, order].astype(np.int64)}
+    return {SOLIDS[cell]: compat.vtk_nodes(cell, dofs.astype(np.int64))}
 
 
 def sections(x: Array, values: Array, cells: dict[int, Ints], planes: Sequence[tuple[int, float]]) -> tuple[Array, Array]:
