@@ -1,4 +1,4 @@
-"""What a scene does not need is not done: how often every demo runs each stage of the method.
+"""What a scene does not need is not done: how often every demo runs each stage of the method, and what its active set costs.
 
 python3 demos/stages.py --plot stages.png
 
@@ -19,6 +19,9 @@ Options:
 # - *mass*: not in statics;
 # - *history*, return mapping and commits: not in elastic bodies;
 # - *output*, fields, tables and checkpoints: only where a file is asked for. With --output the demos write theirs to folders in DIR.
+#
+# Who touches, sticks or slips is found by exchanges of contactors within a linearised problem. A second table tells how many load or time
+# steps, Newton iterations and exchanges there were, and how many factorisations, or set-ups of a preconditioner, did for all of them.
 #
 # The demos run on one process each, however many ranks this script has. --demos names some of them, parted by commas; --seconds 1 adds
 # a table of the time.
@@ -58,13 +61,21 @@ import json, runpy, sys, time
 script, file, timers, *options = sys.argv[1:]
 sys.argv = [script, *options]
 sys.path.insert(0, script.rpartition("/")[0])
+from uem_dolfinx.solve.problem import UnitedProblem
+attempt, counts = UnitedProblem.attempt, {"steps": 0, "iterations": 0, "exchanges": 0}
+def counted(*args, **how):
+    history = attempt(*args, **how)
+    for name, n in (("steps", 1), ("iterations", len(history)), ("exchanges", sum(i.exchanges for i in history))):
+        counts[name] += n
+    return history
+UnitedProblem.attempt = counted
 start = time.perf_counter()
 runpy.run_path(script, run_name="__main__")
 wall = time.perf_counter() - start
 import uem_dolfinx
 told = {t: uem_dolfinx.timing(t) for t in json.loads(timers)}
 with open(file, "w", encoding="utf-8") as out:
-    json.dump({"timers": told, "wall": wall}, out)
+    json.dump({"timers": told, "wall": wall, "counts": counts}, out)
 """
 
 # %% [markdown]
@@ -84,8 +95,8 @@ def small() -> dict[str, list[str]]:
 
 
 # %%
-def run(name: str, options: list[str]) -> tuple[dict[str, int], dict[str, float]]:
-    """Calls and seconds of every stage of a demo, and the seconds of the whole."""
+def run(name: str, options: list[str]) -> tuple[dict[str, int], dict[str, float], dict[str, int]]:
+    """Calls and seconds of every stage of a demo, with the seconds of the whole, and how often contactors were exchanged."""
     timers = [timer for stage in STAGES.values() for timer in stage]
     if args.output:
         options = [*options, "--output", str(Path(args.output).resolve() / name)]
@@ -100,7 +111,7 @@ def run(name: str, options: list[str]) -> tuple[dict[str, int], dict[str, float]
         print(f"{name} {' '.join(options)}: {told['wall']:.1f} s", flush=True)
     calls = {stage: sum(told["timers"][timer][0] for timer in timers) for stage, timers in STAGES.items()}
     seconds = {stage: sum(told["timers"][timer][1] for timer in timers) for stage, timers in STAGES.items()}
-    return calls, seconds | {"wall": told["wall"]}
+    return calls, seconds | {"wall": told["wall"]}, told["counts"] | {"factorisations": calls["factorisation"]}
 
 
 # %%
@@ -118,9 +129,10 @@ if comm.rank == 0:
 found, failure = comm.bcast((found, failure))
 if failure is not None:
     raise failure
-results = {"rows": [{"demo": name} | calls for name, (calls, _) in found.items()]}
+results = {"rows": [{"demo": name} | calls for name, (calls, _, _) in found.items()]}
+results["exchanges"] = [{"demo": name} | counts for name, (_, _, counts) in found.items() if counts["exchanges"]]
 if args.seconds:
-    results["seconds"] = [{"demo": name} | seconds for name, (_, seconds) in found.items()]
+    results["seconds"] = [{"demo": name} | seconds for name, (_, seconds, _) in found.items()]
 common.report(args, results)
 
 # %% [markdown]
@@ -130,8 +142,8 @@ common.report(args, results)
 # %%
 with uem.figure(args.plot, comm, size=(9.5, 1.2 + 0.33 * len(found))) as (panel,):
     if panel is not None:
-        calls = np.array([[row[stage] for stage in STAGES] for row, _ in found.values()])
-        share = np.array([[s[stage] / s["wall"] for stage in STAGES] for _, s in found.values()])
+        calls = np.array([[row[stage] for stage in STAGES] for row, _, _ in found.values()])
+        share = np.array([[s[stage] / s["wall"] for stage in STAGES] for _, s, _ in found.values()])
         image = panel.imshow(np.ma.masked_where(calls == 0, 100 * share), aspect="auto", cmap="YlOrRd", vmin=0.0)
         panel.set_xticks(range(len(STAGES)), STAGES)
         panel.set_yticks(range(len(found)), [name.replace("_", " ") for name in found])
@@ -159,7 +171,7 @@ known = {
     "ironing": static,
     "stack": {"P": 1, "P'KP": 1, "tangent": 1, "factorisation": 1} | static,
 }
-for name, (calls, _) in found.items():
+for name, (calls, _, _) in found.items():
     for stage, n in known.get(name, {}).items():
         assert calls[stage] == n, (name, stage, calls)
     assert calls["tangent"] > 0 and calls["factorisation"] > 0, (name, calls)
