@@ -1,4 +1,4 @@
-"""Nodes to the surfaces of many bodies: the discretisation of general contact, and what it is where nothing is near."""
+"""Nodes to the surfaces of many bodies: the discretisation of general contact."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.bernstein import Bernstein
-from uem_dolfinx.contact.kinematics import Constraints, Traction
 from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
+from uem_dolfinx.contact.nothing_near import NothingNear
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.neighbours import Neighbour
@@ -22,6 +22,8 @@ class AmongBodies(NodeToSurface):
     """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
 
     target: Neighbour
+    #: Lists tell what is near.
+    can_be_far = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -33,8 +35,7 @@ class AmongBodies(NodeToSurface):
         """Project contactors (collective); see ``Discretisation``."""
         self.target.hold(np.where(state.active, state.facet, -1))
         if self.target.nothing_near() and not reduced(self.config.comm, bool(state.active.any()), op=MPI.LOR):
-            p = self.target.nowhere(points)
-            return NothingNear(self, points, p, p, p.gap, None, None)
+            return NothingNear.at(self, points)
         return super().place(points, state)
 
     def look_farther(self) -> bool:
@@ -49,51 +50,3 @@ class AmongBodies(NodeToSurface):
 
 class AmongQuadraticBodies(AmongBodies, Bernstein):
     """The same with control gaps, of degree 2."""
-
-
-class NothingNear(NodalKinematics):
-    """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
-
-    @property
-    def idle(self) -> bool:
-        """Yes: nothing is near."""
-        return True
-
-    @property
-    def movable(self) -> Bools:  # type: ignore[override]
-        """None can close its gap ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    @property
-    def cone(self) -> Array:  # type: ignore[override]
-        """There are no facets to push ``(n,)``."""
-        return np.ones(len(self.gap))
-
-    def placed_again(self, state: PairState) -> NodalKinematics:
-        """They stay where they are."""
-        return self
-
-    def predicted(self, du: Array) -> Array:
-        """The gap to nothing, as large as the model ``(n,)``."""
-        return self.gap
-
-    def off(self, state: PairState) -> Bools:
-        """None is past an end ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    def at_end(self, state: PairState) -> Bools:
-        """None is held by an end ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    def return_vectors(self, state: PairState) -> Array:
-        """None is moved ``(n, gdim)``."""
-        return np.zeros(self.points.shape)
-
-    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """There are none."""
-        none = np.zeros(len(self.gap))
-        return Traction(none, none, np.zeros(self.points.shape))
-
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Nothing turns."""
-        return []

@@ -33,8 +33,8 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.geometry.rigid import shared_target
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.shared_target import shared_target
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
 from uem_dolfinx.parallel import agreed, reduced

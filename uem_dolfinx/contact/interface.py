@@ -89,13 +89,17 @@ class Interface(Told):
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
-    @timed("projection")
     def project(self) -> None:
         """Project the contactors onto the target where both are now (collective).
 
         Raises:
             NotFiniteError: if the target's functions return what is not finite.
         """
+        if not (self.discretisation.far and self.kinematics.idle):
+            self._project()
+
+    @timed("projection")
+    def _project(self) -> None:
         if self.tie is not None and not self.tie.begin_placement():
             return
         first = not hasattr(self, "kinematics")
@@ -113,6 +117,12 @@ class Interface(Told):
         agree(self.config.comm, error)
         self._place_friction()
 
+    def look(self) -> None:
+        """Place contactors that were not looked at since the surfaces are far apart (collective)."""
+        if self.discretisation.far:
+            self.discretisation.far = False
+            self.project()
+
     def _place_friction(self) -> None:
         if self.friction is not None:
             assert self.trial.friction is not None
@@ -125,15 +135,6 @@ class Interface(Told):
             self.kinematics = kinematics
             if self.acting is not None:
                 self.acting.replace(kinematics)
-
-    @property
-    def off(self) -> Bools:
-        """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""
-        return self._past_end if self.tie is None else self._past_end | self.tie.excluded
-
-    @property
-    def _past_end(self) -> Bools:
-        return self.kinematics.off(self.trial) | self.barred
 
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
@@ -299,7 +300,7 @@ class Interface(Told):
 
     def release_apart(self) -> None:
         """Release contactors without friction that rigid motions have taken off their target (collective)."""
-        if not self.frictional:
+        if not (self.frictional or self.kinematics.idle):
             apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
             self._set_active(replace(self.trial, active=self.trial.active & ~apart))
 
@@ -397,6 +398,8 @@ class Interface(Told):
 
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
+        if self.discretisation.far:
+            return
         if self.friction is not None:
             if self.kinematics.idle:
                 self._place_friction()
@@ -429,6 +432,7 @@ class Interface(Told):
     def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
         """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
         self.committed, self.reserved, self.redundant, self.barred = memory
+        self.discretisation.far = False
         if self.tie is not None:
             # what has been tied since then stays so
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied

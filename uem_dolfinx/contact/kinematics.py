@@ -285,6 +285,9 @@ class Discretisation(Protocol):
     def prescribed(self) -> bool:
         """Whether any contactor on any rank has a Dirichlet condition."""
 
+    #: Whether the surfaces are so far apart that contactors are not looked at.
+    far: bool
+
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.kinematics import Kinematics
-from uem_dolfinx.contact.laws.law import FrictionLaw, RateLaw, of_rate
+from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate, slides_otherwise
 
 #: What is left of a limit that is proportional to the force along the normal, below this part of it, is rounding.
 #: [bound; limit of friction; -]
@@ -78,7 +78,7 @@ class Limits:
         lam = np.maximum(lam, 0.0) if self._held is None else self._held
         limit, slope = self._stuck(lam)
         rate = np.zeros_like(limit)
-        if isinstance(self.law, RateLaw):
+        if slides_otherwise(self.law):
             sliding = self.law.sliding(self.value, lam, self.area, self.speed)
             limit, slope, rate = (np.where(slips, new, old) for new, old in zip(sliding, (limit, slope, rate)))
             dt = 0.0 if self._duration is None else self._duration()

@@ -44,6 +44,8 @@ class NodeToSurface(OnTarget):
 
     chained, two_pass = False, True
     pointwise = at_feet = True
+    #: Whether it can be told ``far``.
+    can_be_far = True
     #: Whether an end of the target holds contactors that came to it there, one or each ``(n,)``.
     ends_hold: bool | Bools = True
 
@@ -83,6 +85,10 @@ class NodeToSurface(OnTarget):
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
+        if self.far:
+            from uem_dolfinx.contact.nothing_near import NothingNear
+
+            return NothingNear.at(self, points)
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)

@@ -33,6 +33,7 @@ class OnTarget:
         frictional: whether there is friction.
         anchor: projection whose feet a contact with small or fixed sliding keeps.
         offset: by how much both surfaces together are taken to be thicker at the contactors ``(n,)``; None for nothing.
+        far: whether the surfaces are so far apart that contactors are not looked at, see ``solve.far_apart``.
     """
 
     ordered_by = -1
@@ -45,6 +46,7 @@ class OnTarget:
         self.hold(free)
         self.anchor: Projection | None = None
         self.offset: Array | None = None
+        self.far = False
         #: Whether the next step finds feet of small sliding anew.
         self._renewing = False
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
@@ -106,8 +108,9 @@ class OnTarget:
             self.let_go()
 
     def look_farther(self) -> bool:
-        """Nothing that contactors might touch is farther away than they look: False."""
-        return False
+        """Look at surfaces that are far apart, from the next placement on: whether they were."""
+        was, self.far = self.far, False
+        return was
 
     def let_go(self) -> None:
         """Keep no feet: the next placement finds them."""

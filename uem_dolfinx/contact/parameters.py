@@ -17,14 +17,11 @@ from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.mortar import Mortar
 from uem_dolfinx.contact.weighted_gaps import MortarKinematics
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.geometry.rigid import RigidCylinder, RigidPlane, RigidSphere
 from uem_dolfinx.parallel import reduced
 
 #: Offsets that differ by this part of a facet's side leave the same terms in rows of weighted gaps, which are linear in them.
 #: [bound; side of a facet; -]
 THICKER = 1e-3
-#: Rigid surfaces given by their distance, from which they keep as much at any offset.
-DISTANCES = (RigidPlane, RigidSphere, RigidCylinder)
 PARAMETERS = ("friction", "offset", "place", "turn")
 
 
@@ -60,7 +57,7 @@ class ContactParameter:
 
 def keeps_distance(contact: Contact) -> bool:
     """Whether the gaps of a contact are distances from its target wherever contactors are: those of any mesh are."""
-    return not hasattr(contact.target, "project") or isinstance(contact.target, DISTANCES)
+    return not hasattr(contact.target, "project") or getattr(contact.target, "measures", False)
 
 
 def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:

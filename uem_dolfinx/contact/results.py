@@ -155,6 +155,7 @@ class ContactResults:
     @property
     def gap(self) -> fem.Function:
         """Gap as a scalar field, a length; zero off the contactor (collective)."""
+        self.pair.look()
         return self._field("gap", self.pair.projection.gap)
 
     @property

@@ -68,6 +68,15 @@ class Told:
         return self.kinematics.gap
 
     @property
+    def off(self) -> Bools:
+        """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""
+        return self._past_end if self.tie is None else self._past_end | self.tie.excluded
+
+    @property
+    def _past_end(self) -> Bools:
+        return self.kinematics.off(self.trial) | self.barred
+
+    @property
     def movable(self) -> Bools:
         """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
         return self.kinematics.movable

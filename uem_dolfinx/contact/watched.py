@@ -51,7 +51,7 @@ class WatchedContact(ContactResults):
 
     def look_at(self, before: PairState, stiffness: Array | None) -> None:
         """Look at the contact after a step from the state ``before``, if it is on; ``stiffness`` as of ``corner_inside`` (collective)."""
-        if self.on:
+        if self.on and not self.pair.discretisation.far:
             self.look_at_ends()
             self.look_at_corners(stiffness)
             self.look_at_wear(before, stiffness)

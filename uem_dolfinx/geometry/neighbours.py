@@ -8,8 +8,7 @@ All that is not listed costs nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import NamedTuple
 
@@ -400,18 +399,3 @@ class Neighbour(MeshTarget):
             rows = np.unique(listed.exchange.rows)
             found = found.with_those(rows, nearest)
         return found if which is None else found.take(which)
-
-    def nowhere(self, points: Array) -> FacetProjection:
-        """The projection of points that have nothing near: no facet, no normal, and a gap as large as the model."""
-        return replace(self._nowhere, foot=points)
-
-    @cached_property
-    def _nowhere(self) -> FacetProjection:
-        n, g, nn, d = len(self.neighbours.nodes), self.facets.config.gdim, self.n_nodes, self.shape.dim
-        facet, none = np.zeros((nn, g)), np.zeros((n, g))
-        facet[:, :d] = self.stride * self.shape.nodes
-        tab = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
-        return FacetProjection(
-            np.full(n, self.facets.config.size), none, np.full((n, nn), -1), np.zeros((n, nn)), np.full(n, -1), none,
-            np.full(n, np.inf), np.zeros((n, d)), none, none, np.tile(facet, (n, 1, 1)), tab.dN, tab.ddN, np.zeros((n, d, g)),
-        )  # fmt: skip

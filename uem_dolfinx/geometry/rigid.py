@@ -7,18 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
-
-from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.errors import InputError, SurfaceError
-from uem_dolfinx.geometry.projection import Projection, Target
-from uem_dolfinx.parallel import ask, ask_together
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import ask
 
 
 @dataclass(frozen=True)
@@ -131,6 +127,8 @@ class RigidSurface:
 
     n_nodes = 0
     averaged = faceted = False
+    #: Whether gaps are distances everywhere, not on the surface alone.
+    measures = False
     dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
 
@@ -198,6 +196,10 @@ class RigidSurface:
         if self.motion is not None:
             return self.motion.about + self.motion.translation
         return np.zeros(gdim) if self._reference is None else self._reference
+
+    def distance_of(self, points: Array) -> Array:
+        """What ``distance`` says of points now ``(n, gdim)``: ``(n,)``."""
+        return self.distance(points if self.motion is None else self.motion.back(points))
 
     def project(self, points: Array) -> RigidProjection:
         """Gap and normal at ``points (n, gdim)``.
@@ -291,6 +293,8 @@ class RigidPlane(RigidSurface):
         normal: out of the target ``(gdim,)``, of any length.
     """
 
+    measures = True
+
     def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike):
         p = given.vector("rigid plane: point", point)
         n = given.direction("rigid plane: normal", normal, len(p))
@@ -308,6 +312,8 @@ class RigidSphere(RigidSurface):
         radius: a length.
         inside: the target is the space around the ball, and bodies touch it from inside.
     """
+
+    measures = True
 
     def __init__(self, center: npt.ArrayLike, radius: float, inside: bool = False):
         c, radius = given.vector("rigid sphere: center", center), given.length("rigid sphere: radius", radius)
@@ -336,6 +342,8 @@ class RigidCylinder(RigidSurface):
         radius: a length.
         inside: the target is the space around the cylinder, and bodies touch it from inside.
     """
+
+    measures = True
 
     def __init__(self, point: npt.ArrayLike, axis: npt.ArrayLike, radius: float, inside: bool = False):
         a, p = given.direction("rigid cylinder: axis", axis, 3), given.vector("rigid cylinder: point", point, 3)
@@ -395,51 +403,3 @@ def rotation_vector(Q: Array) -> Array:
 
         return np.asarray(Rotation.from_matrix(Q).as_rotvec())
     return np.array([np.arctan2(Q[1, 0], Q[0, 0])])
-
-
-class SharedTarget:
-    """A target of the user's in a problem: what its functions raise on one rank is raised on all; else it is that target.
-
-    Args:
-        target: not a mesh.
-        comm: of the problem.
-    """
-
-    def __init__(self, target: Target, comm: MPI.Comm):
-        self._target, self._comm = target, comm
-        self._words = f"the target '{getattr(target, 'name', type(target).__name__)}'"
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._target, name)
-
-    @property
-    def motion(self) -> Any:
-        """The target's own, which a checkpoint sets."""
-        return self._target.motion
-
-    @motion.setter
-    def motion(self, motion: Any) -> None:
-        self._target.motion = motion
-
-    def project(self, points: Array) -> Projection:
-        """Where points stand relative to it (collective)."""
-        return ask_together(self._comm, self._words, self._target.project, points)
-
-    def follow(self, points: Array, old: Any) -> Projection:
-        """Gaps with the feet, normals and weights of an earlier projection (collective)."""
-        return ask_together(self._comm, self._words, self._target.follow, points, old)
-
-
-def shared_target(target: Target, comm: MPI.Comm, gdim: int) -> Target:
-    """A target of the user's for a problem in ``gdim`` dimensions (collective).
-
-    Raises:
-        SurfaceError: if it is given in another dimension.
-        InputError: if it is not the same on all ranks.
-    """
-    own, name = getattr(target, "gdim", None), getattr(target, "name", type(target).__name__)
-    if own not in (None, gdim):
-        remedy = f"give it points and directions of {gdim} numbers"
-        raise SurfaceError(f"{name} is given in {own}D, but the displacement in {gdim}D: {remedy}")
-    given.alike(comm, name, stride=target.stride, place=getattr(target, "_reference", None))
-    return cast(Target, SharedTarget(target, comm))

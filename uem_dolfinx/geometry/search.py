@@ -78,6 +78,7 @@ class MeshTarget:
         shortest = min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))
         self.stride = 0.5 * reduced(self.comm, float(shortest), op=MPI.MIN)
         self.first: Ints = facets.first
+        self._nowhere: FacetProjection | None = None
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Exact closest points of ``points (n, gdim)`` on the whole target (collective).
@@ -110,6 +111,19 @@ class MeshTarget:
         new, _ = self._ask(self.facets.owners(old.facet), self.facets.current(), points, old.facet, old.xi)
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
+
+    def nowhere(self, points: Array) -> FacetProjection:
+        """The projection of ``points (n, gdim)`` that have nothing near: no facet, no normal, and a gap as large as the model."""
+        if self._nowhere is None or len(self._nowhere.gap) != len(points):
+            n, g, nn, d = len(points), self.facets.config.gdim, self.n_nodes, self.shape.dim
+            facet, none = np.zeros((nn, g)), np.zeros((n, g))
+            facet[:, :d] = self.stride * self.shape.nodes
+            tab = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
+            self._nowhere = FacetProjection(
+                np.full(n, self.facets.config.size), none, np.full((n, nn), -1), np.zeros((n, nn)), np.full(n, -1), none,
+                np.full(n, np.inf), np.zeros((n, d)), none, none, np.tile(facet, (n, 1, 1)), tab.dN, tab.ddN, np.zeros((n, d, g)),
+            )  # fmt: skip
+        return replace(self._nowhere, foot=points)
 
     @property
     def faceted(self) -> bool:

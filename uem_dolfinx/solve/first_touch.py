@@ -17,7 +17,13 @@ from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
 
 
-def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions | None, place: Callable[[], None]) -> None:
+def touch_ahead(
+    bodies: Bodies,
+    pairs: Sequence[Interface],
+    rigid: RigidMotions | None,
+    place: Callable[[], None],
+    look_within: Callable[[float], None],
+) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
     It saves the solve that would find them; those that are wrong are released before anything moves. Contactors with friction are left
@@ -28,6 +34,7 @@ def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions 
         pairs: of all contacts.
         rigid: motions of the bodies; None without contacts.
         place: projects all contactors.
+        look_within: looks at contacts that motions by a given length may bring near; see ``FarApart``.
     """
     config, comm = bodies.config, bodies.comm
     known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
@@ -36,7 +43,9 @@ def touch_ahead(bodies: Bodies, pairs: Sequence[Interface], rigid: RigidMotions 
     place()
     free, prescribed = bodies.free[: config.n_owned], bodies.prescribed[: config.n_owned]
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
-    near = OPEN * float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
+    way = float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
+    look_within(np.sqrt(config.gdim) * way)
+    near = OPEN * way
     gaps = [pair.predicted(du) for pair in pairs]
     violated = []
     for pair, gap in zip(pairs, gaps):

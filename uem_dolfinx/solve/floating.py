@@ -24,6 +24,7 @@ from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.far_apart import FarApart
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 
 if TYPE_CHECKING:
@@ -52,14 +53,17 @@ class FloatingBodies:
         bodies: without contact.
         pairs: of all contacts.
         linear: equations of users, None for none; without contacts and these nothing is done about bodies that float.
+        far_apart: contacts that are not looked at until bodies come near; None if all are.
 
     Attributes:
         rigid: rigid motions of the bodies; None without contacts.
         motions: those of the present step, None if conditions and inertia hold all bodies.
     """
 
-    def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None = None):
-        self._bodies, self._pairs, self._linear = bodies, pairs, linear
+    def __init__(
+        self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None = None, far_apart: FarApart | None = None
+    ):
+        self._bodies, self._pairs, self._linear, self._far_apart = bodies, pairs, linear, far_apart
         config, dynamics = bodies.config, bodies.dynamics
         self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
@@ -102,6 +106,8 @@ class FloatingBodies:
         """
         if self._bodies.dynamics is not None:
             self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
+        if self._far_apart is not None:
+            self._far_apart.begin_step(self.motions is not None)
         if self.motions is not None:
             self.motions.forget_supports()
             self._fall(place, freely=True)
@@ -222,7 +228,10 @@ class FloatingBodies:
             changed |= took
             if v is None:
                 return changed
-            motions.move(v)
+            ways = motions.ways(v)
+            if self._far_apart is not None and self._far_apart.look_along(ways):
+                continue
+            motions.config.shift(slice(None), ways)
             back = (v * before).reshape(motions.count, -1).sum(axis=1) < 0
             damping, before, changed = np.where(back, 0.5 * damping, np.minimum(1.0, 2.0 * damping)), v, True
         raise motions.error(before)
@@ -242,15 +251,16 @@ class FloatingBodies:
         """
         motions, config, comm = self.motions, self._bodies.config, self._bodies.comm
         assert motions is not None
-        ahead = [pair.approach for pair in self._pairs]
-        equations = [pair.equations() for pair in self._pairs]
+        pairs = [pair for pair in self._pairs if not pair.discretisation.far]
+        ahead = [pair.approach for pair in pairs]
+        equations = [pair.equations() for pair in pairs]
         united = [e.resisting.select(e.resisting.active) for e in equations]
         more = [] if self._linear is None else [self._linear.at_present()]
         rows = UnitingEquations.join(ahead + united + more, config.gdim)
         kinds = [np.full(len(e), AHEAD) for e in ahead]
-        for pair, e in zip(self._pairs, equations):
+        for pair, e in zip(pairs, equations):
             kinds.append(np.where(e.tied | pair.frictional, HELD, UNITED)[e.resisting.active])
-        kind = np.concatenate([*kinds, *(np.full(len(e), HELD) for e in more)])
+        kind = np.concatenate([np.zeros(0, int), *kinds, *(np.full(len(e), HELD) for e in more)])
         R, force, scale = motions.rates(rows), *motions.forces(self._forces())
         loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._forces()).any()
         if not (loose or freely):
@@ -277,9 +287,9 @@ class FloatingBodies:
             free = B @ (B.T @ f)
             carries = (push > 0) | ((R @ free < -OPEN * np.linalg.norm(free)) & (R @ v <= OPEN * np.linalg.norm(free)))
             parts = np.split(carries[: sum(len(e) for e in ahead)], np.cumsum([len(e) for e in ahead])[:-1])
-            active = [pair.activate_closing(c) for pair, c in zip(self._pairs, parts)]
+            active = [pair.activate_closing(c) for pair, c in zip(pairs, parts)]
             took = any(active)
-            if freely and any(a and pair.frictional for a, pair in zip(active, self._pairs)):
+            if freely and any(a and pair.frictional for a, pair in zip(active, pairs)):
                 return np.zeros_like(v), True
         if not freely:
             return None, took

@@ -264,17 +264,20 @@ class RigidMotions:
         gram, along = (sum(a) for a in zip(*self.comm.allgather(((fields.T @ fields).tocsc(), fields.T @ du.ravel()))))
         return np.asarray(fields @ spsolve(gram, along)).reshape(du.shape)
 
-    def move(self, motion: Array) -> None:
-        """Move the bodies, ghosts included."""
+    def ways(self, motion: Array) -> Array:
+        """How far nodes go in a motion, ghosts included ``(n_local, gdim)``."""
         config, g = self.config, self.config.gdim
         parts = motion.reshape(self.count, self.n_modes)
         body = self._body
         if not self.finite:
-            config.shift(slice(None), np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body]))
-            return
+            return np.asarray(np.einsum("nmg,nm->ng", self._modes(config.X, body), parts[body]))
         x = config.x
         turns = np.array([rotation_matrix(_turn(angles)) for angles in parts[:, g:] / self.radius[:, None]]) - np.eye(g)
-        config.shift(slice(None), np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g])
+        return np.asarray(np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g])
+
+    def move(self, motion: Array) -> None:
+        """Move the bodies, ghosts included."""
+        self.config.shift(slice(None), self.ways(motion))
 
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 

@@ -195,7 +195,7 @@ def make_rows(
     Raises:
         FrictionError: if contactors wedge where several equations meet.
     """
-    rigid = [pair for pair in pairs if not pair.target.n_nodes]
+    rigid = [pair for pair in pairs if not (pair.target.n_nodes or pair.kinematics.idle)]
     for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]

@@ -27,6 +27,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.exchanges import Exchanges, count
+from uem_dolfinx.solve.far_apart import FarApart
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
@@ -72,7 +73,8 @@ class BodySystem:
         self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
-        self._curvature: PETSc.Mat | None = None
+        #: Curvature of the contact in the last united matrix; None where it had none.
+        self.curvature: PETSc.Mat | None = None
         self._petrov_galerkin = False  # whether P differs from Q
         #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
         self._not_unique: tuple[BodyState, bool] | None = None
@@ -95,10 +97,10 @@ class BodySystem:
         """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
         self.pairs, self.linear, self._here = list(pairs), linear, None
         self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
-        self.exchanges = Exchanges(self.pairs)
+        self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         #: How equations of several contacts can meet.
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
-        self.floating = FloatingBodies(self.bodies, self.pairs, linear)
+        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -111,6 +113,7 @@ class BodySystem:
             return
         self.bodies.check_displacement()
         with timed("search and projection"):
+            self.far_apart.place()
             for pair in self.pairs:
                 pair.project()
 
@@ -146,7 +149,7 @@ class BodySystem:
                 pair.project()
         self.floating.begin_step(self.place)
         if self.pairs and self.bodies.dynamics is None and self.floating.motions is None:
-            touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place)
+            touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place, self.far_apart.look_within)
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
@@ -157,7 +160,7 @@ class BodySystem:
         self.floating.end_step()
         if self._not_unique is not None:
             state, negative = self._not_unique
-            added = together(self._curvature, state.added)
+            added = together(self.curvature, state.added)
             if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
                 raise several_answers()
 
@@ -274,10 +277,11 @@ class BodySystem:
         assert isinstance(state, BodyState)
         driving = max(first(self.unknowns.norms(rhs)) for rhs in (problem.rhs, step.rhs)) if left > 0.0 else 0.0
         with timed("uniting equations"):
-            F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
             increment = du.array_r[: self._n].reshape(-1, self.config.gdim)
-            forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            self.far_apart.look_within(np.sqrt(self.config.gdim) * way)
+            F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
+            forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             near = max(PREDICTED, left) * way
             predicted = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
@@ -290,7 +294,7 @@ class BodySystem:
             if self._adrift:
                 chosen = violated if count(self.pairs, violated) else None
             else:
-                chosen = self.exchanges.choose(violated, predicted, self._curvature is not None, way)
+                chosen = self.exchanges.choose(violated, predicted, self.curvature is not None, way)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise FrictionError(
                     "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
@@ -302,7 +306,7 @@ class BodySystem:
                 self._take(forces)
                 return None
             if self.exchanges.straight:
-                self._curvature = None
+                self.curvature = None
             if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen)]):
                 self.exchanges.start_again()
             rows = self._rows()
@@ -317,7 +321,7 @@ class BodySystem:
 
     def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
         """What contact, friction and present forces add to ``F = K du`` (collective)."""
-        for more in (self._curvature, state.added):
+        for more in (self.curvature, state.added):
             if more is not None:
                 F.axpy(1.0, forms.product(more, du))
         F.axpy(1.0, self.residual())
@@ -387,7 +391,7 @@ class BodySystem:
             self.bodies.update_tangent()
         with timed("contact curvature"):
             how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex, self.linear
-            self._curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
+            self.curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
 
@@ -397,14 +401,14 @@ class BodySystem:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
         K, P, Q = self.bodies.tangent.K, state.trial, state.test
-        state = state.with_pressures(self.pairs, K, self._curvature) if self._heats else state
-        curvature = together(self._curvature, state.added)
+        state = state.with_pressures(self.pairs, K, self.curvature) if self._heats else state
+        curvature = together(self.curvature, state.added)
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
         self.solver.begin_at(c := P.c)
         linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
         # momentum is kept exactly where solves can be
-        passing = not linear or (self._curvature is not None and self.bodies.dynamics is None)
+        passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(
             state=state,
             rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
@@ -427,11 +431,6 @@ class BodySystem:
         """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
         dq = self.solver.complete(step.dq)
         return step if dq is step.dq else step._replace(dq=dq, du=self.move(problem.state, dq))
-
-    @property
-    def curvature(self) -> PETSc.Mat | None:
-        """Curvature of the contact in the last united matrix; None where it had none."""
-        return self._curvature
 
     def forget(self) -> None:
         """Let the next step assemble and factorise anew, as the first of a run does (collective)."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from inspect import signature
-from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
+from typing import Any, Protocol, TypeAlias, TypeGuard, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +52,6 @@ class FrictionLaw(Protocol):
         """
 
 
-@runtime_checkable
 class RateLaw(FrictionLaw, Protocol):
     """A law of friction by which contactors that slip bear another force than those that are about to."""
 
@@ -74,9 +73,14 @@ class RateLaw(FrictionLaw, Protocol):
         """
 
 
+def slides_otherwise(law: FrictionLaw) -> TypeGuard[RateLaw]:
+    """Whether contactors that slip bear another force than those that are about to."""
+    return hasattr(law, "sliding")
+
+
 def of_rate(law: FrictionLaw) -> bool:
     """Whether the speed of slip counts."""
-    return isinstance(law, RateLaw) and law.timed
+    return slides_otherwise(law) and law.timed
 
 
 def as_law(friction: Any) -> FrictionLaw:
