@@ -27,7 +27,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 
 COMM = MPI.COMM_WORLD
-REPO = Path(__file__).resolve().parent.parent
+REPO = Path(__file__).resolve().parents[2]
 README = (REPO / "README.md").read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
 
 

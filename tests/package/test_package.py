@@ -7,13 +7,15 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
+import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from helpers import outside_mpi, serial
 
-REPO = Path(__file__).resolve().parent.parent
+REPO = Path(__file__).resolve().parents[2]
 MODULES = sorted(p.relative_to(REPO).with_suffix("").parts for p in (REPO / "uem_dolfinx").rglob("*.py"))
 NAMES = [".".join(parts).removesuffix(".__init__") for parts in MODULES]
 
@@ -47,6 +49,21 @@ def built(tmp_path_factory):
     done = subprocess.run([sys.executable, "-c", ask, built], cwd=source, env=outside_mpi(), capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return built
+
+
+@serial
+@pytest.mark.slow
+def test_archives(built):
+    """The licence by its name, links that hold away from the repository, and no part of the tests without the rest."""
+    (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    (name,) = (n for n in zipfile.ZipFile(wheel).namelist() if n.endswith("/METADATA"))
+    metadata = zipfile.ZipFile(wheel).read(name).decode()
+    assert re.search(r"^License(-Expression)?: MIT$", metadata, re.M) and "\nLicense-File: LICENSE\n" in metadata
+    assert "PᵀKP" in metadata and not re.search(r"\]\((?!https?:)", metadata)
+    names = [Path(*Path(n).parts[1:]) for n in tarfile.open(sdist).getnames()]
+    assert Path("README.md") in names and Path("uem_dolfinx/meshes/flange.geo") in names
+    # newer setuptools pack tests/test*.py by themselves, without what these import
+    assert not [n for n in names if n.parts[:1] == ("tests",)] and not list(REPO.glob("tests/test*.py"))
 
 
 @serial
