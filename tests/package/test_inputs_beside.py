@@ -49,6 +49,7 @@ def test_plasticity(parameters, error, words):
         ({"mass": 1.0}, uem.InputTypeError, ("mass = 1.0", "a Mass", "uem.lumped_mass")),
         ({"scheme": "newmark"}, uem.InputTypeError, ("scheme = 'newmark'", "a Scheme")),
         ({"damping": 0.1}, uem.InputTypeError, ("damping = 0.1", "a function of the velocity")),
+        ({"damping": ufl.Form([])}, uem.InputTypeError, ("damping = ", "a function of the velocity", "as lambda rate")),
         ({"contactors": "light"}, uem.InputError, ("contactors = 'light'", "'massless' or 'massy'")),
         ({"time": nan}, uem.InputError, ("time = nan", "a finite number")),
         ({"time": "now"}, uem.InputTypeError, ("time = 'now'", "a finite number")),

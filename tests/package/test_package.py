@@ -60,7 +60,8 @@ def test_archives(built):
     metadata = zipfile.ZipFile(wheel).read(name).decode()
     assert re.search(r"^License(-Expression)?: MIT$", metadata, re.M) and "\nLicense-File: LICENSE\n" in metadata
     assert "PᵀKP" in metadata and not re.search(r"\]\((?!https?:)", metadata)
-    names = [Path(*Path(n).parts[1:]) for n in tarfile.open(sdist).getnames()]
+    with tarfile.open(sdist) as archive:
+        names = [Path(*Path(n).parts[1:]) for n in archive.getnames()]
     assert Path("README.md") in names and Path("uem_dolfinx/meshes/flange.geo") in names
     # newer setuptools pack tests/test*.py by themselves, without what these import
     assert not [n for n in names if n.parts[:1] == ("tests",)] and not list(REPO.glob("tests/test*.py"))

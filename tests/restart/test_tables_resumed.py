@@ -41,3 +41,20 @@ def test_table_made_before_the_checkpoint_is_read(kind, folder):
     run(0.06, early=False)
     after = text()
     assert after[: len(before)] == before and len(after) == len(before) + 2
+
+
+def test_damping_goes_on(folder):
+    """The energy that damping takes is the same bit for bit in a run that is taken up again."""
+
+    def run(name, *ends):
+        for end in ends:
+            bar, checkpoint = Bar((0.0, -3.0), eta=20.0), uem.Checkpoint(folder / name)
+            checkpoint.begin(bar.problem.state())
+            with uem.EnergyBook(bar.problem, path=folder / f"{name}.csv", resume=True) as book:
+                for step in uem.time_steps(bar.problem, 0.01, end, checkpoint=checkpoint):
+                    damped = book.write(step).damped
+        COMM.barrier()
+        return damped, (folder / f"{name}.csv").read_text()
+
+    (damped, whole), (_, parted) = run("whole", 0.06), run("parted", 0.03, 0.06)
+    assert damped > 0.0 and whole == parted

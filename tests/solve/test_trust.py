@@ -107,3 +107,13 @@ def test_a_load_near_the_rounding_of_positions_is_not_taken_for_none(weight):
     uem.UnitedProblem(F, u, bcs=clamp(V, s.tag("side", 0, at(0, 0.0)), 0), contacts=[floor]).solve()
     y = V.tabulate_dof_coordinates()[:, 1]
     assert np.abs(u.x.array.reshape(-1, 2)[:, 1] + weight * (y - y**2 / 2)).max() <= max(1e-15, 1e-10 * weight)
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_displacement_that_leaves_no_facets(coupling):
+    """Bodies that have flown so far that rounding brings the nodes of a facet together are refused before anything is projected."""
+    b = blocks(COMM, "triangle", 2, 3)
+    b.u.x.array[:] = 1e17
+    contact = uem.Contact(b.high, b.low, coupling=coupling)
+    with pytest.raises(uem.NotFiniteError, match=r"displaced by 1e\+17, whose rounding is more than the facets"):
+        uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])

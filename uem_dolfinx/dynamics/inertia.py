@@ -43,7 +43,8 @@ class Dynamics:
         scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``.
         velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
         gravity: acceleration of free fall ``(gdim,)``; every node weighs what its mass does, so that free fall strains nothing.
-        damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual.
+        damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual:
+            ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
         contactors: ``"massless"`` hands the mass of the contactors on to the nodes around [UEM, 5], and that of the nodes that they
             follow in the bodies that can carry it, so that impact itself neither loses nor gives energy; ``"massy"`` leaves it.
         time: at the start.
@@ -81,9 +82,12 @@ class Dynamics:
             "mass", mass, isinstance(mass, Mass), "a Mass", "make it by uem.lumped_mass(V, density) or uem.consistent_mass"
         )
         given.kind("scheme", scheme, scheme is None or isinstance(scheme, Scheme), "a Scheme, as uem.newmark(), or None")
+        # a UFL form can be called as well
+        makes = callable(damping) and not isinstance(damping, ufl.Form)
         given.kind(
-            "damping", damping, damping is None or callable(damping), "a function of the velocity that makes a form, or None"
-        )
+            "damping", damping, damping is None or makes, "a function of the velocity that makes a form, or None",
+            "as lambda rate: eta * ufl.inner(rate, v) * ufl.dx",
+        )  # fmt: skip
         given.word("contactors", contactors, ("massless", "massy"))
         given.number("time", time)
         self.mass, self.scheme, self.damping, self.contactors = mass, scheme or newmark(), damping, contactors
@@ -397,6 +401,7 @@ class Dynamics:
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers that a run goes on from beside the Functions, by name."""
         kept = {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
+        kept |= {} if self.damping is None else {"rate in damping": float(self._rate.value)}
         return kept | ({"masses at points": [np.array(one.kept).tolist() for one in self.added]} if self.added else {})
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
@@ -404,6 +409,8 @@ class Dynamics:
         names = "time", "start", "accelerated", "last length"
         self.time, self.start, self.accelerated, self._last = (kept[name] for name in names)
         self.resumed += 1
+        if self.damping is not None:
+            self._rate.value = kept["rate in damping"]
         self.restore()
         self._copy_committed()
         for one, own in zip(self.added, kept.get("masses at points", [])):

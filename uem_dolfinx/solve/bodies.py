@@ -22,6 +22,7 @@ from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.tangent import Inversions, Tangent
 
 if TYPE_CHECKING:
@@ -268,14 +269,20 @@ class Bodies:
 
     # -- displacement --------------------------------------------------------------------------------------------------
 
-    def check_displacement(self) -> None:
-        """Refuse a displacement that is not finite (collective).
+    def check_displacement(self, facets: float) -> None:
+        """Refuse a displacement that is not finite, or so large that facets of a length are less than its rounding (collective).
 
         Raises:
-            NotFiniteError: if it is not.
+            NotFiniteError: if it is so.
         """
         if not np.isfinite(self._u.norm()):
             raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
+        far = reduced(self.comm, float(np.abs(self.config.displacement).max(initial=0.0)), op=MPI.MAX)
+        if np.finfo(float).eps * far > facets:
+            raise NotFiniteError(
+                f"nodes are displaced by {far:.3g}, whose rounding is more than the facets: loads drive bodies to where nothing holds "
+                "them; take smaller load steps, hold the bodies, or give them inertia"
+            )
 
     def displacement(self) -> PETSc.Vec:
         """Copy of the present displacement, and of all other fields."""

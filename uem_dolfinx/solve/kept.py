@@ -26,6 +26,8 @@ def state_of(problem: Any) -> State:
         d = problem.dynamics
         functions |= {"velocity": d.velocity, "acceleration": d.acceleration, "inertia forces": d.forces}
         functions["mean velocity"] = d.mean_velocity
+        if d.damping is not None:
+            functions["velocity in damping"] = d.past
     for i, material in enumerate(problem.materials, 1):
         functions |= {f"{name} {i}": f for name, f in material.history.items()}
     of_equations = fem.Function(config.V)

@@ -111,7 +111,7 @@ class BodySystem:
         self._here = None
         if not self.pairs:
             return
-        self.bodies.check_displacement()
+        self.bodies.check_displacement(min(pair.target.stride for pair in self.pairs))
         with timed("search and projection"):
             self.far_apart.place()
             for pair in self.pairs:
