@@ -16,6 +16,8 @@ from helpers import CELLS, at, blocks, box, clamp, complementary, linear, modulu
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.algebra.rings import DependentRingError
+from uem_dolfinx.solve import rows
 
 COMM = MPI.COMM_WORLD
 
@@ -117,3 +119,25 @@ def test_displacement_that_leaves_no_facets(coupling):
     contact = uem.Contact(b.high, b.low, coupling=coupling)
     with pytest.raises(uem.NotFiniteError, match=r"displaced by 1e\+17, whose rounding is more than the facets"):
         uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
+
+
+def test_rotated_rows_that_depend_on_each_other(monkeypatch):
+    """Where rotated equations of slipping contactors depend on each other in a ring, friction is said to wedge, and steps are cut."""
+    b, made = blocks(COMM, "triangle", 2, 2), rows.Restriction
+
+    def restriction(space, equations, *rest, like=None):
+        if like is None:
+            return made(space, equations, *rest)
+        error = DependentRingError("a ring")
+        error.rows = np.arange(len(equations)) == 0
+        raise error
+
+    monkeypatch.setattr(rows, "Restriction", restriction)
+    bcs = clamp(b.V, b.bottom) + clamp(b.V, b.top, value=[0.1, -0.01])
+    contact = uem.Contact(b.high, b.low, friction=0.1, name="faces")
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact])
+    with pytest.raises(
+        uem.FrictionError, match=r"faces: friction leaves more than one answer about the contactor at \(.*no better"
+    ):
+        for _ in uem.load_steps(problem, 1):
+            pass

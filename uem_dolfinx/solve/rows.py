@@ -222,7 +222,11 @@ def make_rows(
         if independent is not None and independent.found:
             independent = _rotated(pairs, independent, test)
             test = independent.equations
-        rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
+        try:
+            rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
+        except DependentRingError as error:
+            _refuse_wedged(pairs, test, error.rows[: len(test)])
+            raise
     couplings = None if linear is None else linear.rigid
     return Rows(
         equations,
@@ -288,7 +292,13 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
         FrictionError: naming the first contactor, of the first rank that has one, whose equations no longer tell its motion.
     """
     rotated = independent.rotated(test)
-    bad, error = np.flatnonzero(rotated.undetermined), None
+    _refuse_wedged(pairs, test, rotated.undetermined)
+    return rotated
+
+
+def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: Bools) -> None:
+    """Raise a FrictionError of the first contactor with rotated equations that no longer tell its motion, on any rank (collective)."""
+    bad, error = np.flatnonzero(wedged), None
     if len(bad):
         node = int(test.node[bad[0]])
         names = ", ".join(pair.name for pair in pairs if node in pair.nodes)
@@ -297,7 +307,6 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
             "equations meet and it wedges: take less friction there, or drop one of the contacts"
         )
     agree(pairs[0].config.comm, error)
-    return rotated
 
 
 def unbalanced(
