@@ -90,15 +90,26 @@ common.report(args, {"punch_error": max(row["error"] for row in first), **rows[-
 
 # %% [markdown]
 # ## The picture
-# The strain around the axis, and the pressures over the radius, on the last mesh.
+# The strain around the axis, and the pressures over the radius, on the last mesh; the settlements on all meshes beside those published.
 
 # %%
 if args.plot:
     problem = problems[FRICTION[-1]]
     hoop = uem.StVenantKirchhoff(1.0, 0.3, kind="axisymmetric").strain(problem.u)[2, 2]
-    with uem.figure(args.plot, comm, panels=2) as (left, right):
+    with uem.figure(args.plot, comm, panels=3) as (left, middle, right):
         uem.plot_scene(problem, left, field=1e3 * hoop, label="hoop strain / 0.001", mirror=True, cells=False, arrows=False)
         uem.plot_pressure(problem.contacts, right, along=lambda x: x[:, 0], along_label="radius in mm", window=(0.0, 45.0))
+        if middle is not None:
+            for k, mu in enumerate(FRICTION):
+                cells, settlements = zip(*((row["n"], 1e3 * row["settlement"]) for row in rows if row["friction"] == mu))
+                middle.plot(cells, settlements, "o-", color=f"C{k}", label=f"mu = {mu:g}")
+                middle.axhline(1e3 * PUBLISHED[mu], color=f"C{k}", ls="--", lw=1, label="code_aster")
+            middle.set_xscale("log", base=2)
+            middle.set_xticks(cells, [str(n) for n in cells])
+            middle.set_xlabel("cells around the edge")
+            middle.set_ylabel("settlement of M in micrometres")
+            middle.grid(alpha=0.25)
+            middle.legend(frameon=False)
 if args.output:
     with uem.ResultsWriter(f"{args.output}/punch_axisymmetric", problems[FRICTION[-1]]) as writer:
         writer.write(1.0)
