@@ -161,7 +161,7 @@ common.report(args, results)
 # %%
 if args.plot:
     with uem.figure(args.plot, comm, panels=2, size=(4.4, 4.6)) as panels:
-        uem.plot_scene(problem, panels[0], field=strain, label=label, cells=False)
+        uem.plot_scene(problem, panels[0], field=strain, label=label, cells=False, percentiles=(0, 98))
         if panels[1] is not None:
             panels[1].plot(time, carried, lw=0.8)
             panels[1].axhline(1.0, color="0.3", lw=1)

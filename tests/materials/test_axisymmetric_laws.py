@@ -229,3 +229,22 @@ def test_tangent_of_plasticity(strain):
     histories = [step.iterations for step in uem.load_steps(problem, 4)]
     assert all(len(history) < 9 for history in histories)
     assert highest(COMM, law.peeq.x.array) > 0.01
+
+
+def test_pressure_that_follows_the_surface():
+    """On all of a cylinder it shrinks it alike in all directions, until its energy falls by as much as p does work on the volume."""
+    s, law, p = Revolved(rectangle((0, 0), (1, 1), (2, 2))), uem.NeoHooke(1.0, 0.3, kind="axisymmetric"), 0.5
+    s.hold_axis()
+    s.hold(1, 0.0)
+    n, gradient = ufl.FacetNormal(s.mesh), ufl.Identity(3) + uem.displacement_gradient(s.u)
+    t = -p * ufl.det(gradient) * ufl.inv(gradient).T * ufl.as_vector([n[0], n[1], 0])
+    work = sum((t[0] * s.v[0] + t[1] * s.v[1]) * uem.ds(side) for side in (s.side(0, 1.0), s.side(1, 1.0)))
+    s.problem(law.residual(s.u, s.v) * ufl.dx - work, rtol=1e-12).solve()
+    stretch, x = 1.0 - highest(COMM, -s.u.x.array), np.array(s.u.x.array).reshape(-1, 2)
+    assert 0.7 < stretch < 0.9 and highest(COMM, np.abs(x - (stretch - 1.0) * s.X)) < 1e-10
+
+    def energy(stretch):
+        s.u.x.array[:] = (stretch - 1.0) * s.X.ravel()
+        return uem.integrate(law.energy(s.u) * ufl.dx) + p * np.pi * stretch**3
+
+    assert abs(energy(stretch + 1e-5) - energy(stretch - 1e-5)) / 2e-5 < 1e-7 * p
