@@ -160,6 +160,21 @@ def test_dirichlet_values_that_are_not_finite(value, where, contact):
         problem.solve()
 
 
+@pytest.mark.parametrize("value", [nan, -inf])
+@pytest.mark.parametrize("field", ["displacement", "degree 2", "scalar"])
+def test_a_node_that_is_nowhere(value, field):
+    """Named by its number in the mesh's input, wherever it is, before anything is computed of it."""
+    b = scene(degree=2 if field == "degree 2" else 1)
+    own = np.flatnonzero(b.scene.input_nodes == 7)
+    b.scene.mesh.geometry.x[own, 1] = value
+    if field == "scalar":
+        T = fem.Function(compat.function_space(b.scene.mesh, 1))
+        problem = lambda: uem.UnitedProblem(ufl.inner(ufl.grad(T), ufl.grad(ufl.TestFunction(T.function_space))) * ufl.dx, T)
+    else:
+        problem = lambda: pressed(b)
+    refused(uem.MeshError, ("node 7 of the mesh's input", f", {value})", "expected finite coordinates", "mend the mesh"), problem)
+
+
 def test_one_contact_for_two_problems():
     b = scene()
     contact = uem.Contact(b.high, b.low)

@@ -5,6 +5,7 @@ Read ``test_other_settings_are_named`` first.
 
 from __future__ import annotations
 
+import json
 import logging
 
 from mpi4py import MPI
@@ -18,6 +19,7 @@ from resting_scenes import Bar as Resting
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.restart import checkpoint
 
 COMM = MPI.COMM_WORLD
 
@@ -78,6 +80,48 @@ def test_other_settings_are_named(what, folder):
     state = other.state()
     state.settings.clear()
     uem.read_checkpoint(folder / "run", state)
+
+
+#: Settings with the words of a run that names none of them, and another run.
+BY_DEFAULT = {
+    "material 1, kinematic_hardening": ({"as_what": "back stress", "E": 0.0}, {"E": 3.0}),
+    "contact 1 'pair', sliding": ({}, {"sliding": "small"}),
+    "scheme": ({}, {"scheme": uem.generalised_alpha(0.5)}),
+    "gravity": ({"gravity": None}, {"gravity": (0.0, -2.0)}),
+}
+
+
+def without(path, name):
+    """Rewrite a checkpoint as a version that did not know of a setting would have written it (collective)."""
+    if COMM.rank == 0:
+        whole = path.read_bytes()
+        end = int(whole[: checkpoint.HEAD].split()[5])
+        content = json.loads(whole[end:])
+        del content["settings"][name]
+        text = checkpoint._text(content)
+        path.write_bytes(checkpoint._head(end, text) + whole[checkpoint.HEAD : end] + text)
+    COMM.barrier()
+
+
+@pytest.mark.parametrize("name", BY_DEFAULT)
+def test_settings_that_came_later(name, folder):
+    """A file that does not know of a setting is of a run that had it by default: that goes on, one with another value is refused."""
+    same, other = BY_DEFAULT[name]
+    uem.write_checkpoint(folder / "run", made(**same).state())
+    without(folder / "run", name)
+    uem.read_checkpoint(folder / "run", made(**same).state())
+    raised(
+        uem.CheckpointError,
+        rf"other settings: {name} \(now [^;]*, then nothing\); go on with those",
+        lambda: uem.read_checkpoint(folder / "run", made(**same | other).state()),
+    )
+
+
+def test_settings_without_a_default(folder):
+    """What has to be named was named then, too."""
+    uem.write_checkpoint(folder / "run", made().state())
+    without(folder / "run", "mass")
+    raised(uem.CheckpointError, r"mass \(now 2 2, .*, then nothing\)", lambda: uem.read_checkpoint(folder / "run", made().state()))
 
 
 def test_other_steps_are_told(folder, caplog):

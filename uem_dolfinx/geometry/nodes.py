@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -13,7 +15,8 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
-from uem_dolfinx.parallel import Exchange, gathered
+from uem_dolfinx.errors import MeshError
+from uem_dolfinx.parallel import Exchange, agree, gathered, reduced
 
 
 class Nodes:
@@ -30,9 +33,13 @@ class Nodes:
         first: global number of the first owned node.
         n_global: global numbers of all ranks' nodes are below it.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
+
+    Raises:
+        MeshError: if a node's place is not finite.
     """
 
     def __init__(self, V: Any):
+        check_places(V.mesh)
         self.V, self.mesh = V, V.mesh
         self.comm = V.mesh.comm
         self.gdim: int = V.mesh.geometry.dim
@@ -146,6 +153,24 @@ class Nodes:
     def describe(self, node: int) -> str:
         """Where a local node is, for error messages."""
         return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"
+
+
+def check_places(mesh: Any) -> None:
+    """Refuse a mesh with nodes that are nowhere (collective).
+
+    Raises:
+        MeshError: naming the first of them, by its number in the mesh's input, and where it is said to be.
+    """
+    x, number = mesh.geometry.x[:, : mesh.geometry.dim], np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    order, last = bad[np.argsort(number[bad])], np.iinfo(np.int64).max
+    least, error = int(reduced(mesh.comm, int(number[order[0]]) if len(bad) else last, op=MPI.MIN)), None
+    if len(bad) and number[order[0]] == least:
+        error = MeshError(
+            f"node {least} of the mesh's input, counted from 0, is at ({', '.join(f'{c:.6g}' for c in x[order[0]])}): expected finite "
+            "coordinates; mend the mesh, or what has moved its nodes"
+        )
+    agree(mesh.comm, error)
 
 
 class Halo:

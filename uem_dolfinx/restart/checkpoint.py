@@ -120,7 +120,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         trouble.agree()
         content = comm.bcast(content)
         _compare(path, content["state"], state.describe())
-        _compare_settings(path, content["settings"], state.settings)
+        _compare_settings(path, content["settings"], state)
         with trouble:
             file = MPI.File.Open(comm, str(path), MPI.MODE_RDONLY)
         trouble.agree()
@@ -247,12 +247,16 @@ def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> Non
             )
 
 
-def _compare_settings(path: Path, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a checkpoint of a run that was made with something else by a CheckpointError that names all that differs."""
+def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
+    """Refuse a checkpoint of a run that was made with something else by a CheckpointError that names all that differs.
+
+    A setting that the file does not know of, as one that came later, was by default then.
+    """
+    expected = state.settings
     others = [
-        f"{name} (now {expected.get(name)}, then {found.get(name)})"
+        f"{name} (now {expected.get(name, 'nothing')}, then {found.get(name, 'nothing')})"
         for name in [*expected, *found]
-        if found.get(name) != expected.get(name)
+        if found.get(name) != expected.get(name) and not (name in state.by_default and name not in found)
     ]
     if found and expected and others:
         raise CheckpointError(

@@ -110,6 +110,7 @@ class State:
         collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
         restore: called on all ranks after reading, to go on from them.
         settings: what the run is made with, by name; a file of other settings is refused, unless there are none on either side.
+        by_default: names of settings that are what they are where nobody names them; a file that does not know of such is not refused.
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """
 
@@ -121,6 +122,7 @@ class State:
     restore: list[Callable[[], None]] = field(default_factory=list)
     steps: int = 0
     settings: dict[str, str] = field(default_factory=dict)
+    by_default: set[str] = field(default_factory=set)
 
     @property
     def comm(self) -> MPI.Comm:

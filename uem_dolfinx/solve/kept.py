@@ -33,7 +33,9 @@ def state_of(problem: Any) -> State:
     of_equations = fem.Function(config.V)
     if problem.linear is not None:
         functions["multipliers of equations"] = of_equations
-    state = State(problem.config.mesh, functions, problem.contacts, settings=problem.settings.describe(problem.comm))
+    settings = problem.settings.describe(problem.comm)
+    by_default = problem.settings.by_default(settings)
+    state = State(problem.config.mesh, functions, problem.contacts, settings=settings, by_default=by_default)
 
     def collect() -> None:
         config.functions()

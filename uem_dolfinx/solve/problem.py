@@ -97,6 +97,7 @@ class UnitedProblem:
         SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, F does not depend on
             it, a Dirichlet condition, the test function or a law with history is of another one, F holds what is of another mesh, or a
             contact belongs to another problem.
+        MeshError: if a node's place is not finite, naming the node.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM meanwhile.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.

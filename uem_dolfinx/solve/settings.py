@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from hashlib import blake2b
+from inspect import signature
 from typing import Any
 
 from mpi4py import MPI
@@ -23,12 +24,17 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law, follows_load, parameters
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.dynamics.scheme import newmark
 from uem_dolfinx.given import described
 from uem_dolfinx.restart.numbering import DIGEST
 
 #: Numbers of a form that are shown.
 #: [format; numbers; -]
 SHOWN = 12
+#: Settings that every contact has.
+OF_CONTACTS = ("coupling", "sliding", "normals", "thickness", "chords")
+#: Of values that there are none of.
+NONE = "none"
 
 
 class Settings:
@@ -56,6 +62,15 @@ class Settings:
         #: Words that are the same on all ranks, and values whose extent over all ranks counts, by name.
         self._words: dict[str, str] = dict(beside)
         self._values: dict[str, Array] = {}
+        #: Words of settings that a user who does not name them gets, as far as there are such, by name.
+        self._usual: dict[str, str] = {}
+        of_contacts = defaults(Contact)
+        for i, contact in enumerate(contacts, 1):
+            name = f"contact {i} '{contact.name}'"
+            self._usual |= {f"{name}, {what}": str(of_contacts[what]) for what in OF_CONTACTS} | {f"{name}, friction": NONE}
+        if dynamics is not None:
+            still = " ".join("0" for _ in dynamics.weight_of_one)
+            self._usual |= {"scheme": str(newmark()), "contactors": defaults(Dynamics)["contactors"], "gravity": still}
         history = [f for material in materials for f in vars(material).values() if isinstance(f, fem.Function)]
         for name, form in forms.items():
             if not isinstance(form, ufl.Form):
@@ -70,15 +85,18 @@ class Settings:
                 if f is not u and isinstance(f, fem.Function) and not any(f is other for other in history):
                     self._values[f"{name}, Function {i}"] = _extent(f.x.array)
         for i, material in enumerate(materials, 1):
+            usual = defaults(type(material))
             for what, values in getattr(material, "parameters", {}).items():
                 self._values[f"material {i}, {what}"] = _extent(values)
+                if isinstance(usual.get(what), (int, float)):
+                    self._usual[f"material {i}, {what}"] = f"{usual[what]:.6g}"
 
     def describe(self, comm: MPI.Comm) -> dict[str, str]:
         """All settings by name (collective)."""
         words, values = dict(self._words), dict(self._values)
         for i, contact in enumerate(self._contacts, 1):
             name = f"contact {i} '{contact.name}'"
-            for what in ("coupling", "sliding", "normals", "thickness", "chords"):
+            for what in OF_CONTACTS:
                 words[f"{name}, {what}"] = str(getattr(contact, what))
             words |= {f"{name}, {what}": value for what, value in contact.words().items()}
             for k, value in enumerate(parameters(as_law(contact.friction))[1:], 2):
@@ -103,9 +121,18 @@ class Settings:
                 words[f"mass {i} at a point"] = " ".join(f"{m:.6g}" for m in one.masses)
         for name, extent in values.items():
             least, most = -comm.allreduce(-extent[0], op=MPI.MAX), comm.allreduce(extent[1], op=MPI.MAX)
-            words[name] = "none" if least > most else f"{least:.6g}" + (f" to {most:.6g}" if most > least else "")
+            words[name] = NONE if least > most else f"{least:.6g}" + (f" to {most:.6g}" if most > least else "")
         # what differs from rank to rank by mistake must not be refused on one alone
         return dict(comm.bcast(words))
+
+    def by_default(self, words: Mapping[str, str]) -> set[str]:
+        """Names of settings that are, by these ``words``, what they are where nobody names them."""
+        return {name for name, usual in self._usual.items() if words.get(name) == usual}
+
+
+def defaults(kind: type) -> dict[str, Any]:
+    """What a class is made with where nothing else is said, by name."""
+    return {name: p.default for name, p in signature(kind).parameters.items() if p.default is not p.empty}
 
 
 def _contents(form: ufl.Form) -> tuple[list[float], list[Any]]:
