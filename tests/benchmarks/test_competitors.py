@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from benchmarks import methods
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, gathered_matrix, highest, linear, modulus, run, scene, st_venant
+from helpers import at, blocks, box, clamp, gathered_matrix, highest, linear, modulus, refused, run, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -119,6 +119,23 @@ def test_finite_strain_in_steps(method, parameter):
     assert all(step.cuts == 0 for step in steps) and methods.counts(steps)[0] < (100 if method == "augmented" else 40)
     reaction = problem.reaction(b.top)[-1]
     assert abs(reaction / force(contact) + 1) < 1e-6
+
+
+def test_springs_know_no_equations_of_users():
+    """Rigid couplings with masses at their points, and linear equations, are refused by name."""
+    for coupled in (True, False):
+        b = blocks(COMM, "quadrilateral", 2, 3)
+        if coupled:
+            more = {"couplings": [uem.RigidCoupling(b.top, (0.5, 1.0), mass=1.0)]}
+        else:
+            more = {"equations": [uem.Equation([((0.0, 1.0), (0.0, 1.0)), ((1.0, 1.0), (0.0, -1.0))])]}
+        refused(
+            uem.InputError,
+            ("masses at their points", "elimination alone"),
+            lambda b=b, more=more: methods.create(
+                "penalty", linear(b.u, E), b.u, parameter=1e3, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)], **more
+            ),
+        )
 
 
 def test_saddle_point_is_indefinite():

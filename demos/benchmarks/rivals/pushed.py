@@ -12,16 +12,22 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
+    from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.contact.interface import Interface
     from uem_dolfinx.solve.bodies import Bodies
 
 
 class PushedSystem(ABC):
-    """Contact by forces; implements ``ContactMethod``, arguments as those of ``solve.system.BodySystem``."""
+    """Contact by forces; implements ``ContactMethod``, arguments as those of ``solve.system.BodySystem``.
+
+    Raises:
+        InputError: if there are equations of users.
+    """
 
     def __init__(
         self,
@@ -31,7 +37,13 @@ class PushedSystem(ABC):
         *,
         newton: str = "full",
         consistent_tangent: bool = True,
+        linear: UserRows | None = None,
     ):
+        if linear is not None:
+            raise InputError(
+                "linear equations and rigid couplings, with the masses at their points, are met by elimination alone: leave method out, "
+                "or equations and couplings"
+            )
         self.bodies, self.pairs, self.solver = bodies, pairs, solver
         self.config, self.comm = bodies.config, bodies.comm
         self.newton, self.consistent_tangent = newton, consistent_tangent
