@@ -97,7 +97,7 @@ closes_at = gap / (alpha * L)
 
 def pressed(T: float) -> float:
     """Pressure with the hot end at T: p = E / (2 L) * growth, of which q = T c p / (1 + R c p) makes a quadratic equation."""
-    if T <= closes_at * (1 + 1e-12):  # a step may end at the instant of closing
+    if closes_at * (1 + 1e-12) >= T:  # a step may end at the instant of closing
         return 0.0
     drawn, by_flux = (E / (2 * L) * alpha * L * growth for growth in (T - closes_at, L / 2 * (1 / k_low - 1 / k_high) * T * c))
     return max(np.roots([resistance * c, 1 - by_flux - resistance * c * drawn, -drawn]).real)

@@ -133,7 +133,13 @@ def test_springs_know_no_equations_of_users():
             uem.InputError,
             ("masses at their points", "elimination alone"),
             lambda b=b, more=more: methods.create(
-                "penalty", linear(b.u, E), b.u, parameter=1e3, bcs=clamp(b.V, b.bottom), contacts=[uem.Contact(b.high, b.low)], **more
+                "penalty",
+                linear(b.u, E),
+                b.u,
+                parameter=1e3,
+                bcs=clamp(b.V, b.bottom),
+                contacts=[uem.Contact(b.high, b.low)],
+                **more,
             ),
         )
 

@@ -167,12 +167,10 @@ def test_a_node_that_is_nowhere(value, field):
     b = scene(degree=2 if field == "degree 2" else 1)
     own = np.flatnonzero(b.scene.input_nodes == 7)
     b.scene.mesh.geometry.x[own, 1] = value
-    if field == "scalar":
-        T = fem.Function(compat.function_space(b.scene.mesh, 1))
-        problem = lambda: uem.UnitedProblem(ufl.inner(ufl.grad(T), ufl.grad(ufl.TestFunction(T.function_space))) * ufl.dx, T)
-    else:
-        problem = lambda: pressed(b)
-    refused(uem.MeshError, ("node 7 of the mesh's input", f", {value})", "expected finite coordinates", "mend the mesh"), problem)
+    T = fem.Function(compat.function_space(b.scene.mesh, 1))
+    warm = ufl.inner(ufl.grad(T), ufl.grad(ufl.TestFunction(T.function_space))) * ufl.dx
+    words = ("node 7 of the mesh's input", f", {value})", "expected finite coordinates", "mend the mesh")
+    refused(uem.MeshError, words, lambda: uem.UnitedProblem(warm, T) if field == "scalar" else pressed(b))
 
 
 def test_one_contact_for_two_problems():

@@ -121,7 +121,9 @@ def test_settings_without_a_default(folder):
     """What has to be named was named then, too."""
     uem.write_checkpoint(folder / "run", made().state())
     without(folder / "run", "mass")
-    raised(uem.CheckpointError, r"mass \(now 2 2, .*, then nothing\)", lambda: uem.read_checkpoint(folder / "run", made().state()))
+    raised(
+        uem.CheckpointError, r"mass \(now 2 2, .*, then nothing\)", lambda: uem.read_checkpoint(folder / "run", made().state())
+    )
 
 
 def test_other_steps_are_told(folder, caplog):

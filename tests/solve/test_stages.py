@@ -140,6 +140,37 @@ def test_interrupted_is_uninterrupted(stops, folder):
     assert made == [] and again.joint.friction == 0.3 and np.allclose(again.forces(), whole.forces(), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("stop", [6, slow(4), 8])
+def test_a_list_that_is_left_is_left_again(stop, folder):
+    """A script leaves a list by ``break`` amid a release, goes on with another, and is run anew from a checkpoint of before or after."""
+
+    def run(name, stop=None):
+        column, made = Column(friction=0.1), []
+        checkpoint = uem.Checkpoint(folder / name, every=1)
+        for steps in (
+            column.steps()[:3],
+            [uem.Step("on", 2, offset={column.joint: -0.01}), uem.Step("rough", 2, friction={column.joint: 0.3})],
+        ):
+            for step in uem.load_steps(column.problem, steps, checkpoint=checkpoint):
+                made.append((step.step, step.number, step.time, *column.forces()))
+                if len(made) == stop:
+                    return column, made
+                if (step.step, step.number) == ("load", 2):
+                    break
+        return column, made
+
+    whole, wanted = run("whole")
+    # the contact is not switched off, as the step after the one that was left would do
+    assert [one[0] for one in wanted] == ["press"] * 2 + ["load"] * 2 + ["on"] * 2 + ["rough"] * 2 and whole.joint.on
+    run("parts", stop)
+    last, made = run("parts")
+    assert len(made) == len(wanted) - stop + 1 and last.joint.on and last.joint.friction == 0.3
+    for ours, theirs in zip(made, wanted[stop - 1 :]):
+        assert ours[:2] == theirs[:2] and np.allclose(ours[2:], theirs[2:], rtol=0, atol=1e-14)
+    if COMM.size == 1:
+        assert np.array_equal(bits(last.b.u.x.array), bits(whole.b.u.x.array))
+
+
 def test_another_step_is_no_step_of_the_checkpoint(folder):
     column = Column()
     for step in uem.load_steps(column.problem, column.steps()[:2], checkpoint=uem.Checkpoint(folder / "run", every=1)):

@@ -82,16 +82,23 @@ def load_steps(
 
 
 def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadStep]:
-    """The load steps of several ``Step``, one after the other."""
+    """The load steps of several ``Step``, one after the other, or up to where a run before the checkpoint has left them."""
     from uem_dolfinx.solve.stages import Stage
 
+    progress = problem.progress
     for step in steps:
-        stage = Stage(problem, step)
+        left, through = progress.left_at(), False
+        stage = Stage(problem, step, 1.0 if left is None else left)
         try:
             for made in _load_steps(problem, step.n, ByLoad(problem)):
-                yield replace(made, step=step.name, before=problem.progress.ramp - 1)
+                yield replace(made, step=step.name, before=progress.ramp - 1)
+            through = True
         finally:
             stage.leave()
+            if not through:
+                progress.left[progress.ramp] = progress.factor
+        if left is not None:
+            return
 
 
 def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> Iterator[LoadStep]:

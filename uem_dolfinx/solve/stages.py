@@ -101,6 +101,7 @@ class Stage:
     Args:
         problem: taken through it.
         step: as it was declared, and checked.
+        end: load factor at which it ended, if the problem's state is one of a later call.
 
     Attributes:
         step: likewise.
@@ -110,7 +111,7 @@ class Stage:
         InputError: if conditions change at nodes that mortar ties.
     """
 
-    def __init__(self, problem: UnitedProblem, step: Step):
+    def __init__(self, problem: UnitedProblem, step: Step, end: float = 1.0):
         self._problem, self.step = problem, step
         progress, self._at = problem.progress, 0.0
         #: Whether nothing of it has been done yet, rather than a part of it, or all, before a checkpoint.
@@ -133,7 +134,7 @@ class Stage:
         if fresh:
             progress.step, progress.loads = step.name, starts
         else:
-            problem.set_load(progress.factor if progress.ahead == 0 else 1.0, known=True)
+            problem.set_load(progress.factor if progress.ahead == 0 else end, known=True)
             move_targets(problem, problem.motions)
             for pair in problem.pairs:
                 settle(pair)

@@ -79,6 +79,8 @@ class Progress:
         carried: what it releases: forces at all unknowns at its beginning, ghosts included ``(n,)``; None for nothing.
         of_equations: multipliers of equations of users at the components that these eliminate, as a checkpoint has kept them
             ``(n_local, gdim)``.
+        left: load factors at which calls of several ``Step`` were left before their end, and none of their later steps begun, by the
+            number of the call that each of these counts as.
     """
 
     steps: int = 0
@@ -95,6 +97,7 @@ class Progress:
     loads: list[Any] = field(default_factory=list)
     carried: Array | None = None
     of_equations: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    left: dict[int, float] = field(default_factory=dict)
     _calls: int = 0
 
     @property
@@ -106,6 +109,17 @@ class Progress:
     def ahead(self) -> int:
         """The next call of ``load_steps``, counted from the one that the problem is in: below 0 if that comes later."""
         return self._calls + 1 - self.ramp
+
+    def left_at(self) -> float | None:
+        """Load factor at which the next call was left, and its list of steps with it, before a checkpoint that is beyond it; else None.
+
+        One that is begun or gone on with has yet to be left.
+        """
+        number = self._calls + 1
+        if number < self.ramp:
+            return self.left.get(number)
+        self.left.pop(number, None)
+        return None
 
     def begin_ramp(self, displacement: Array, steps: int) -> bool:
         """Begin a call of ``load_steps`` with so many steps, or go on with the one that a checkpoint was written in.
@@ -148,7 +162,8 @@ class Progress:
         """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
         load: dict[str, Any] = {}
         if ramped:
-            load = {"load ramp": self.ramp, "load factor": self.factor, "arc length": self.reach}
+            ramp = [self.ramp, *map(list, self.left.items())] if self.left else self.ramp
+            load = {"load ramp": ramp, "load factor": self.factor, "arc length": self.reach}
             load |= {
                 "name of the step": self.step,
                 "loads at its beginning": self.loads,
@@ -161,7 +176,9 @@ class Progress:
         self.steps = kept["steps committed"]
         self.resumed += 1
         if start is not None:
-            self.ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
+            ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
+            self.ramp, *left = ramp if isinstance(ramp, list) else [ramp]
+            self.left = dict(left)
             self.start, self.step, self.loads = np.array(start), kept["name of the step"], kept["loads at its beginning"]
             self.carried = carried if kept["releases forces"] else None
             self.control.from_checkpoint(kept)
