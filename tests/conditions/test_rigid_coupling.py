@@ -14,6 +14,7 @@ from helpers import at, blocks, box, clamp, highest, linear, modulus, refused, r
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.conditions.rigid_set import RigidSet, moments, turned
 from uem_dolfinx.geometry.rigid import rotation_matrix
 
@@ -229,6 +230,39 @@ def test_rigid_bodies_on_each_other():
     assert np.abs(b.u.x.array).max(initial=0.0) <= 1e-13
     assert np.allclose(contact.resultant().force, (0.0, 0.02), atol=1e-12)
     assert np.allclose(base.reaction[0], (0.0, 0.02), atol=1e-12) and base.reaction[1] == pytest.approx(-0.002, abs=1e-12)
+
+
+@pytest.mark.parametrize(("part", "height", "pressed"), [(0.99, 1.0, True), slow(0.99, 1.0, False), (1.2, 0.1, False)])
+def test_what_friction_cannot_hold(part, height, pressed):
+    """A rigid block on a soft base, pushed by so much of what friction bears: told so, as of an elastic one, pressed on before or not.
+
+    At 0.99 pushed at its top the rear of the block digs into the base, whose slope takes a part of its weight.
+    """
+    b, now = blocks(COMM, "quadrilateral", 6, 4, overhang=0.5), [(0.0, -0.01)]
+    upper = b.scene.tag("upper", 1, lambda x: x[:, 1] >= 0.0)
+    coupling = uem.RigidCoupling(upper, (0.5, height), force=lambda _: now[-1])
+    contact, E = uem.Contact(b.high, b.low, friction=0.3), modulus(b.scene, 1.0, 0.0)
+    how = {"contacts": [contact], "couplings": [coupling], "load": lambda _: None}
+    problem = uem.UnitedProblem(linear(b.u, E), b.u, bcs=clamp(b.V, b.bottom), **how)
+    if pressed:
+        problem.solve()
+    now.append((part * 0.3 * 0.01, -0.01))
+    problem.set_load(1.0)
+    error = refused(uem.FrictionError, (), problem.solve)
+    assert "friction does not hold it" in str(error) or "stick and slip by turns" in str(error)
+
+
+def test_supports_of_rigid_bodies():
+    """What nothing holds of a rigid body is held at components that its coupling leaves, one for each motion."""
+    b = Bar()
+    coupling = uem.RigidCoupling(b.scene.tag("all", 0, lambda x: x[:, 0] >= 0.0), (1.0, 0.5), motion=(0.1, None, None))
+    problem = b.problem(coupling, bcs=())
+    rigid, motions = problem.linear.rigid, problem.system.floating.rigid
+    n = problem.config.n_owned
+    left = rigid.left(np.ones((n, 2), dtype=bool))
+    pins = motions.supports(motions.open_motions(None), UnitingEquations.join([], 2), left)
+    # the third motion is the coupling's own, which the two components beside that one tell
+    assert COMM.allreduce(left.sum()) == 2 and COMM.allreduce((pins & left).sum()) == COMM.allreduce(pins.sum()) == 2
 
 
 # -- in motion -------------------------------------------------------------------------------------------------------------

@@ -145,7 +145,12 @@ class FloatingBodies:
         self._open = self._sliding = self.motions.open_motions(self._rates(resisting))
         if resisting is not equations:
             self._sliding = self.motions.open_motions(self._rates(equations))
-        left, supports = free.copy(), self.motions.supports(self._sliding, equations)
+        rigid, parted = None if self._linear is None else self._linear.rigid, None
+        if rigid is not None:
+            # what couplings leave of their nodes holds these
+            parted = rigid.left(np.ones((self._bodies.config.n_owned, free.shape[1]), dtype=bool))
+            equations = equations.select(np.arange(len(equations)) < len(equations) - rigid.n_rows)
+        left, supports = free.copy(), self.motions.supports(self._sliding, equations, parted)
         left[: len(supports)] &= ~supports
         return left
 

@@ -281,15 +281,21 @@ class RigidMotions:
 
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 
-    def supports(self, motions: Any, equations: UnitingEquations) -> Bools:
+    def supports(self, motions: Any, equations: UnitingEquations, left: Bools | None = None) -> Bools:
         """Components of owned nodes that hold neutral motions without any reaction ``(n_owned, gdim)`` (collective).
 
-        One component per motion, each where what the earlier ones of its bodies leave open moves it most; contactors are spared.
+        One component per motion, each where what the earlier ones of its bodies leave open moves it most.
+
+        Args:
+            motions: sparse matrix ``(n_motions, k)``.
+            equations: whose nodes are spared.
+            left: components that rigid couplings do not eliminate ``(n_owned, gdim)``; None for all.
         """
         if self._supports is not None and motions.shape[1]:
             before, pins = self._supports
             if before.shape == motions.shape and abs(before @ (before.T @ motions) - motions).max() < OPEN:
-                return pins
+                if left is None or not reduced(self.comm, bool((pins & ~left).any()), op=MPI.LOR):
+                    return pins
         from scipy.sparse import csr_matrix
 
         config, g, comm = self.config, self.config.gdim, self.comm
@@ -301,7 +307,7 @@ class RigidMotions:
         of_body = np.full(self.count, -1)
         of_body[terms.row // self.n_modes] = group[terms.col]
         own = self._body[: config.n_owned]
-        allowed = self.free & (of_body[own] >= 0)[:, None]
+        allowed = self.free & (of_body[own] >= 0)[:, None] & (True if left is None else left)
         allowed[equations.node] = False
         i, c = np.nonzero(allowed)
         own, of = own[i], of_body[own[i]]
