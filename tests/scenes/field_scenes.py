@@ -79,3 +79,12 @@ def with_pressure(f: Fields, E: float, nu: float) -> ufl.Form:
     (u, p), (v, q) = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
     mu, compliance = E / (2 * (1 + nu)), (1 - 2 * nu) * (1 + nu) / (E * nu)
     return (2 * mu * ufl.inner(strain(u), strain(v)) - p * ufl.div(v) - q * (ufl.div(u) + compliance * p)) * ufl.dx
+
+
+def neo_hooke_with_pressure(f: Fields, E: float, nu: float) -> ufl.Form:
+    """Finite strains with the pressure as a field of its own, up to nu = 0.5 (plane strain in 2D)."""
+    (u, p), (v, q) = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
+    mu, compliance = E / (2 * (1 + nu)), (1 - 2 * nu) * (1 + nu) / (E * nu)
+    F = ufl.Identity(len(u)) + ufl.grad(u)
+    J, inverse = ufl.det(F), ufl.inv(F).T
+    return (ufl.inner(mu * (F - inverse) - p * J * inverse, ufl.grad(v)) - q * (J - 1 + compliance * p)) * ufl.dx

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from field_scenes import fields, strain, stress, with_pressure
+from field_scenes import fields, neo_hooke_with_pressure, strain, stress, with_pressure
 from helpers import blocks, gathered_matrix, highest, linear, modulus, refused, run, slow
 
 import uem_dolfinx as uem
@@ -201,6 +201,30 @@ def test_every_field_is_solved_beside_the_largest_forces():
     R.array[:] *= problem.bodies.free_rows.ravel()
     assert every[0] > 1e9 * every[1] > 0.0
     assert rows.norms(R)[1] < 1e-8 * every[1]
+
+
+@pytest.mark.parametrize(
+    ("law", "E", "contact"),
+    [(neo_hooke_with_pressure, 2e11, True), (with_pressure, 1.0, True), (neo_hooke_with_pressure, 1.0, False)],
+)
+def test_unloaded_to_nothing(law, E, contact):
+    """Without any force left, what remains in each field is rounding beside what there has been in it, which ends the step."""
+    b = blocks(COMM, "triangle", 2, 3)
+    f, load = fields(b, 2, 1), fem.Constant(b.scene.mesh, 0.0)
+    v = f.split(ufl.TestFunction(f.w.function_space))[0]
+    F = law(f, E, 0.4999) + load * v[1] * forms.surface_measure(b.scene.mesh, b.top.entities)
+    bcs = f.rollers() + ([] if contact else [uem.dirichlet(f.space, b.high, 1)])
+    contacts = [uem.Contact(b.high, b.low)] if contact else []
+    problem = uem.UnitedProblem(F, f.w, displacement=0, bcs=bcs, contacts=contacts)
+    for part in (0.5, 1.0, 0.0, 0.0):
+        load.value = 0.02 * E * part
+        iterations = problem.solve()
+        if part == 1.0:
+            pressed = [highest(COMM, np.abs(g.x.array)) for g in problem.config.functions().values()]
+    assert len(iterations) <= 8
+    left = [highest(COMM, np.abs(g.x.array)) for g in problem.config.functions().values()]
+    assert pressed[0] > 0.01 and pressed[1] > 5e-3 * E
+    assert left[0] <= 1e-14 and left[1] <= 1e-14 * E
 
 
 def test_other_fields_do_not_hide_that_there_is_no_stiffness():

@@ -230,12 +230,20 @@ class Bodies:
             return self._beside(told, [one.size() for one in self._added])
         return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
 
+    def remembered(self, positioned: bool) -> Any:
+        """Norm beside which forces of later steps may be rounding: of those above it, and of the terms of other fields (collective)."""
+        told = self.above_rounding(positioned)
+        if self._fields is None:
+            return told
+        terms, rounding = self._fields.terms(), np.maximum(FORCE_ROUNDING * self._fields.largest(), self.strain_rounding())
+        return np.maximum(told, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
+
     def strain_rounding(self) -> Any:
-        """Norm of the forces that rounding of ``1 + grad(u)`` can make, nothing in other fields (collective)."""
+        """Norm of the forces that rounding of ``1 + grad(u)`` can make, or one for each field ``(n_fields,)`` (collective)."""
         if self.stiffness is None or not self.config.moves:
             return 0.0
         size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
-        return size if self._fields is None else self._first(size)
+        return size if self._fields is None else self._fields.strain_rounding(self.config.size) + self._first(size)
 
     def _first(self, of_displacement: float) -> Array:
         """A norm of the displacement's forces, none of the other fields ``(n_fields,)``."""

@@ -35,6 +35,7 @@ class FieldScales:
         #: Entries in equations of other fields, or of them in those of the displacement.
         self._which: Ints = np.flatnonzero(((unknowns.field[row] > 0) | (field[column] > 0)) & (field[column] >= 0))
         self._row, self._column = row[self._which], column[self._which]
+        self._by_displacement = field[self._column] == 0
         kinds = int(unknowns.kind.max(initial=0)) + 1
         #: Entries of one row in columns of one component, which are averaged.
         self._group: Ints = self._row * kinds + kind[self._column]
@@ -71,6 +72,15 @@ class FieldScales:
     def largest(self) -> Array:
         """Norm of the sums of the terms' sizes in the equations of each field ``(n_fields,)`` (collective)."""
         return self._unknowns.norms_of(self._largest())
+
+    def strain_rounding(self, size: float) -> Array:
+        """Norm of what rounding of ``1 + grad(u)`` can make in the equations of each field, none for the displacement ``(n_fields,)``.
+
+        An equation as ``det(1 + grad(u)) = 1`` is left with it however small u is. Collective; ``size`` is the model's, a length.
+        """
+        K, _ = self._known()
+        of_displacement = np.where(self._by_displacement, np.abs(K), 0.0)
+        return self._of_others(np.bincount(self._row, np.finfo(float).eps * size * of_displacement, len(self._unknowns.field)))
 
     def above(self, F: Array, part: float) -> Array:
         """Norm of the residual ``F (n_rows * gdim,)`` where it is more than a part of the terms, none for the displacement (collective)."""

@@ -376,7 +376,7 @@ class UnitedProblem:
         if self.history is not None:
             self.history.note(self._before, *self.led)
         self.committed = np.array(self.u.x.array)
-        self.largest_forces = np.maximum(self.largest_forces, self.bodies.above_rounding(bool(self.pairs)))
+        self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
         for material in self.materials:
             material.commit()
         if self.dynamics is not None:

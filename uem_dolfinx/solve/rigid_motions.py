@@ -293,9 +293,9 @@ class RigidMotions:
         """
         if self._supports is not None and motions.shape[1]:
             before, pins = self._supports
-            if before.shape == motions.shape and abs(before @ (before.T @ motions) - motions).max() < OPEN:
-                if left is None or not reduced(self.comm, bool((pins & ~left).any()), op=MPI.LOR):
-                    return pins
+            gone = left is not None and reduced(self.comm, bool((pins & ~left).any()), op=MPI.LOR)
+            if not gone and before.shape == motions.shape and abs(before @ (before.T @ motions) - motions).max() < OPEN:
+                return pins
         from scipy.sparse import csr_matrix
 
         config, g, comm = self.config, self.config.gdim, self.comm
