@@ -308,6 +308,28 @@ def petsc_option_used(name: str) -> bool | None:
     return bool(used.value)
 
 
+def arrays_of(A: PETSc.Mat) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]] | None:
+    """Where PETSc has the entries of a matrix on one rank: first of every row, columns and values; None if it does not tell.
+
+    petsc4py copies them. They are there as long as the matrix is, and has entries in no other places.
+    """
+    rows, columns, values = found = [ctypes.c_void_p() for _ in range(3)]
+    if A.getType() != "seqaij":
+        return None
+    try:
+        ask = ctypes.CDLL(PETSc.__file__).MatSeqAIJGetCSRAndMemType
+    except (OSError, AttributeError):
+        return None
+    if ask(ctypes.c_void_p(A.handle), *map(ctypes.byref, found), None) or not all(found):
+        return None
+
+    def there(at: ctypes.c_void_p, kind: Any, n: int) -> npt.NDArray[Any]:
+        return np.frombuffer((ctypes.c_char * (n * np.dtype(kind).itemsize)).from_address(at.value or 0), kind)
+
+    starts = there(rows, PETSc.IntType, A.getSize()[0] + 1)
+    return starts, there(columns, PETSc.IntType, int(starts[-1])), there(values, PETSc.ScalarType, int(starts[-1]))
+
+
 def petsc_forms() -> Any:
     """``dolfinx.fem.petsc``, which is heavy on some versions."""
     import dolfinx.fem.petsc

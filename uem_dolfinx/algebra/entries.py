@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -9,7 +10,8 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
 
@@ -18,53 +20,57 @@ from uem_dolfinx.parallel import reduced
 SYMMETRIC = 1e-11
 
 
+@dataclass(frozen=True)
 class Entries:
     """Entries of the owned rows of a square matrix, shared with PETSc.
 
     Those in own columns come first, row by row; on several ranks those in other ranks' columns follow, of row ``i`` in line ``n + i``.
 
-    Args:
+    Attributes:
         indptr: first entry of every line, and the number of entries ``(lines + 1,)``; lines are the n owned rows, or twice as many.
         columns: global numbers, sorted in every line ``(k,)``.
-        like: a matrix of the same layout and block size.
-
-    Attributes:
-        values: of the entries ``(k,)``, zero at first.
+        values: of the entries ``(k,)``.
         mat: the matrix that has them; to be assembled after changes.
     """
 
-    def __init__(self, indptr: Ints, columns: Ints, like: PETSc.Mat):
-        self.indptr, self.columns = indptr, columns
-        self.values = np.zeros(len(columns))
+    indptr: Ints
+    columns: Ints
+    values: Array
+    mat: PETSc.Mat
+
+    @staticmethod
+    def of_arrays(indptr: Ints, columns: Ints, values: Array, like: PETSc.Mat) -> Entries:
+        """A matrix of the layout and block size of ``like`` from its arrays (collective)."""
         sizes, (first, last) = like.getSizes(), like.getOwnershipRange()
         n = last - first
-        arrays: Any = indptr, columns, self.values
+        arrays: Any = indptr, columns, values
         if len(indptr) > n + 1:
             k = indptr[n]
             inside, outside = (indptr[: n + 1], columns[:k] - first), (indptr[n:] - k, columns[k:].copy())
-            arrays = (*inside, self.values[:k]), (*outside, self.values[k:])
-        self.mat = PETSc.Mat().createAIJWithArrays(sizes, arrays, bsize=like.getBlockSize(), comm=like.comm)
+            arrays = (*inside, values[:k]), (*outside, values[k:])
+        mat = PETSc.Mat().createAIJWithArrays(sizes, arrays, bsize=like.getBlockSize(), comm=like.comm)
         # multigrid looks for it, and petsc4py 3.18 forgets it
-        self.mat.setBlockSize(like.getBlockSize())
+        mat.setBlockSize(like.getBlockSize())
+        return Entries(indptr, columns, values, mat)
+
+    @staticmethod
+    def within(K: PETSc.Mat) -> Entries | None:
+        """Those of a matrix where it has them, to be read while it stays; None of one on several ranks, and where PETSc does not tell."""
+        arrays = compat.arrays_of(K) if K.comm.size == 1 else None
+        return None if arrays is None else Entries(*arrays, K)
 
     @staticmethod
     def as_in(K: PETSc.Mat) -> Entries:
         """Zeros in the places of the entries of ``K``."""
         if K.comm.size == 1:
             indptr, columns = K.getRowIJ()
-            return Entries(indptr, columns, K)
+            return Entries.of_arrays(indptr, columns, np.zeros(len(columns)), K)
         first, last = K.getOwnershipRange()
         indptr, columns, _ = K.getValuesCSR()
         inside, _ = K.getDiagonalBlock().getRowIJ()
         own = (columns >= first) & (columns < last)
         lines = np.append(inside, inside[-1] + (indptr - inside)[1:]).astype(indptr.dtype)
-        return Entries(lines, np.append(columns[own], columns[~own]), K)
-
-    def of(self, lines: Bools) -> tuple[Ints, Ints]:
-        """Places of the entries in some of the lines, and the lines that they are in."""
-        which = np.flatnonzero(lines).astype(self.indptr.dtype)
-        places, i = entries_of(which, self.indptr)
-        return places, which[i]
+        return Entries.of_arrays(lines, np.append(columns[own], columns[~own]), np.zeros(len(columns)), K)
 
     def find(self, lines: Ints, columns: Ints) -> tuple[Ints, Bools]:
         """Places where entries of these lines and columns are or would be put, and whether they are there, ``(m,)`` each."""

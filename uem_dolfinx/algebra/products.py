@@ -6,8 +6,8 @@ which crosses out their components and those that are prescribed,
     Q'KP = ZKZ + ZK P_E + Q_E'K_E (Z + P_E)
 
 so that only blocks of these nodes and their neighbours are multiplied, by each rank its own rows, and all that grows with the bodies is a
-copy of values. K without prescribed components, with its diagonal where these are, is kept as well: its entries go line by line to where
-the matrix has them, in one piece between lines that have more.
+copy of values. Entries of K go line by line to where the matrix has them, in one piece between lines that have more; prescribed components
+are crossed out there, but for the diagonal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, product, summed, to_owners, together
-from uem_dolfinx.algebra.entries import Entries, blocks_of, entries_of
+from uem_dolfinx.algebra.entries import Entries, blocks_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
@@ -61,18 +61,15 @@ class UnitedMatrix:
         #: K and the free components that the matrix was made for, and the state of K's values that it holds.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
-        #: Z K Z with the diagonal of K, where it is crossed out, and the matrix.
+        #: Entries of K, of a copy where it has arrays of its own, and of the matrix.
         self._K: Any = None
-        self._crossed: Ints = np.zeros(0, np.int64)
-        #: Places in it of prescribed components' diagonal.
-        self._held: Ints = np.zeros(0, np.int64)
         self._A: Any = None
         #: Keys of the blocks that K lacks, line of nodes times their number plus column, sorted.
         self._filled: Ints = np.zeros(0, np.int64)
         #: Whether a step begins.
         self._begins = False
-        #: Places where the last update changed what is K's, and what was there.
-        self._changed: tuple[Ints, Array] | None = None
+        #: Places where the last update changed what is K's, of blocks' lines and of single entries, and what was there.
+        self._changed: tuple[tuple[Ints, Array], tuple[Ints, Array]] | None = None
 
     def begin_step(self) -> None:
         """Let no place depend on the steps before this one: a run that goes on from a checkpoint takes the same."""
@@ -94,26 +91,35 @@ class UnitedMatrix:
         """Bring K's values and the products into the matrix (collective)."""
         changes, adding = self._changes(trial, test, G)
         begins = self._A is None or self._begins
-        places, there = self._find(self._K if begins else self._A, changes)
+        lines, there = self._find(self._K if begins else self._A, changes)
         if begins or reduced(self.space.comm, int(not there.all())):
-            self._make_places(begins, changes, P, Q, G)
-            places, _ = self._find(self._A, changes)
-        values = self._A.values
+            self._make_places(begins, changes, there if begins else None, P, Q, G)
+            lines, _ = self._find(self._A, changes)
+        values, g, nodes = self._A.values, self.space.block, P.united
         if self._changed is None:
-            for to, here in self._runs:
-                values[to] = self._K.values[here]
-            values[self._moved[1]] = self._K.values[self._moved[0]]
-            values[self._empty] = 0.0
+            self._copy_values()
         else:
-            values[self._changed[0]] = self._changed[1]
-        g, nodes = self.space.block, P.united
+            (blocks, of_blocks), (single, of_single) = self._changed
+            values[_along(blocks, g)], values[single] = of_blocks, of_single
         idle = (g * nodes[:, None] + np.arange(g))[~P.used[nodes]].astype(np.int64)
         held, own = (entries.find(idle, idle + self._first)[0] for entries in (self._A, self._K))
-        at = np.concatenate([places.ravel(), held])
-        self._changed = at, values[at]
-        values[places] = np.where(adding[:, None, None], values[places], 0.0) + changes.value
+        places = _along(lines, g)
+        self._changed = (lines, values[places]), (held, values[held])
+        values[places] = np.where(adding[:, None, None], self._changed[0][1], 0.0) + changes.value
         values[held] = self._stiff(own)
         self._A.mat.assemble()
+
+    def _copy_values(self) -> None:
+        """Bring K's values into the matrix as those of ZKZ, with the diagonal of K where it is crossed out (collective)."""
+        values, g = self._A.values, self.space.block
+        for to, here in self._runs:
+            values[to] = self._K.values[here]
+        old, new = self._moved
+        values[_along(new, g)] = self._K.values[_along(old, g)]
+        values[_along(self._empty, g)] = 0.0
+        free, (own, there) = self.space.vector(self._made_for[1]), self._held
+        self._A.mat.diagonalScale(free, free)
+        values[there] = self._stiff(own)
 
     def _stiff(self, places: Ints) -> Array:
         """Entries of K at ``places (k,)`` of its diagonal, a large one where there is none, as in bodies that are rigid ``(k,)``."""
@@ -160,24 +166,28 @@ class UnitedMatrix:
     # -- blocks of K and of curvature --------------------------------------------------------------------------------------
 
     def _inside(self, nodes: Ints, columns: Bools | None = None) -> Blocks:
-        """Blocks of K in rows and columns of owned nodes, in rows ``nodes (k,)``, and in some ``columns (n_owned,)`` alone if told."""
+        """Blocks of ZKZ in rows and columns of owned nodes, in rows ``nodes (k,)``, and in some ``columns (n_owned,)`` alone if told."""
         g, first = self.space.block, self.space.first
         places, i, width = blocks_of(nodes, self._K.indptr, g)
         column = self._K.columns[places] // g
         if columns is not None:
             kept = columns[column - first]
             places, i, width, column = places[kept], i[kept], width[kept], column[kept]
-        return Blocks(nodes[i] + first, column.astype(np.int64), self._values(places, width))
+        free = self._made_for[1]
+        return Blocks(
+            nodes[i] + first, column.astype(np.int64), self._values(places, width, free[nodes[i]], free[column - first])
+        )
 
     def _outside(self, which: Bools) -> Blocks:
-        """Some of the blocks of K in owned rows and other ranks' columns, of which ``_beyond`` has the places."""
+        """Some of the blocks of ZKZ in owned rows and other ranks' columns, of which ``_beyond`` has the places."""
         there = self._beyond.some(which)
-        return there._replace(value=self._values(*there.value.T.astype(np.int64)))
+        free = self._made_for[1][there.row - self.space.first]
+        return there._replace(value=self._values(*there.value.T.astype(np.int64), free, self._free_beyond[which]))
 
-    def _values(self, places: Ints, width: Ints) -> Array:
-        """Values of blocks of K from the places where they begin, and the number of entries in their lines."""
-        k = np.arange(self.space.block)
-        return self._K.values[places[:, None, None] + width[:, None, None] * k[:, None] + k]
+    def _values(self, places: Ints, width: Ints, *free: Bools) -> Array:
+        """Values of blocks of ZKZ: from the places where K has them, the entries in their lines, and ``free (k, g)`` rows and columns."""
+        there = self._K.values[_along(_lines(places, width, self.space.block), self.space.block)]
+        return np.asarray(there * free[0][:, :, None] * free[1][:, None, :])
 
     def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
         """Blocks of G in owned rows without prescribed components (collective)."""
@@ -187,36 +197,31 @@ class UnitedMatrix:
         return Blocks(row, column, value * free[row - self.space.first][:, :, None] * there[:, None, :])
 
     def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:
-        """Places of blocks in owned rows ``(k, g, g)``, and whether they are there ``(k,)``."""
+        """Places of the lines of blocks in owned rows ``(k, g)``, and whether the blocks are there ``(k,)``."""
         g = self.space.block
         inside = self.space.owner_of(blocks.column) == self.space.comm.rank
         line = g * blocks.row - self._first + np.where(inside, 0, self._n)
-        column = np.repeat(g * blocks.column, g)
-        places, there = entries.find((line[:, None] + np.arange(g)).ravel(), column)
-        return places.reshape(-1, g, 1) + np.arange(g), np.asarray(there.reshape(-1, g).all(axis=1))
+        places, there = entries.find(line, g * blocks.column)
+        return _lines(places, entries.indptr[line + 1] - entries.indptr[line], g), there
 
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
         """Take K's places if they are new; whether its values are (collective)."""
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
         fresh, changed = reduced(self.space.comm, np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
-            self._made_for, self._K, self._A = (K, P.free), Entries.as_in(K), None
-            # where Z crosses out, but for the diagonal
-            free = self.space.vector(P.free)
-            self._K.values[:] = 1.0
-            self._K.mat.diagonalScale(free, free)
-            held = np.flatnonzero(~P.free)
-            self._held = self._K.find(held, held + self._first)[0]
-            self._K.values[self._held] = 1.0
-            self._crossed = np.flatnonzero(self._K.values == 0.0)
+            self._made_for, self._A = (K, P.free), None
+            self._K = Entries.within(K) or Entries.as_in(K)
             self._beyond = self._places_beyond()
+            self._free_beyond = self.space.ask_owners(self._beyond.column, P.free.astype(float)) > 0.0
         return bool(changed)
 
     def _take(self, K: PETSc.Mat) -> None:
         """Take the values of K (collective)."""
-        K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._K.values[self._crossed] = 0.0
-        self._K.values[self._held] = self._stiff(self._held)
+        if self._K.mat == K:
+            # an assembly may have put them elsewhere
+            self._K = Entries.within(K)
+        else:
+            K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._state, self._changed = K.stateGet(), None
 
     def _places_beyond(self) -> Blocks:
@@ -227,10 +232,15 @@ class UnitedMatrix:
         row, column = lines[i] - n + self._first // g, self._K.columns[places] // g
         return Blocks(row, column.astype(np.int64), np.column_stack([places, width]))
 
-    def _make_places(self, begins: bool, changes: Blocks, P: Restriction, Q: Restriction, G: Blocks | None) -> None:
-        """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective)."""
+    def _make_places(
+        self, begins: bool, changes: Blocks, there: Bools | None, P: Restriction, Q: Restriction, G: Blocks | None
+    ) -> None:
+        """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective).
+
+        ``there (k,)`` tells of the changes, if known, whether K has them.
+        """
         comm = self.space.comm
-        wanted = self._missing(changes)
+        wanted = self._missing(changes, there)
         if self.reserving:
             trial = P.reserved()
             more, _ = self._changes(trial, trial if Q is P else Q.reserved(), G)
@@ -247,9 +257,9 @@ class UnitedMatrix:
             self._filled = both if few else wanted
         self._create()
 
-    def _missing(self, blocks: Blocks) -> Ints:
-        """Keys of those blocks that K lacks."""
-        _, there = self._find(self._K, blocks)
+    def _missing(self, blocks: Blocks, there: Bools | None = None) -> Ints:
+        """Keys of those blocks that K lacks, of which ``there (k,)`` it has, if known."""
+        there = self._find(self._K, blocks)[1] if there is None else there
         new = blocks.some(~there)
         first = self.space.first
         line = new.row - first + np.where(self.space.owner_of(new.column) == self.space.comm.rank, 0, self.space.n_owned)
@@ -258,32 +268,44 @@ class UnitedMatrix:
     def _create(self) -> None:
         """Make the matrix, with the entries of K and those that were filled (collective)."""
         K, g = self._K, self.space.block
-        k = np.arange(g)
+        # lines of nodes, each of g lines of components with the same columns
         line, column = np.divmod(self._filled, self._size)
-        shape = (len(line), g, g)
-        new = np.broadcast_to((g * line[:, None] + k)[:, :, None], shape).ravel()
-        columns = np.broadcast_to((g * column[:, None] + k)[:, None, :], shape).ravel()
-        counts = np.bincount(new, minlength=len(K.indptr) - 1)
-        shift, grown = np.append(0, np.cumsum(counts)), counts > 0
-        starts = (K.indptr + shift).astype(K.indptr.dtype)
-        old, line = K.of(grown)
-        all_columns = np.empty(starts[-1], K.columns.dtype)
-        merged = np.append(K.columns[old], columns)
-        at, order = entries_of(np.flatnonzero(grown), starts)[0], np.lexsort((merged, np.append(line, new)))
-        place = np.empty_like(at)
-        place[order] = at
-        all_columns[place] = merged
-        #: Where the entries of lines that have more come from, and where they went to.
-        self._moved = old, place[: len(old)]
+        counts = np.bincount(line, minlength=(len(K.indptr) - 1) // g)
+        widths = np.diff(K.indptr)[::g] + g * counts
+        starts = np.append(0, np.cumsum(np.repeat(widths, g))).astype(K.indptr.dtype)
+        values, all_columns = np.zeros(starts[-1]), np.empty(starts[-1], K.columns.dtype)
+        grown = np.flatnonzero(counts)
+        places, i, width = blocks_of(grown, K.indptr, g)
+        lines, columns = np.append(grown[i], line), np.append(K.columns[places] // g, column).astype(K.columns.dtype)
+        order = np.lexsort((columns, lines))
+        lines, sorted_columns = lines[order], columns[order]
+        before = np.arange(len(order)) - np.searchsorted(lines, lines)
+        there = np.empty((len(order), g), K.indptr.dtype)
+        there[order] = _lines(starts[g * lines] + g * before, widths[lines], g)
+        all_columns[_along(there[order], g)] = (g * sorted_columns[:, None] + np.arange(g, dtype=K.columns.dtype))[:, None]
+        #: Lines of blocks where others are new: those of K, and where they went to.
+        self._moved = _lines(places, width, g), there[: len(places)]
+        #: Lines of blocks that K lacks.
+        self._empty = there[len(places) :]
         #: Where the lines between those that have grown went to, and where they come from.
         self._runs = []
-        ends = np.flatnonzero(grown)
-        begins, ends = np.append(0, ends + 1), np.append(ends, len(counts))
-        for a, b, by in zip(K.indptr[begins], K.indptr[ends], shift[begins]):
+        begins, ends = np.append(0, g * (grown + 1)), np.append(g * grown, len(K.indptr) - 1)
+        for a, b, c in zip(K.indptr[begins], K.indptr[ends], starts[begins]):
             if a < b:
-                self._runs.append((slice(a + by, b + by), slice(a, b)))
-        for there, here in self._runs:
-            all_columns[there] = K.columns[here]
-        self._A, self._changed = Entries(starts, all_columns, K.mat), None
-        #: Where K has no entry.
-        self._empty = place[len(old) :]
+                self._runs.append((slice(c, c + b - a), slice(a, b)))
+        for to, here in self._runs:
+            all_columns[to] = K.columns[here]
+        self._A, self._changed = Entries.of_arrays(starts, all_columns, values, K.mat), None
+        held = np.flatnonzero(~self._made_for[1])
+        #: Places of prescribed components' diagonal, in K and in the matrix.
+        self._held = tuple(entries.find(held, held + self._first)[0] for entries in (K, self._A))
+
+
+def _lines(places: Ints, width: Ints, g: int) -> Ints:
+    """Places of the lines of blocks ``(k, g)``, from those of the first and the number of entries in each line ``(k,)``."""
+    return places[:, None] + width[:, None] * np.arange(g, dtype=width.dtype)
+
+
+def _along(lines: Ints, g: int) -> Ints:
+    """Places of the entries of blocks ``(k, g, g)`` from those of their lines ``(k, g)``."""
+    return lines[:, :, None] + np.arange(g, dtype=lines.dtype)
