@@ -75,6 +75,6 @@ def test_candidates_against_all_pairs(monkeypatch, gap, angle):
     i, f = opposite._candidates(target, y, middle, radius, np.full(len(x), 1.5 * gap + 0.1), planes.normal)
     assert len(looked_at[0][0]) <= 50 * len(x)
     every = [a.ravel() for a in np.meshgrid(np.arange(len(x)), np.arange(len(y)), indexing="ij")]
-    s = overlap(planes.take(every[0]), (shape, x[every[0]]), (shape, y[every[1]]), -np.ones(len(every[0])))
+    s = overlap(planes, (shape, x), (shape, y[every[1]]), -np.ones(len(x)), every[0])
     upon = np.unique(s.pair)
     assert len(upon) > len(x) and set(zip(*(a[upon] for a in every))) <= set(zip(i, f))

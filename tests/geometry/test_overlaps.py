@@ -15,6 +15,8 @@ from uem_dolfinx.geometry.overlaps import Planes, clip, locate, overlap
 from uem_dolfinx.geometry.shapes import facet_shape
 
 KINDS = [("interval", 1), ("interval", 2), ("triangle", 1), ("triangle", 2), ("quadrilateral", 1), ("quadrilateral", 2)]
+#: Contactor facet of a single pair.
+ONE = np.zeros(1, dtype=np.int64)
 
 
 def polygon(rng, corners, spread=1.0):
@@ -88,7 +90,7 @@ def test_integrals_over_a_segment(cell):
     sign = np.array([1.0 if cell != "interval" else -1.0])
     planes = Planes.of(shape, x[None], sign)
     assert planes.normal[0] == pytest.approx(np.eye(x.shape[1])[-1])
-    s = overlap(planes, (shape, x[None]), (shape, y[None]), sign)
+    s = overlap(planes, (shape, x[None]), (shape, y[None]), sign, ONE)
     # the second facet's inclined plane is z = 0.1 + tilt x
     size = {"interval": 0.75, "quadrilateral": 0.75, "triangle": 0.75**2 / 2}[cell]
     middle = {"interval": 0.625, "quadrilateral": 0.625, "triangle": 0.5}[cell]
@@ -102,7 +104,7 @@ def test_slivers():
     for part in (3e-13, 3e-12):
         shape, x, y = pair_of("interval", 1.0 - part)
         planes = Planes.of(shape, x[None], np.array([-1.0]))
-        found.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([-1.0])).pair) > 0)
+        found.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([-1.0]), ONE).pair) > 0)
     assert found == [False, True]
 
 
@@ -113,7 +115,7 @@ def test_facets_that_are_affine():
         shape, x, y = pair_of("quadrilateral", 0.25)
         x[3, 0] += bend
         planes = Planes.of(shape, x[None], np.array([1.0]))
-        counts.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0])).pair))
+        counts.append(len(overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]), ONE).pair))
     assert counts[0] == counts[1] < counts[2]
 
 
@@ -130,7 +132,7 @@ def test_slivers_change_no_integrals():
             for _ in range(first):
                 y = y[turn]
             planes = Planes.of(shape, x[None], np.array([1.0]))
-            s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]))
+            s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]), ONE)
             sizes.add(len(s.pair))
             found.append([s.weight.sum(), (s.weight * s.gap).sum(), (s.weight * s.gap * s.xi[:, 0] * s.eta[:, 1]).sum()])
         assert np.ptp(found, axis=0).max() <= 5e-10
@@ -143,7 +145,7 @@ def test_products_that_are_no_polynomials():
     y = np.array([[-1.0, -1.0, 0.1], [3.0, -1.0, 0.1], [-1.0, 3.0, 0.1], [3.0, 3.0, 0.1]])
     x[3, :2] += [0.25, -0.15]
     planes = Planes.of(shape, x[None], np.array([1.0]))
-    s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]))
+    s = overlap(planes, (shape, x[None]), (shape, y[None]), np.array([1.0]), ONE)
     found = s.weight @ shape.functions(s.xi)
     gauss, w = np.polynomial.legendre.leggauss(12)
     xi = np.stack(np.meshgrid(0.5 * gauss + 0.5, 0.5 * gauss + 0.5, indexing="ij"), axis=-1).reshape(-1, 2)

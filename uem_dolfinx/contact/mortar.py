@@ -160,7 +160,8 @@ class Mortar(Contactors):
         else:
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
         segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
-        b, phi = self.basis.at(segments.xi), surface.shape.functions(segments.xi)
+        phi = surface.shape.functions(segments.xi)
+        b = phi if surface.shape.degree == 1 else self.basis.at(segments.xi)
         radius, offset = None, None
         if config.axisymmetric:
             radius = np.einsum("qa,qa->q", phi, x[facets][pairs[segments.pair], :, 0])
@@ -230,16 +231,17 @@ class Mortar(Contactors):
         keys = self.surface.keys[facets]
         found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.told(facets))
         e = found.facet
-        s = overlap(planes.take(e), (self.surface.shape, x[e]), (shape, found.x), self.surface.sign[facets[e]])
+        s = overlap(planes, (self.surface.shape, x), (shape, found.x), self.surface.sign[facets], e)
         # what lies behind the facets in reach is no contact
         weight = np.bincount(s.pair, s.weight, minlength=len(e))
         mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
-        kept = ((weight > 0) & (np.abs(mean) <= reach[e]))[s.pair]
-        s = Segments(s.pair[kept], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
-        to_gap = slopes(shape, found.x, planes.normal[e], s.pair, s.eta)
-        upon = np.unique(s.pair)
-        facing = np.column_stack([keys[e[upon]], found.key[upon]])
-        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes, found.x, None, facing)
+        upon = (weight > 0) & (np.abs(mean) <= reach[e])
+        kept, number = upon[s.pair], np.cumsum(upon) - 1
+        s = Segments(number[s.pair[kept]], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
+        e, y = e[upon], found.x[upon]
+        to_gap = slopes(shape, y, planes.normal[e], s.pair, s.eta)
+        facing = np.column_stack([keys[e], found.key[upon]])
+        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes[upon], y, None, facing)
 
     def _over_facets(self, planes: Planes, x: Array, least: Array) -> Pieces:
         """Whole facets against a rigid surface, which covers all that face it with cosines above ``least (m,)``."""

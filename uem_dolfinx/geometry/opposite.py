@@ -89,11 +89,14 @@ def _facing(
 ) -> Opposite:
     """Those candidates that face each other now, or have ``faced`` each other before, in order."""
     kept = -np.einsum("kg,kg->k", planes.normal[facet], Planes.of(shape, y, sign).normal) > FACING
-    if faced is not None:
+    if faced is not None and len(faced[1]):
         keys, before = faced
-        _, number = np.unique(np.concatenate([before, np.column_stack([keys[facet], key])]), axis=0, return_inverse=True)
+        unsure = np.flatnonzero(~kept)
+        asked = np.column_stack([keys[facet[unsure]], key[unsure]])
+        before = before[np.isin(before[:, 0], asked[:, 0])]
+        _, number = np.unique(np.concatenate([before, asked]), axis=0, return_inverse=True)
         number = number.ravel()
-        kept |= np.isin(number[len(before) :], number[: len(before)])
+        kept[unsure] = np.isin(number[len(before) :], number[: len(before)])
     i = np.flatnonzero(kept)
     i = i[np.lexsort((key[i], facet[i]))]
     return Opposite(facet[i], y[i], nodes[i], key[i])

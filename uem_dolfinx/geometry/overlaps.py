@@ -8,6 +8,7 @@ point lie on one line along n, and leave neither force nor moment behind.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import TypeAlias
 
 import numpy as np
@@ -118,31 +119,42 @@ def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:
 
 def _affine(shape: FacetShape, y: Array) -> bool:
     """Whether the maps of facets with nodes ``y (m, nn, fdim)`` in their planes are affine."""
+    if shape.affine:
+        return True
     corners = y[:, : shape.dim + 1]
     made = corners[:, :1] + np.einsum("af,mfe->mae", shape.nodes, corners[:, 1:] - corners[:, :1])
     return bool(np.abs(y - made).max(initial=0.0) <= STRAIGHT * np.abs(y - y[:, :1]).max(initial=0.0))
 
 
-def overlap(planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[FacetShape, Array], sign: Array) -> Segments:
+def overlap(
+    planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[FacetShape, Array], sign: Array, facet: Ints
+) -> Segments:
     """Segments of pairs of facets.
 
     Args:
-        planes: of the contactor facet of every pair ``(m,)``.
+        planes: of the contactor facets ``(m,)``.
         contactor: shape, and nodes of the facets ``(m, nc, gdim)``.
-        target: likewise ``(m, nt, gdim)``.
+        target: likewise, of every pair ``(k, nt, gdim)``.
         sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
+        facet: contactor facet of every pair ``(k,)``.
     """
     (shape, x), (other, y) = contactor, target
-    own, its = planes.coordinates(x), planes.coordinates(y)
-    meet = ((own.min(axis=1) < its.max(axis=1)) & (its.min(axis=1) < own.max(axis=1)))[:, :-1].all(axis=1)
-    pair = np.flatnonzero(meet)
-    planes, own, its, sign = planes.take(pair), own[pair], its[pair], sign[pair]
+    own, its = planes.coordinates(x), planes.take(facet).coordinates(y)
+    (low, high), (least, most) = _box(own), _box(its)
+    pair = np.flatnonzero(((low[facet] < most) & (least < high[facet]))[:, :-1].all(axis=1))
+    planes, own, its, sign = planes.take(facet[pair]), own[facet[pair]], its[pair], sign[facet[pair]]
     rule = quadrature(shape, _affine(shape, own[:, :, :-1]) and _affine(other, its[:, :, :-1]))
     place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, (shape, own), (other, its), sign, rule)
     xi, eta = locate(shape, own[place, :, :-1], at), locate(other, its[place, :, :-1], at)
     height = np.einsum("qa,qa->q", other.functions(eta), its[place, :, -1])
     height -= np.einsum("qa,qa->q", shape.functions(xi), own[place, :, -1])
     return Segments(pair[place], xi, eta, weight, height)
+
+
+def _box(places: Array) -> tuple[Array, Array]:
+    """Least and largest coordinates of facets with nodes at ``places (m, nn, f)``: ``(m, f)`` each."""
+    nodes = np.moveaxis(places, 1, 0)
+    return reduce(np.minimum, nodes), reduce(np.maximum, nodes)
 
 
 def _intervals(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
@@ -190,11 +202,16 @@ def clip(subject: Array, frame: Array) -> tuple[Array, Ints]:
         Corners ``(m, k + l, 2)`` and how many of them there are ``(m,)``.
     """
     m, k, _ = subject.shape
-    corners, count = subject, np.full(m, k)
+    left, corners, count = np.arange(m), subject, np.full(m, k)
     for a in range(frame.shape[1]):
-        start, along = frame[:, a], frame[:, (a + 1) % frame.shape[1]] - frame[:, a]
+        start, along = frame[left, a], frame[left, (a + 1) % frame.shape[1]] - frame[left, a]
         corners, count = _cut(corners, count, start, along)
-    return corners, count
+        # nothing is left of some
+        some = np.flatnonzero(count)
+        left, corners, count = left[some], corners[some], count[some]
+    every, counts = np.zeros((m, *corners.shape[1:])), np.zeros(m, dtype=np.int64)
+    every[left], counts[left] = corners, count
+    return every, counts
 
 
 def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array, Ints]:
@@ -203,8 +220,7 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     i = np.arange(k)
     real = i < count[:, None]
     inside_by = cross(along[:, None], corners - start[:, None])
-    after = np.where(i + 1 < count[:, None], i + 1, 0)
-    following, beyond_by = np.take_along_axis(corners, after[..., None], axis=1), np.take_along_axis(inside_by, after, axis=1)
+    following, beyond_by = (_following(values, count) for values in (corners, inside_by))
     inside = inside_by >= 0
     crosses = real & (inside != (beyond_by >= 0))
     drop = inside_by - beyond_by
@@ -218,6 +234,13 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     left = np.zeros((m, max(k + 1, int(count.max(initial=0))), 2))
     left[polygon, place] = np.where(which[:, None] == 0, corners[polygon, corner], met[polygon, corner])
     return left, count
+
+
+def _following(values: Array, count: Ints) -> Array:
+    """What the next corners of polygons have, by the number of these ``(m,)``, of ``values (m, k, ...)`` at their corners."""
+    after = np.roll(values, -1, axis=1)
+    after[np.arange(len(count)), count - 1] = values[:, 0]
+    return after
 
 
 def _fan(corners: Array, count: Ints) -> tuple[Array, Array]:

@@ -91,6 +91,8 @@ class Bodies:
             dynamics.hold(~self.free[: config.n_owned])
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
+        #: State of the values of K that it is of.
+        self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._inversions = Inversions(config) if check and config.moves else None
         self._fields: Any = None
@@ -167,7 +169,8 @@ class Bodies:
     def update_tangent(self) -> PETSc.Mat:
         """K at the present displacement, and its diagonal (collective)."""
         self.tangent.update()
-        self.stiffness = self._diagonal()
+        if self.stiffness is None or self._stiffness_of != self.tangent.K.stateGet():
+            self.stiffness, self._stiffness_of = self._diagonal(), self.tangent.K.stateGet()
         return self.tangent.K
 
     def initial_stiffness(self) -> Array:
