@@ -8,7 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra.entries import blocks_of
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Ints, sums_of_groups
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import Exchange
 
@@ -73,10 +73,10 @@ def _in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array,
 def summed(A: Blocks) -> Blocks:
     """The same matrix with each place once, sorted by row and column."""
     order = np.lexsort((A.column, A.row))
-    row, column, value = A.some(order)
+    row, column = A.row[order], A.column[order]
     new = np.ones(len(row), dtype=bool)
     new[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
-    return Blocks(row[new], column[new], np.add.reduceat(value, np.flatnonzero(new)) if len(row) else value)
+    return Blocks(row[new], column[new], sums_of_groups(A.value, np.flatnonzero(new), order) if len(row) else A.value)
 
 
 def to_owners(space: Nodes, A: Blocks) -> Blocks:

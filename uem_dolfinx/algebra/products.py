@@ -68,8 +68,8 @@ class UnitedMatrix:
         self._filled: Ints = np.zeros(0, np.int64)
         #: Whether a step begins.
         self._begins = False
-        #: Places where the last update changed what is K's, of blocks' lines and of single entries, and what was there.
-        self._changed: tuple[tuple[Ints, Array], tuple[Ints, Array]] | None = None
+        #: Where the last update changed what is K's: blocks and places of their lines, places of single entries in the matrix and in K.
+        self._changed: tuple[Blocks, Ints, Ints, Ints] | None = None
 
     def begin_step(self) -> None:
         """Let no place depend on the steps before this one: a run that goes on from a checkpoint takes the same."""
@@ -95,31 +95,34 @@ class UnitedMatrix:
         if begins or reduced(self.space.comm, int(not there.all())):
             self._make_places(begins, changes, there if begins else None, P, Q, G)
             lines, _ = self._find(self._A, changes)
+        self._bring_values()
         values, g, nodes = self._A.values, self.space.block, P.united
-        if self._changed is None:
-            self._copy_values()
-        else:
-            (blocks, of_blocks), (single, of_single) = self._changed
-            values[_along(blocks, g)], values[single] = of_blocks, of_single
         idle = (g * nodes[:, None] + np.arange(g))[~P.used[nodes]].astype(np.int64)
         held, own = (entries.find(idle, idle + self._first)[0] for entries in (self._A, self._K))
-        places = _along(lines, g)
-        self._changed = (lines, values[places]), (held, values[held])
-        values[places] = np.where(adding[:, None, None], self._changed[0][1], 0.0) + changes.value
+        self._changed = changes._replace(value=np.zeros(0)), lines, held, own
+        changes.value[adding] += values[_along(lines[adding], g)]
+        values[_along(lines, g)] = changes.value
         values[held] = self._stiff(own)
         self._A.mat.assemble()
 
-    def _copy_values(self) -> None:
-        """Bring K's values into the matrix as those of ZKZ, with the diagonal of K where it is crossed out (collective)."""
+    def _bring_values(self) -> None:
+        """Bring K's values into the matrix, or back, as those of ZKZ, with the diagonal of K where it is crossed out (collective)."""
         values, g = self._A.values, self.space.block
-        for to, here in self._runs:
-            values[to] = self._K.values[here]
-        old, new = self._moved
-        values[_along(new, g)] = self._K.values[_along(old, g)]
-        values[_along(self._empty, g)] = 0.0
-        free, (own, there) = self.space.vector(self._made_for[1]), self._held
+        if self._changed is None:
+            for to, here in self._runs:
+                values[to] = self._K.values[here]
+            old, new = self._moved
+            values[_along(new, g)] = self._K.values[_along(old, g)]
+            values[_along(self._empty, g)] = 0.0
+        else:
+            blocks, lines, held, own = self._changed
+            old, there = self._find(self._K, blocks)
+            values[_along(lines[there], g)] = self._K.values[_along(old[there], g)]
+            values[_along(lines[~there], g)] = 0.0
+            values[held] = self._K.values[own]
+        free, (own, held) = self.space.vector(self._made_for[1]), self._held
         self._A.mat.diagonalScale(free, free)
-        values[there] = self._stiff(own)
+        values[held] = self._stiff(own)
 
     def _stiff(self, places: Ints) -> Array:
         """Entries of K at ``places (k,)`` of its diagonal, a large one where there is none, as in bodies that are rigid ``(k,)``."""

@@ -18,7 +18,7 @@ from math import comb, factorial
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_groups
 from uem_dolfinx.geometry.overlaps import Segments
 from uem_dolfinx.geometry.shapes import FacetShape
 
@@ -129,7 +129,7 @@ def add_up(place: Ints, values: Array, n: int) -> Array:
     out = np.zeros((n, values.shape[1]))
     if len(place):
         first = np.flatnonzero(np.diff(place, prepend=-1))
-        out[place[first]] = np.add.reduceat(values, first, axis=0)
+        out[place[first]] = sums_of_groups(values, first)
     return out
 
 

@@ -24,6 +24,10 @@ from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import Motions, Sides, dual_tangents, ring_of, skew, sum_of_products
 from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
+#: Pairs of facets whose second derivatives are made at once, in a few times the memory that these take.
+#: [bound; pairs; -]
+AT_ONCE = 1000
+
 
 def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
     """Minus the second derivatives of weighted gaps times their multipliers, those of the target's ends among them.
@@ -35,7 +39,12 @@ def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
     Returns:
         Lists of global nodes ``(p, c)`` and symmetric blocks ``(p, c gdim, c gdim)``.
     """
-    parts = [at.curvature(pressure)]
+    pressing, parts = np.flatnonzero(pressure.any(axis=1)), []
+    last = np.cumsum(np.bincount(at.facet, minlength=len(pressure))[pressing])
+    for some in np.split(pressing, np.flatnonzero(np.diff(last // AT_ONCE)) + 1):
+        alone = np.zeros_like(pressure)
+        alone[some] = pressure[some]
+        parts.append(at.curvature(alone))
     if at.other is not None:
         which = at.partly_covered()
         which = which[(pressure[at.facet[which]] != 0).any(axis=1)]

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_groups
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -192,9 +192,9 @@ def add_up_terms(*parts: Terms) -> Terms:
         return row, term, value
     key = row * (term.max() + 1) + term
     order = np.argsort(key, kind="stable")
-    row, term, value = row[order], term[order], value[order]
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    return row[first], term[first], np.add.reduceat(value, first, axis=0)
+    each = order[first]
+    return row[each], term[each], sums_of_groups(value, first, order)
 
 
 def with_terms(equations: UnitingEquations, terms: Terms) -> UnitingEquations:

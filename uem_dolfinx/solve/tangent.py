@@ -161,10 +161,10 @@ def curvature_of(
     """
     parts = [part for pair in pairs if pair.sliding == "finite" for part in pair.curvature()]
     parts += [] if linear is None else linear.curvature()
-    if convex:
-        parts = [(nodes, convex_part(blocks)) for nodes, blocks in parts]
-    if not apart:
-        parts = [(nodes, 0.5 * (blocks + blocks.transpose(0, 2, 1))) for nodes, blocks in parts]
+    for i, (nodes, blocks) in enumerate(parts):
+        # one after the other takes the place of what it was made of
+        blocks = convex_part(blocks) if convex else blocks
+        parts[i] = nodes, blocks if apart else 0.5 * (blocks + blocks.transpose(0, 2, 1))
     # a plane has none
     if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
         return None
