@@ -5,15 +5,18 @@ A form of another mesh or space would be assembled with the numbers of other nod
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any, TypeAlias
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
 from ufl.algorithms.remove_complex_nodes import remove_complex_nodes
 from ufl.core.expr import Expr
-from ufl.differentiation import Derivative
+from ufl.corealg.traversal import unique_pre_traversal
+from ufl.differentiation import CompoundDerivative, Derivative
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
@@ -62,11 +65,28 @@ def _arguments(what: str, form: Any, domain: Any, fault: str, expected: str) -> 
     _check_mesh(what, form, domain)
     try:
         arguments = form.arguments()
-        # as form compilers do: the conj of ufl.inner is none of a real form
-        check_form_arity(remove_complex_nodes(ufl.algorithms.expand_derivatives(form)), arguments)
+        # gradients are linear, and take longer to be expanded than all the rest
+        if not (_is_expanded(form) and _holds_once(apply_algebra_lowering(form), arguments)):
+            # as form compilers do: the conj of ufl.inner is none of a real form
+            check_form_arity(remove_complex_nodes(ufl.algorithms.expand_derivatives(form)), arguments)
     except (Exception, ArityMismatch) as error:  # of which class depends on the version of UFL
         raise InputError(f"{what} is {fault} ({error}): expected {expected}") from error
     return arguments
+
+
+def _is_expanded(form: ufl.Form) -> bool:
+    """Whether a form holds no derivatives but those in space."""
+    parts = chain.from_iterable(unique_pre_traversal(integral.integrand()) for integral in form.integrals())
+    return not any(isinstance(part, Derivative) and not isinstance(part, CompoundDerivative) for part in parts)
+
+
+def _holds_once(form: ufl.Form, arguments: Any) -> bool:
+    """Whether every term holds all arguments once, as far as that is seen before gradients are expanded."""
+    try:
+        check_form_arity(remove_complex_nodes(form), arguments)
+    except (Exception, ArityMismatch):
+        return False
+    return True
 
 
 def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
