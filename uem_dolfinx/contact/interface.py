@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.nothing_near import NothingNear
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.contact.told import Told
 from uem_dolfinx.errors import NotFiniteError
@@ -102,8 +103,8 @@ class Interface(Told):
     def _project(self) -> None:
         if self.tie is not None and not self.tie.begin_placement():
             return
-        first = not hasattr(self, "kinematics")
-        self.kinematics = self.discretisation.place(self.points, self.trial)
+        first, how = not hasattr(self, "kinematics"), self.discretisation
+        self.kinematics = NothingNear.at(how, self.points) if how.far else how.place(self.points, self.trial)
         if self.kinematics.idle and not first:
             return
         p = self.projection
@@ -432,7 +433,6 @@ class Interface(Told):
     def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
         """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
         self.committed, self.reserved, self.redundant, self.barred = memory
-        self.discretisation.far = False
         if self.tie is not None:
             # what has been tied since then stays so
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied

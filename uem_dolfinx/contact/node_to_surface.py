@@ -85,10 +85,6 @@ class NodeToSurface(OnTarget):
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
-        if self.far:
-            from uem_dolfinx.contact.nothing_near import NothingNear
-
-            return NothingNear.at(self, points)
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.kinematics import Constraints, Traction
-from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
+from uem_dolfinx.contact.node_to_surface import NodalKinematics
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.search import MeshTarget
 
@@ -15,8 +17,8 @@ class NothingNear(NodalKinematics):
     """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
 
     @classmethod
-    def at(cls, of: NodeToSurface, points: Array) -> NothingNear:
-        """Of contactors at ``points (n, gdim)``."""
+    def at(cls, of: Any, points: Array) -> NothingNear:
+        """Of the contactors of a ``NodeToSurface`` at ``points (n, gdim)``."""
         p = of.target.nowhere(points) if isinstance(of.target, MeshTarget) else of.target.project(points)
         return cls(of, points, p, p, p.gap, None, None)
 

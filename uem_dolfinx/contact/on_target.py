@@ -118,6 +118,7 @@ class OnTarget:
 
     def commit(self) -> None:
         """The next step is to find the feet anew; a rigid target that it moves is asked for them before."""
+        self.far = False
         if self.sliding == "small":
             self._renewing = True
             if not self.target.n_nodes:

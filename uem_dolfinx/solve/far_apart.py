@@ -21,7 +21,7 @@ from uem_dolfinx.geometry.search import MeshTarget
 
 #: Meshed surfaces whose boxes are farther from each other than this are far apart.
 #: [convention; the target's longest facet; test_far_apart.py::test_what_is_far_apart]
-NEARER = 1.0
+FACETS_AWAY = 1.0
 
 
 class Boxes(NamedTuple):
@@ -84,7 +84,7 @@ class FarApart:
         if some:
             config.comm.Allreduce(MPI.IN_PLACE, longest, op=MPI.MAX)
         #: What is near, and with offsets ``(n_pairs,)``; boxes where the bodies were when last asked.
-        self._reach = self._near = NEARER * longest
+        self._reach = self._near = FACETS_AWAY * longest
         self._boxes: Boxes
 
     def begin_step(self, falls: bool) -> None:
