@@ -51,6 +51,7 @@ add_module_names = False
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "uem_dolfinx"
+pygments_dark_style = "github-dark"
 html_static_path = ["site.css"]
 html_css_files = ["site.css"]
 html_copy_source = False
