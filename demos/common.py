@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import gc
 import json
 import logging
 import os
+import sys
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
@@ -65,6 +67,7 @@ def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(docstring or "").partition("\n")[0])
     parser.add_argument("--json", metavar="FILE", help="write the figures measured")
     parser.add_argument("--plot", metavar="FILE.png", help="draw a picture")
+    parser.add_argument("--setup", metavar="FILE.png", help="draw what the problem declares, and end")
     parser.add_argument("--output", metavar="DIR", help="write fields for ParaView and a CSV history")
     parser.add_argument("--verbose", action="store_true", help="show every Newton iteration, and where time went")
     words = explanations(docstring)
@@ -80,7 +83,39 @@ def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
         text = f"{words.get(name, '')} (default: {shown})".strip()
         parser.add_argument("--" + name.replace("_", "-"), default=default, help=text.replace("%", "%%"), **kind)
     logging.basicConfig(format="%(message)s")
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.setup:
+        draw_setup(args.setup, **of_sketch(Path(sys.argv[0]).stem))
+    return args
+
+
+def of_sketch(name: str) -> dict[str, Any]:
+    """What ``sketches.txt`` says of the sketch of a demo; nothing if it says nothing."""
+    lines = (Path(__file__).parent / "sketches.txt").read_text(encoding="utf-8").splitlines()
+    told = dict(line.split(": ", 1) for line in lines if not line.startswith("#"))
+    how = ast.literal_eval(told.get(name, "{}")) or {}
+    return {key: value for key, value in how.items() if key != "small"}
+
+
+def draw_setup(path: str, problem: int = 1, **how: Any) -> None:
+    """Let the script end by a picture of what a problem declares as soon as it has made it.
+
+    Args:
+        path: name of the picture.
+        problem: which of the problems that it makes, counted from 1.
+        how: arguments of ``uem.plot_setup``.
+    """
+    made = []
+
+    class Drawn(uem.UnitedProblem):
+        def __init__(self, *args: Any, **options: Any):
+            super().__init__(*args, **options)
+            made.append(self)
+            if len(made) == problem:
+                uem.plot_setup(self, path, **({"dpi": 110} | how))
+                raise SystemExit
+
+    uem.UnitedProblem = Drawn
 
 
 def cg(amg: str = "", rtol: float | None = None) -> dict[str, Any]:

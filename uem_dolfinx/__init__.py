@@ -47,8 +47,8 @@ __all__ = [
     "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric", "consistent_mass", "dirichlet",
     "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate",
     "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
-    "plot_pressure", "plot_scene", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test",
-    "time_steps", "timing", "timings", "write_checkpoint",
+    "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent",
+    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -132,7 +132,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
-    from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene
+    from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene, plot_setup
     from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
     from uem_dolfinx.solve.history import History, recording
@@ -150,6 +150,7 @@ _LATER = {
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
+    "plot_setup": "output.pictures",
     "ContactParameter": "contact.parameters",
     "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
     "History": "solve.history", "recording": "solve.history",

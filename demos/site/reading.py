@@ -56,6 +56,13 @@ class Entry:
         """The heading of the demo's page."""
         return re.search(r"^# # (.*)$", (DEMOS / f"{self.name}.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
 
+    @property
+    def sketch(self) -> list[str]:
+        """The line of Markdown that shows what the demo declares, if there is a picture of that."""
+        picture = f"pictures/{self.name}_setup.png"
+        words = "The scene: bodies, supports, loads, and what meets what"
+        return [f":::{{figure}} {picture}\n:alt: {words}\n:class: sketch\n:::"] if (DEMOS / picture).exists() else []
+
     def card(self) -> str:
         """A card with the title, the first picture and the text without its links."""
         picture = re.match(r"!\[(.*)\]\((.*)\)", self.pictures[0]) if self.pictures else None
@@ -128,7 +135,7 @@ def machinery(source: str) -> bool:
 
 
 def demo(text: str) -> NotebookNode:
-    """The notebook of a demo: title, picture, what was measured, the line that runs it and its options; then its cells."""
+    """The notebook of a demo: title, sketch, picture, what was measured, the line that runs it and its options; then its cells."""
     notebook = jupytext.reads(fitting(text), fmt="py:percent")
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook.metadata["language_info"] = {"name": "python"}
@@ -138,7 +145,7 @@ def demo(text: str) -> NotebookNode:
         title, _, rest = notebook.cells[0].source.partition("\n")
         shown = f"```sh\n{run}\n```\n" if run else ""
         entry = next((e for _, entries in gallery()[1].values() for e in entries if f"# {e.title}" == title), None)
-        pictures = "\n\n".join(entry.pictures) if entry else ""
+        pictures = "\n\n".join([*entry.sketch, *entry.pictures]) if entry else ""
         measured = f"**Measured:** {entry.measured}\n" if entry and entry.measured else ""
         notebook.cells[0].source = f"{title}\n{rest}\n\n{pictures}\n\n{measured}\n{shown}\n{options(text)}"
     for cell in notebook.cells:

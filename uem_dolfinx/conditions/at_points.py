@@ -97,9 +97,10 @@ class AtPoints:
         self, config: Configuration, declared: Sequence[PointLoad | PointSpring], couplings: Sequence[RigidCoupling] = ()
     ):
         self._config, self._couplings = config, list(couplings)
-        self._parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
+        #: What was declared, each with its owned nodes.
+        self.parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
         with agreed(config.comm):
-            for one, _ in self._parts:
+            for one, _ in self.parts:
                 one.force_and_stiffness(config.gdim)
         n = len(config.whole.x.array)
         #: Unknowns that the components of the nodes are ``(n_local, gdim)``.
@@ -108,7 +109,7 @@ class AtPoints:
     def add_forces(self, b: AnyArray) -> None:
         """Add what a residual, internal minus external forces, lacks at the owned unknowns ``(n,)`` (collective)."""
         config = self._config
-        for one, nodes in self._parts:
+        for one, nodes in self.parts:
             force, k = one.force_and_stiffness(config.gdim)
             np.subtract.at(b, self._unknowns[nodes], force if k is None else -config.displacement[nodes] @ k)
         for coupling in self._couplings:
@@ -117,7 +118,7 @@ class AtPoints:
     def loads(self) -> Array:
         """Forces but those of springs, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         found = np.zeros((self._config.n_owned, self._config.gdim))
-        for one, nodes in self._parts:
+        for one, nodes in self.parts:
             np.add.at(found, nodes, one.force_and_stiffness(self._config.gdim)[0])
         for coupling in self._couplings:
             found[coupling.nodes.nodes] += coupling.nodal_forces()
@@ -127,7 +128,7 @@ class AtPoints:
         """Energy that the springs have stored (collective)."""
         u, parts = (
             self._config.displacement,
-            [(nodes, one.force_and_stiffness(self._config.gdim)[1]) for one, nodes in self._parts],
+            [(nodes, one.force_and_stiffness(self._config.gdim)[1]) for one, nodes in self.parts],
         )
         own = sum(0.5 * float(np.einsum("ng,gh,nh->", u[nodes], k, u[nodes])) for nodes, k in parts if k is not None)
         return float(reduced(self._config.comm, float(own)))
@@ -135,7 +136,7 @@ class AtPoints:
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the springs to an assembled tangent (collective)."""
         config, g = self._config, self._config.gdim
-        for one, nodes in self._parts:
+        for one, nodes in self.parts:
             _, k = one.force_and_stiffness(g)
             for node in config.to_global(nodes) if k is not None else ():
                 rows = (node * g + np.arange(g)).astype(PETSc.IntType)

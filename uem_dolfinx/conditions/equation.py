@@ -105,6 +105,11 @@ class Equation:
         self._terms = [(where, given.vector(f"the vector of terms[{i}]", c)) for i, (where, c) in enumerate(terms)]
         self.b = checked_value("b", b, 1)
 
+    @property
+    def places(self) -> list[Any]:
+        """Where the nodes are that it is of."""
+        return [where for where, _ in self._terms]
+
     def n_values(self, block: int) -> int:
         """As of ``LinearEquations``."""
         return 1
@@ -146,6 +151,7 @@ class Periodic:
         jump: Value,
     ):
         self._follower, self._leader = follower, leader
+        self.places = [follower, leader]
         self._map = given.kind("map", map, map is None or callable(map), "a function of places (n, gdim), or None")
         self._turn = None if turn is None else _rotation(turn)
         self.b = checked_value("jump", jump, None)

@@ -49,6 +49,7 @@ class RigidCoupling:
 
     Attributes:
         name: that of the part.
+        point: as given ``(gdim,)``.
 
     Raises:
         InputError, InputTypeError: for values of another form, an inertia that no body has, or a motion or a mass of what is distributed.
@@ -69,8 +70,8 @@ class RigidCoupling:
         rotations: str | None = None,
     ):
         self.where, self.name = where, "a point" if is_point(where) else name_of(where)
-        self._point = given.vector("point", point)
-        g = len(self._point)
+        self.point = given.vector("point", point)
+        g = len(self.point)
         self._sizes = g, 1 if g == 2 else 3
         self._loads = checked_value("force", force, g), checked_value("moment", moment, self._sizes[1])
         self.distribute = given.flag("distribute", distribute)
@@ -109,12 +110,12 @@ class RigidCoupling:
         if self._set is not None:
             raise SpaceError(f"the RigidCoupling of '{self.name}' belongs to another problem: make a new one for every problem")
         with agreed(config.comm):
-            given.vector("the point of a RigidCoupling", self._point, config.gdim)
+            given.vector("the point of a RigidCoupling", self.point, config.gdim)
             if config.axisymmetric:
                 raise InputError(f"the RigidCoupling of '{self.name}': there are none on axisymmetric meshes; use Equation")
         nodes = nodes_at(config, self.where, f"the part of the RigidCoupling of '{self.name}'")
         large = finite if self._rotations is None else self._rotations == "large"
-        self._set = RigidSet(config, nodes, self._point, large)
+        self._set = RigidSet(config, nodes, self.point, large)
         arms = self._set.X - self._set.middle
         spread = reduced(config.comm, arms.T @ arms)
         sizes = np.linalg.eigvalsh(spread)
@@ -187,7 +188,7 @@ class RigidCoupling:
         ``near (n_turns,)`` is a rotation that tells the number of turns, None for the one that was known last.
         """
         at = self.nodes.placement(u)
-        shift = at.displacement(self._point[None])[0]
+        shift = at.displacement(self.point[None])[0]
         return np.append(shift, at.turn if at.small is not None else nearest_turn(at.turn, self.turns if near is None else near))
 
     # -- what users read ---------------------------------------------------------------------------------------------------
@@ -219,9 +220,9 @@ class RigidCoupling:
         config, own = self.nodes.config, forces[self.nodes.nodes]
         at = self.nodes.placement(config.displacement[: config.n_owned])
         if self.nodes.large:
-            arms = self.nodes.X + config.displacement[self.nodes.nodes] - self._point - at.displacement(self._point[None])
+            arms = self.nodes.X + config.displacement[self.nodes.nodes] - self.point - at.displacement(self.point[None])
         else:
-            arms = self.nodes.X - self._point
+            arms = self.nodes.X - self.point
         sums = reduced(config.comm, np.append(own.sum(axis=0), moments(arms, own).sum(axis=0)))
         held = np.isin(np.arange(len(sums)), list(self.prescribed))
         sums = np.where(held, sums, 0.0)

@@ -228,6 +228,11 @@ class GeneralContact:
                     raise SurfaceError(f"bodies: '{name}' and '{self._names[body]}' are one body: give each body one name")
                 self._names[body] = name
 
+    @property
+    def all_surfaces(self) -> Tag:
+        """Facets that may touch something, once a problem has been made."""
+        return self._skin.tag
+
     # -- results ---------------------------------------------------------------------------------------------------------
 
     @property

@@ -15,12 +15,12 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.frames import Frame, Gathering, Pieces
-from uem_dolfinx.output.sections import grid
+from uem_dolfinx.output.sections import Shape, grid
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it; forces that
-#: are less have no arrow; points that are nearer are one where outlines are looked for.
+#: are less have no arrow, and prescribed values are zero; points that are nearer are one where outlines are looked for.
 #: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
 #: Colour of what carries no contact pressure, and of rigid surfaces.
@@ -39,12 +39,8 @@ class Drawing:
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         gdim, pressed = problem.config.gdim, isinstance(field, Contact)
         with agreed(problem.comm):
-            refused = {"mirror": mirror} if gdim == 3 else {"view": view, "surface": surface}
-            for name, value in refused.items():
-                if value is not None and value is not False:
-                    raise InputError(
-                        f"{name} = {given.shown(value)} is for {5 - gdim}D scenes, this one is {gdim}D: leave it out"
-                    )
+            for name, value in ({"mirror": mirror} if gdim == 3 else {"surface": surface}).items():
+                _refuse_of_other_dimension(gdim, name, value)
             if np.ndim(levels) == 0:
                 levels = given.count("levels", levels)
             elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
@@ -54,17 +50,14 @@ class Drawing:
             elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
                 raise InputError(given.sentence("field", field, FIELD))
             scale = given.number("scale", scale)
-            if window is not None and not (np.diff(given.vector("window", window, 2 * gdim))[::2] > 0).all():
-                raise InputError(given.sentence("window", window, "on each axis a lower bound and a larger upper one"))
+            box = checked_window(gdim, window)
             if percentiles is not None:
                 least, most = given.vector("percentiles", percentiles, 2)
                 if not 0 <= least < most <= 100:
                     raise InputError(
                         given.sentence("percentiles", percentiles, "two of them, from 0 to 100, the smaller one first")
                     )
-            if gdim == 3:
-                toward = (1.0, 1.0, 1.0) if view is None or (isinstance(view, str) and view == "iso") else view
-                self.view = given.direction("view", toward, 3)  # type: ignore[arg-type]
+            self.view = checked_view(gdim, view)
         if gdim == 3:
             pictures3d.require(problem.comm)
         size = "|u|" if problem.config.moves else problem.u.name
@@ -74,7 +67,6 @@ class Drawing:
         #: Width of an image of a 3D scene in points.
         self.width = 1600
         self.comm = problem.comm
-        box = None if window is None else np.reshape(window, (-1, 2))
         gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface, box, rigid)
         self.take, self.pieces = gathering.take, gathering.pieces
 
@@ -82,6 +74,28 @@ class Drawing:
         """What draws these frames, on rank 0: window, colours and lengths of arrows are the same for all of them."""
         assert self.pieces is not None
         return (Drawn3D if frames[0].x.shape[1] == 3 else Drawn2D)(self, self.pieces, frames)
+
+
+def checked_view(gdim: int, view: str | Sequence[float] | None) -> Array:
+    """Direction from the scene to the eye ``(3,)``, with the errors of ``plot_scene``."""
+    if gdim == 2:
+        _refuse_of_other_dimension(gdim, "view", view)
+    return given.direction("view", (1.0, 1.0, 1.0) if view is None or (isinstance(view, str) and view == "iso") else view, 3)  # type: ignore[arg-type]
+
+
+def checked_window(gdim: int, window: Sequence[float] | None) -> Array | None:
+    """Bounds ``(gdim, 2)``, None for everything, with the errors of ``plot_scene``."""
+    if window is None:
+        return None
+    ends = given.vector("window", window, 2 * gdim).reshape(gdim, 2)
+    if not (np.diff(ends) > 0).all():
+        raise InputError(given.sentence("window", window, "on each axis a lower bound and a larger upper one"))
+    return ends
+
+
+def _refuse_of_other_dimension(gdim: int, name: str, value: Any) -> None:
+    if value is not None and value is not False:
+        raise InputError(f"{name} = {given.shown(value)} is for {5 - gdim}D scenes, this one is {gdim}D: leave it out")
 
 
 class Drawn(ABC):
@@ -203,13 +217,18 @@ class Drawn2D(Drawn):
     def _draw_rigid(self, ax: Any, frame: Frame) -> None:
         """Rigid targets, hatched behind their surface."""
         for shape in frame.rigid:
-            (x, y), points = grid(self.box, 400)
-            if self.how.mirror:
-                points[:, 0] = np.abs(points[:, 0])
-            height = shape.height(points).reshape(len(y), len(x))
-            if np.nanmin(height) < 0 < np.nanmax(height):
-                ax.contourf(x, y, height, levels=[np.nanmin(height), 0.0], colors=RIGID, hatches=["////"], alpha=0.6, zorder=0.5)
-                ax.contour(x, y, height, levels=[0.0], colors="k", linewidths=0.8, zorder=2)
+            draw_rigid(ax, shape, self.box, self.how.mirror)
+
+
+def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: Any) -> None:
+    """A rigid surface in a box ``(2, 2)``, hatched behind it; ``line`` is how it ends, as matplotlib's contours."""
+    (x, y), points = grid(box, 400)
+    if mirror:
+        points[:, 0] = np.abs(points[:, 0])
+    height = shape.height(points).reshape(len(y), len(x))
+    if np.nanmin(height) < 0 < np.nanmax(height):
+        ax.contourf(x, y, height, levels=[np.nanmin(height), 0.0], colors=RIGID, hatches=["////"], alpha=0.6, zorder=0.5)
+        ax.contour(x, y, height, levels=[0.0], **({"colors": "k", "linewidths": 0.8, "zorder": 2} | line))
 
 
 class Drawn3D(Drawn):
@@ -244,10 +263,10 @@ class Drawn3D(Drawn):
         ax.axis("off")
         ax.figure.colorbar(self.colours, ax=ax, label=self.how.label, shrink=0.85, extend=self.extend, spacing="proportional")
         if self.how.triad:
-            _draw_triad(ax, self.how.view)
+            draw_triad(ax, self.how.view)
 
 
-def _draw_triad(ax: Any, view: Array) -> None:
+def draw_triad(ax: Any, view: Array) -> None:
     """The axes of the scene as the eye sees them, in a corner of the panel."""
     right, up = pictures3d.screen(view)
     inset = ax.inset_axes((-0.06, -0.06, 0.16, 0.16))

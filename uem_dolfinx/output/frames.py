@@ -12,7 +12,7 @@ from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.output.sections import Shape, rigid_shapes, sections, solid_cells
@@ -91,7 +91,7 @@ class Gathering:
         self._cells = solid_cells(mesh) if solid else {}
         faces, edges = boundary(mesh, surface) if problem.config.gdim == 3 else None, np.zeros((0, 4), np.int64)
         if faces is None:
-            faces, edges = _vertex_cells(mesh)
+            faces, edges = vertex_cells(mesh)
         #: Vertices of this rank that are drawn.
         self._used = np.unique(faces)
         parts = problem.comm.gather((len(self._used), np.searchsorted(self._used, faces), np.searchsorted(self._used, edges)))
@@ -165,7 +165,7 @@ def vertex_positions(problem: UnitedProblem, scale: float) -> Array:
     return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
 
 
-def _vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
+def vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
     """Owned cells by d.o.f. of the P1 space: their triangles ``(n, 3)`` and outlines ``(n_cells, n_nodes + 1)``."""
     name, owned = compat.cell_name(mesh), mesh.topology.index_map(2).size_local
     dofs = compat.cell_dofs(compat.function_space(mesh, 1))[:owned].astype(np.int64)
@@ -179,6 +179,11 @@ def boundary(mesh: Any, surface: Part | None = None) -> Ints:
     Returns:
         Vertices in their order around each facet ``(n, n_vertices)``.
     """
+    return boundary_and_cells(mesh, surface)[0]
+
+
+def boundary_and_cells(mesh: Any, surface: Part | None = None) -> tuple[Ints, Indices]:
+    """As ``boundary``, and the cells behind the facets ``(n,)`` (collective)."""
     topology, tdim = mesh.topology, mesh.topology.dim
     topology.create_connectivity(tdim - 1, tdim)
     facets = np.asarray(exterior_facet_indices(topology))
@@ -187,7 +192,7 @@ def boundary(mesh: Any, surface: Part | None = None) -> Ints:
     corners = np.array(forms.reference_topology(compat.cell_name(mesh))[tdim - 1])
     cells, sides = forms.cells_of_facets(mesh, facets)
     dofs = compat.cell_dofs(compat.function_space(mesh, 1)).astype(np.int64)
-    return np.asarray(dofs[cells[:, None], corners[sides][:, AROUND[corners.shape[1]]]])
+    return np.asarray(dofs[cells[:, None], corners[sides][:, AROUND[corners.shape[1]]]]), cells
 
 
 def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:

@@ -18,7 +18,8 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part
-from uem_dolfinx.output.drawings import Drawing
+from uem_dolfinx.output import pictures3d
+from uem_dolfinx.output.drawings import Drawing, checked_view, checked_window
 from uem_dolfinx.output.frames import gather_contactors
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -168,6 +169,82 @@ def plot_scene(
             # margins are cut off
             drawing.width = max(drawing.width, round(2.0 * panel.get_window_extent().width))
             drawing.over([frame]).draw(panel, frame)
+    return Picture(file.getvalue()) if picture is ... else None
+
+
+def plot_setup(
+    problem: UnitedProblem,
+    picture: str | Path | Any = ...,
+    *,
+    at: float | None = None,
+    loads: bool = True,
+    arrows: Sequence[tuple[Any, Any, str]] = (),
+    cells: bool = False,
+    window: Sequence[float] | None = None,
+    view: str | Sequence[float] | None = None,
+    legend: bool = True,
+    triad: bool = True,
+    size: tuple[float, float] = (6.4, 4.8),
+    dpi: float = 150,
+) -> Picture | None:
+    """Draw what a problem declares: its undeformed bodies, where they are held, what moves and loads them, what meets what (collective).
+
+    Each body has its grey. Contactors and targets have colours of their own, with their names; rigid targets are hatched, in 3D seen
+    through. What is held in all components is hatched, in 3D dark; a triangle, in 3D a cone, points along a component that is held from
+    outside. Arrows are prescribed displacements, motions of rigid surfaces, loads on surfaces and points, forces on bodies, gravity
+    and the velocity at the start; those of displacements and velocities are as long as they are large, the others tell directions.
+
+    Args:
+        problem: the scene.
+        picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
+            Jupyter shows it.
+        at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; all is as
+            it was after that. None is the full load in statics, and the present time in dynamics.
+        loads: find the loads that are terms of the residual: it is assembled without displacement, what it integrates over surfaces apart.
+        arrows: what else acts, such as what is prescribed later: places, directions ``(gdim,)`` and names.
+        cells: draw the edges of the cells.
+        window: as of :func:`plot_scene`; nothing is cut.
+        view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
+        legend: name what is drawn.
+        triad: draw the axes in a corner; 3D only.
+        size: width and height in inches; of a panel it is that of :func:`figure`.
+        dpi: points per inch; of a panel it is that of :func:`figure`.
+
+    Returns:
+        The picture if it has neither name nor panel.
+
+    Raises:
+        MissingBackendError: if matplotlib cannot be imported, or in 3D PyVista.
+        InputError, InputTypeError: for an argument that is none in this dimension, or out of its range.
+        UserFunctionError: if a function in ``load`` raises.
+    """
+    from uem_dolfinx.output.declared import Declarations
+    from uem_dolfinx.output.sketches import Look, draw_2d, draw_3d
+
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    gdim = problem.config.gdim
+    with agreed(problem.comm):
+        toward, box = checked_view(gdim, view), checked_window(gdim, window)
+        loads, cells, legend, triad = (
+            given.flag(name, value) for name, value in (("loads", loads), ("cells", cells), ("legend", legend), ("triad", triad))
+        )
+        if at is not None:
+            at = given.number("at", at)
+        elif problem.dynamics is None and problem.stage is None:
+            at = 1.0
+        for one in arrows:
+            given.kind("arrows", arrows, isinstance(one, Sequence) and len(one) == 3, "a list of places, directions and names")
+        more = [
+            (given.vector("a place in arrows", place, gdim), given.direction("a direction in arrows", way, gdim), str(name))
+            for place, way, name in arrows
+        ]
+    if gdim == 3:
+        pictures3d.require(problem.comm)
+    found, file = Declarations(problem, at, loads).found, BytesIO()
+    with _panel(file if picture is ... else picture, problem.comm, size, dpi) as panel:
+        if panel is not None and found is not None:
+            width = max(1600, round(2.0 * panel.get_window_extent().width))
+            (draw_2d if gdim == 2 else draw_3d)(panel, found, Look(more, cells, box, toward, legend, triad, width))
     return Picture(file.getvalue()) if picture is ... else None
 
 

@@ -99,8 +99,13 @@ def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:
     Raises:
         InputError: if nothing is in the window.
     """
-    with _quiet():
+    with quiet():
         found = [_image(faces, solid, look) for solid in solids]
+    return without_margins(found)
+
+
+def without_margins(found: Sequence[Array]) -> list[Array]:
+    """Images of the same size without what is empty on all of them."""
     seen = np.any([image[..., 3] > 0 for image in found], axis=0)
     rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
     return [image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] for image in found]
@@ -134,33 +139,43 @@ def _image(faces: Ints, solid: Solid, look: Look) -> Array:
                 show_edges=edges, edge_color="black", edge_opacity=0.3, line_width=line, ambient=0.75, diffuse=0.25, specular=0.0,
             )  # fmt: skip
     for surface in (skin, section):
-        outline = _inside(_outline(surface, look.same), look)
+        outline = _inside(outlines(surface, look.same), look)
         if outline.n_cells:
             plotter.add_mesh(outline, color="black", line_width=2.0 * line)
     for shape in solid.rigid:
-        _add_rigid(plotter, shape, look)
+        add_rigid(plotter, shape, look.box)
     at, to = solid.arrows
     shown = ((at >= look.box[:, 0]) & (at <= look.box[:, 1])).all(axis=1)
     if shown.any():
         plotter.add_arrows(at[shown], to[shown], color="white", show_edges=True, edge_color="gray", line_width=line)
+    return taken(plotter, look.view, look.box)
+
+
+def taken(plotter: Any, view: Array, box: Array) -> Array:
+    """The image of what is in a plotter, which is closed, from a direction ``(3,)``, so that a box ``(3, 2)`` fills it."""
     plotter.enable_anti_aliasing("ssaa")
-    plotter.view_vector(look.view, screen(look.view)[1])
-    plotter.reset_camera(bounds=look.box.ravel())
+    plotter.view_vector(view, screen(view)[1])
+    plotter.reset_camera(bounds=box.ravel())
     image = np.array(plotter.screenshot(None, transparent_background=True, return_img=True))
     plotter.close()
     return image
 
 
 def _polygons(points: Array, faces: Ints, values: Array) -> Any:
-    """PyVista's surface of these facets."""
-    import pyvista
-
-    surface = pyvista.PolyData(points, np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel())
+    """PyVista's surface of these facets, with values at their vertices."""
+    surface = polygons(points, faces)
     surface["values"] = values
     return surface
 
 
-def _outline(surface: Any, same: float) -> Any:
+def polygons(points: Array, faces: Ints) -> Any:
+    """PyVista's surface of these facets."""
+    import pyvista
+
+    return pyvista.PolyData(points, np.column_stack([np.full(len(faces), faces.shape[1]), faces]).ravel())
+
+
+def outlines(surface: Any, same: float) -> Any:
     """Edges of a surface, whose facets may come from several ranks, at which it ends or turns."""
     whole = surface.clean(tolerance=same, absolute=False)
     if whole.n_cells:
@@ -177,20 +192,20 @@ def _inside(surface: Any, look: Look) -> Any:
     return surface
 
 
-def _add_rigid(plotter: Any, shape: Shape, look: Look) -> None:
-    """A rigid surface in the box, where its function vanishes; bodies are seen through it."""
+def add_rigid(plotter: Any, shape: Shape, box: Array, color: str = "lightsteelblue", opacity: float = 0.45) -> None:
+    """A rigid surface in a box ``(3, 2)``, where its function vanishes; bodies are seen through it."""
     import pyvista
 
-    axes, points = grid(look.box, 60)
+    axes, points = grid(box, 60)
     volume = pyvista.RectilinearGrid(*axes)
     volume["height"] = shape.height(points)
     surface = volume.contour([0.0], scalars="height")
     if surface.n_cells:
-        plotter.add_mesh(surface, color="lightsteelblue", opacity=0.45, show_scalar_bar=False, smooth_shading=True)
+        plotter.add_mesh(surface, color=color, opacity=opacity, show_scalar_bar=False, smooth_shading=True)
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """VTK warns where there is no screen before it does without one."""
     from vtkmodules.vtkCommonCore import vtkLogger
 

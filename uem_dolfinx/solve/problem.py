@@ -175,7 +175,8 @@ class UnitedProblem:
         #: Contacts as they were declared, and all that they consist of: a general one is several.
         ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
         self.declared: list[Contact | GeneralContact] = contacts
-        self._ties = [tie.name for tie in ties]
+        #: What else was declared: ties of a scalar field, linear equations, and couplings.
+        self.ties, self.equations, self.couplings = ties, equations, couplings
         self.contacts: list[Contact] = parts_of(contacts, self.config)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
@@ -255,7 +256,7 @@ class UnitedProblem:
         dofmap = self.u.function_space.dofmap
         size = f"{dofmap.index_map_bs * dofmap.index_map.size_global} unknowns in {config.gdim}D"
         kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
-        names = ", ".join(map(repr, self._ties + [contact.name for contact in self.contacts])) or "none"
+        names = ", ".join(map(repr, [contact.name for contact in [*self.ties, *self.contacts]])) or "none"
         return f"UnitedProblem({size}, {kind}, contacts: {names}, steps committed: {self.progress.steps})"
 
     # -- one step ----------------------------------------------------------------------------------------------------
