@@ -286,8 +286,10 @@ class Bodies:
         Raises:
             NotFiniteError: if it is so.
         """
-        if not np.isfinite(self._u.norm()):
+        if not np.isfinite(size := self._u.norm()):
             raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
+        if np.finfo(float).eps * size <= facets:
+            return
         far = reduced(self.comm, float(np.abs(self.config.displacement).max(initial=0.0)), op=MPI.MAX)
         if np.finfo(float).eps * far > facets:
             raise NotFiniteError(

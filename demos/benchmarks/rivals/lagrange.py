@@ -65,7 +65,7 @@ class LagrangeSystem(BodySystem):
         """Saddle-point matrix, and what drives the step, as the united system would feel it."""
         if iteration is not None:
             self._differentiate(first=iteration == 0)
-        curvature = self._curvature
+        curvature = self.curvature
         equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
         self._c = self.config.vector(self.bodies.prescribed)

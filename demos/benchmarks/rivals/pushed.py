@@ -98,7 +98,7 @@ class PushedSystem(ABC):
     def place(self) -> None:
         """Project the contactors."""
         if self.pairs:
-            self.bodies.check_displacement()
+            self.bodies.check_displacement(min(pair.target.stride for pair in self.pairs))
             for pair in self.pairs:
                 pair.project()
 
