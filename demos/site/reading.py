@@ -30,7 +30,7 @@ def options(text: str) -> str:
                 choices = isinstance(option.value, ast.Tuple)
                 values = " or ".join(f"`{ast.unparse(v)}`" for v in (option.value.elts if choices else [option.value]))
                 rows.append(f"| `--{option.arg.replace('_', '-')}` | {explained.get(option.arg, '')} | {values} |")
-    head = "**Options**, beside `--plot FILE.png`, `--json FILE` and `--output DIR`:\n\n"
+    head = "**Options**, beside `--plot FILE.png`, `--setup FILE.png`, `--json FILE` and `--output DIR`:\n\n"
     head += "| option | meaning | default, the first of several choices |\n|---|---|---|\n"
     return head + "\n".join(rows) + "\n" if rows else ""
 

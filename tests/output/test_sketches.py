@@ -224,6 +224,62 @@ def test_temperatures_and_ties():
     assert [one.name.split(": ")[1] for one in found.surfaces] == ["tied", "tied to"]
 
 
+def test_bodies_of_revolution():
+    """The axis is told, and forces on a body are those on all of it."""
+    s, V, u, left, right = bar()
+    uem.axisymmetric(s.mesh)
+    v = ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.3, kind="axisymmetric").residual(u, v) * ufl.dx - ufl.dot(ufl.as_vector((2.0, -3.0)), v) * ufl.dx
+    found = declared(uem.UnitedProblem(F, u, bcs=clamp(V, left, 0)))
+    if found is not None:
+        (body,) = acting(found, "body load")
+        assert found.axis and np.allclose(body.vectors, [[0.0, -3.0 * 4.0 * np.pi]])
+
+
+def test_sections_that_carry_a_force():
+    """Both parts of a bolt are drawn to each other."""
+    b = blocks(COMM, "quadrilateral")
+    bolt = uem.Preload(b.high, b.low, force=0.02)
+    found = declared(uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.0), contacts=[bolt]))
+    if found is not None:
+        assert [one.name for one in found.surfaces] == ["high: preloaded", "low: preloaded"]
+        down, up = acting(found, "load")
+        np.testing.assert_allclose(down.at, [[0.5, 0.0]], atol=1e-14)
+        np.testing.assert_allclose([down.vectors[0], up.vectors[0]], [[0.0, -1.0], [0.0, 1.0]], atol=1e-14)
+
+
+def test_other_fields():
+    """Where a pressure beside the displacement is prescribed, and what of the displacement."""
+    s, _, _, left, right = bar()
+    W = uem.function_space(s.mesh, [("Lagrange", 1, (2,)), 1])
+    w, (v, q) = fem.Function(W), ufl.TestFunctions(W)
+    u, p = ufl.split(w)
+    F = (ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) + ufl.inner(ufl.grad(p), ufl.grad(q))) * ufl.dx
+    bcs = [uem.dirichlet(W.sub(0), left, c) for c in range(2)] + [uem.dirichlet(W.sub(1), right, value=3.0)]
+    found = declared(uem.UnitedProblem(F, w, displacement=0, bcs=bcs))
+    if found is not None:
+        (value,) = found.acting
+        assert value.name == "prescribed value of field 1" and len(value.at) == 3 and np.allclose(value.at[:, 0], 2.0)
+        assert measure(found.clamped[0]).sum() == pytest.approx(1.0)
+
+
+def test_names_of_many_contacts():
+    """Those of contacts tell surfaces apart that several of them have, and beyond so many there is one pair of colours."""
+    for count in (2, 7):
+        b = blocks(COMM, "quadrilateral", gap=0.2)
+        floors = [uem.RigidPlane((0.0, -2.0 - k), (0.0, 1.0)) for k in range(count)]
+        contacts = [uem.Contact(b.low, floor, name=f"floor {k}", max_penetration=9.0) for k, floor in enumerate(floors)]
+        found = declared(uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.1), contacts=contacts))
+        if found is None:
+            continue
+        assert [one.name for one in found.surfaces] == [f"low: contactor (floor {k})" for k in range(count)]
+        assert [one.layer for one in found.surfaces] == list(range(count))
+        assert found.rigid[1].name == "rigid plane: target (floor 1)"
+        sketch = Sketch(found, Look([], False, None, np.ones(3), True, True, 1600))
+        assert {sketch.name_surface(one) for one in found.surfaces} == {PAIRS[k][0] for k in range(2 if count == 2 else 1)}
+        assert len({name for kind, name in sketch.names if kind == "surface"}) == (2 if count == 2 else 1)
+
+
 def test_rounding_is_not_prescribed():
     """Components that a Function prescribes as rounding are held, those that are a little larger are moved."""
     for size, held in ((3e-10, 1), (3e-9, 0)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -54,7 +54,7 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
         for one in (*F.constants(), *F.coefficients())
         if one is not problem.u and isinstance(one, (fem.Constant, fem.Function))
     ]
-    terms += load if isinstance(load, dict) else []
+    terms += load if isinstance(load, Mapping) else []
     kept = [(forms.values_of(one), np.array(forms.values_of(one))) for one in terms]
     targets = [contact.target for contact in problem.contacts if isinstance(contact.target, RigidSurface)]
     motions = [target.motion for target in targets]
@@ -62,8 +62,8 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
     try:
         _set_load(problem, at)
         yield
-    finally:
         _set_load(problem, now)
+    finally:
         for values, before in kept:
             values[...] = before
         for target, motion in zip(targets, motions):
@@ -73,7 +73,7 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
 def _set_load(problem: UnitedProblem, at: float) -> None:
     """What a problem's ``load`` and its couplings set at a load factor or time; nothing of contacts (collective)."""
     load = problem.load
-    if isinstance(load, dict):
+    if isinstance(load, Mapping):
         for constant, value in load.items():
             what = f"the load of a Constant at {at:.6g}"
             set_constant(constant, ask_together(problem.comm, what, value, at) if callable(value) else value * at)
