@@ -11,11 +11,14 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
+from benchmarks.scenes import scene as create_scene
 from body_scenes import Bodies, Discs, ball, close, dimension, grid, oedometer, surface_of
 from dolfinx import fem
-from helpers import M, blocks, box, clamp, highest, linear, modulus, run, slow, st_venant
+from helpers import M, at, blocks, box, clamp, highest, linear, modulus, run, slow, st_venant
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
 from uem_dolfinx.contact.sliding import Sliding
 
 COMM = MPI.COMM_WORLD
@@ -180,6 +183,52 @@ def test_a_joint_with_a_step(mu):
 
 
 # -- it does not matter how it is drawn --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "nodes_of", "tie_by", "coupling"),
+    [
+        ("tie", "upper", "node_to_surface", "node_to_surface"),
+        ("tie", "lower", "mortar", "node_to_surface"),
+        ("preload", "lower", "mortar", "node_to_surface"),
+        ("tie", "upper", "mortar", "mortar"),
+        ("preload", "lower", "node_to_surface", "mortar"),
+    ],
+)
+def test_sections_that_are_tied(kind, nodes_of, tie_by, coupling):
+    """Two loose plates on a base, tied or bolted over a section of their joint, whatever follows what; tied they are as one plate."""
+    cell = "quadrilateral"
+    base = box(cell, [-0.5, -1.0], [4.5, 0.0], [10, 1])
+    plates = [box(cell, [0.0, 0.5 * k], [4.0, 0.5 * k + 0.5], [8, 1]) for k in (0, 1)]
+    found = []
+    for parts in (plates, [box(cell, [0.0, 0.0], [4.0, 1.0], [8, 2])]):
+        s = create_scene(COMM, cell, [*parts, base])
+        V = compat.function_space(s.mesh, 1, (2,))
+        u, v, n = fem.Function(V, name="u"), ufl.TestFunction(V), len(parts)
+        bottom = s.tag("bottom", n, at(1, -1.0))
+        push = forms.surface_measure(s.mesh, s.tag("top", n - 1, at(1, 1.0)).entities)
+        contacts = [general := uem.GeneralContact(friction=0.8, coupling=coupling)]
+        if n == 2:
+            section = [
+                s.tag(f"section {k}", k, lambda x: (abs(x[:, 1] - 0.5) < 1e-9) & (abs(x[:, 0] - 2.0) < 0.6)) for k in (1, 0)
+            ]
+            section = section if nodes_of == "upper" else section[::-1]
+            joint = uem.Contact(*section, tied=True, coupling=tie_by)
+            if kind == "preload":
+                joint = uem.Preload(*section, force=0.002, coupling=tie_by)
+            contacts.append(joint)
+        F = linear(u, 1.0) - (0.0005 * v[0] - 0.005 * v[1]) * push
+        problem = uem.UnitedProblem(F, u, bcs=clamp(V, bottom), contacts=contacts, rtol=1e-11)
+        run(problem)
+        assert np.allclose(problem.reaction(bottom), (-0.002, 0.02), rtol=1e-9)
+        top = np.isclose(s.drawing[:, 1], 1.0)
+        found.append(s.gather(u)[top][np.argsort(s.drawing[top, 0])])
+        if n == 2 and coupling == "node_to_surface":
+            # nodes at the border of the section are tied, too
+            own = [part.pair.trial.active[np.isin(part.pair.nodes, joint.nodes)].sum() for part in general.parts]
+            assert COMM.allreduce(int(sum(own))) == 0
+    if kind == "tie":
+        assert np.abs(found[0] - found[1]).max() <= 1e-9 * np.abs(found[1]).max()
 
 
 def heap(order=(0, 1, 2), *, turn=0.0, length=1.0, stress=1.0, mu=0.0, comm=COMM, **how):

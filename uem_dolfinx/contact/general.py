@@ -47,7 +47,7 @@ class GeneralContact:
         surfaces: parts that may touch, named as for ``Contact``; None is all exterior facets.
         rigid: rigid surfaces that all of them may touch: one, or a list.
         exclude: parts that touch nothing, and pairs of parts ``(one, other)`` that never touch each other, of facets or of cells. What
-            another ``Contact`` of the same problem names against each other is left to it.
+            another ``Contact`` of the same problem names against each other is left to it; nodes that it ties touch nothing beside it.
         order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer first.
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
@@ -139,7 +139,8 @@ class GeneralContact:
         self.taken, self._config = True, config
         alone = [one for one in self.exclude if not _is_pair(one)]
         pairs = [one for one in self.exclude if _is_pair(one)]
-        pairs += [(c.contactor, c.target) for c in others if not hasattr(c.target, "project")]
+        others = [c for c in others if not hasattr(c.target, "project")]
+        pairs += [(c.contactor, c.target) for c in others]
         surface = _surface(config, self.surfaces, [_part(config, part, "exclude") for part in alone])
         self._skin = skin = Skin(config, surface)
         place = skin.order([_part(config, part, "order") for part in self.order])
@@ -158,7 +159,11 @@ class GeneralContact:
             )
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
-            apart = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
+            apart: list[Apart] = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
+            if self.coupling != "mortar":
+                # nodes at the border of what is tied are tied: they touch nothing beside it
+                tied = [False] * (len(pairs) - len(others)) + [c.tied is True for c in others]
+                apart = [_with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
             among = self._mortar if self.coupling == "mortar" else self._nodes
             parts += among(nodes, place, itself, apart, bound, options)
         for i, target in enumerate(self.rigid):
@@ -384,6 +389,18 @@ def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag
     if reduced(config.comm, len(left)) == 0:
         raise SurfaceError("general contact: exclude leaves no facet that may touch: leave some out of exclude")
     return Tag("all surfaces", 0, facets, mesh, left.astype(np.int32))
+
+
+def _with_border(skin: Skin, sets: Apart) -> Apart:
+    """Two sets of facets with those beside them, which have a node in common (collective)."""
+    config = skin.config
+
+    def more(nodes: Bools) -> Bools:
+        there = config.ask_owners(skin.nodes.ravel(), nodes[: config.n_owned, None].astype(float))
+        return np.asarray((there.reshape(skin.nodes.shape) > 0).any(axis=1))
+
+    one, _, other, _ = sets
+    return one, more(one), other, more(other)
 
 
 def _where(skin: Skin, part: Part, role: str) -> tuple[Bools, Bools]:

@@ -80,8 +80,8 @@ class FieldScales:
         """
         K, _ = self._known()
         of_displacement = np.where(self._by_displacement, np.abs(K), 0.0)
-        rounding = np.bincount(self._row, np.finfo(float).eps * size * of_displacement, len(self._unknowns.field))
-        return self._of_others(np.asarray(rounding, dtype=float))
+        each = np.bincount(self._row, np.finfo(float).eps * size * of_displacement, len(self._unknowns.field))
+        return self._of_others(np.asarray(each, dtype=float))
 
     def above(self, F: Array, part: float) -> Array:
         """Norm of the residual ``F (n_rows * gdim,)`` where it is more than a part of the terms, none for the displacement (collective)."""

@@ -58,10 +58,14 @@ class OverConstraints:
         # bodies that follow each other in one order never follow each other both ways
         ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
         one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
-        self.mutual: Bools = (meets & meets.T & ~one_order).any(axis=1)
-        for pair, mutual in zip(pairs, self.mutual):
+        both_ways = meets & meets.T & ~one_order
+        self.mutual: Bools = both_ways.any(axis=1)
+        # what is tied as a whole never touches: its surfaces meet others beside it alone
+        tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
+        refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
+        for pair, mutual, wrong in zip(pairs, self.mutual, refused):
             pair.mutual = bool(mutual)
-            if mutual and not pair.discretisation.two_pass:
+            if wrong and not pair.discretisation.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
