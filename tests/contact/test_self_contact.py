@@ -10,35 +10,15 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from body_scenes import skin_of
+from body_scenes import fork, skin_of
 from dolfinx import fem
-from helpers import Body, at, box, refused, run, scene, slow
+from helpers import at, box, refused, run, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
 
 COMM = MPI.COMM_WORLD
-
-
-def without(body: Body, hole) -> Body:
-    """A body without the cells whose middles ``hole`` tells, and without nodes that no cell has."""
-    cells = body.cells[~hole(body.x[body.cells].mean(axis=1))]
-    used = np.unique(cells)
-    place = np.full(len(body.x), -1)
-    place[used] = np.arange(len(used))
-    return Body(body.x[used], place[cells])
-
-
-def fork(cell, n=1, more=0.0):
-    """A fork of two prongs of thickness 0.4 that are 0.1 apart, the lower one longer by ``more``."""
-    g = 2 if cell in ("triangle", "quadrilateral") else 3
-    whole = box(cell, [-0.4, -0.45, 0.0][:g], [2.4, 0.45, 0.4][:g], [28 * n, 18 * n, 2][:g])
-
-    def hole(x):
-        return (x[:, 0] > 0) & (np.abs(x[:, 1]) < 0.05) | (x[:, 0] > 2) & (x[:, 1] > 0) | (x[:, 0] > 2 + more) & (x[:, 1] < 0)
-
-    return without(whole, hole)
 
 
 def closed(cell, angle=0.0, load=4e-3, steps=4, degree=1, more=0.0, normals="facet", **how):

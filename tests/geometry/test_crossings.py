@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from body_scenes import skin_of
+from helpers import box, rotation
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.crossings import find_crossings
 
 
@@ -38,3 +42,42 @@ def test_crossings_are_those_of_a_slow_search(seed, g, size):
     for i, time, inwards, normal in expected:
         match = (found.point == i) & (found.inwards == inwards) & (np.abs(found.time - time) < 1e-3)
         assert match.any() and np.abs(found.normal[match] - normal).max(axis=1).min() < 0.1
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("g", [2, 3])
+def test_ways_as_seen_from_facets(g, size):
+    """What moves rigidly by any angle crosses nothing; what else moves crosses the same facets if all turns by up to a right angle."""
+    rng = np.random.default_rng(0)
+    p, x, sign = rng.normal(size=(40, g)), rng.normal(size=(30, g, g)), rng.choice([-1.0, 1.0], 30)
+    q = p + rng.normal(size=p.shape)
+    still = find_crossings((size * p, size * x), (size * q, size * x), sign, 0.0)
+    key = np.lexsort((still.facet, still.point))
+    assert len(key) > 20 and np.allclose(still.way, size * np.linalg.norm(q - p, axis=1)[still.point], rtol=1e-12)
+    for angle in (0.0, 0.5, 1.5, np.pi, 5.0):
+        turned = [size * (a @ rotation(g, angle).T) for a in (p, q, x)]
+        start = size * p, size * x
+        assert len(find_crossings(start, (turned[0], turned[2]), sign, 0.0, turning=True).point) == 0
+        if angle > 1.5:
+            continue
+        found = find_crossings(start, (turned[1], turned[2]), sign, 0.0, turning=True)
+        order = np.lexsort((found.facet, found.point))
+        for name in ("point", "facet", "inwards"):
+            assert (getattr(found, name)[order] == getattr(still, name)[key]).all()
+        assert np.allclose(found.time[order], still.time[key], atol=1e-9)
+        assert np.allclose(found.normal[order], still.normal[key] @ rotation(g, angle).T, atol=1e-9)
+
+
+def test_each_body_is_carried_along():
+    """Bodies that turn by angles of their own come where they are; one that is stretched too keeps its middle and its angle."""
+    bodies = [box("triangle", [x, 0.0], [x + 1.0, 0.5], [4, 2]) for x in (0.0, 2.0)]
+    _, skin = skin_of("triangle", bodies)
+    config, body, angles = skin.config, skin.body_of_node, (3.0, -1.0)
+    turns = np.stack([rotation(2, angle) for angle in angles])[body]
+    X = config.X
+    now = np.einsum("nij,nj->ni", turns, X) + 1.0
+    assert np.abs(carried_along(config, body, 2, X, now) - now).max() < 1e-13
+    stretched = np.einsum("nij,nj->ni", turns, X * [1.5, 1.0])
+    middle = np.array([[0.5, 0.25], [2.5, 0.25]])[body]
+    expected = np.einsum("nij,nj->ni", turns, X - middle + middle * [1.5, 1.0])
+    assert np.abs(carried_along(config, body, 2, X, stretched) - expected).max() < 1e-13

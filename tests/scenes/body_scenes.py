@@ -10,7 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
-from helpers import at, box, clamp, highest, linear, modulus, scene, st_venant
+from helpers import Body, at, box, clamp, highest, linear, modulus, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -42,6 +42,26 @@ def turned(body, angle):
     R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     middle = 0.5 * (body.x.min(axis=0) + body.x.max(axis=0))
     return body.mapped(lambda x: middle + (x - middle) @ R.T)
+
+
+def without(body: Body, hole) -> Body:
+    """A body without the cells whose middles ``hole`` tells, and without nodes that no cell has."""
+    cells = body.cells[~hole(body.x[body.cells].mean(axis=1))]
+    used = np.unique(cells)
+    place = np.full(len(body.x), -1)
+    place[used] = np.arange(len(used))
+    return Body(body.x[used], place[cells])
+
+
+def fork(cell, n=1, more=0.0):
+    """A fork of two prongs of thickness 0.4 that are 0.1 apart, the lower one longer by ``more``."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    whole = box(cell, [-0.4, -0.45, 0.0][:g], [2.4, 0.45, 0.4][:g], [28 * n, 18 * n, 2][:g])
+
+    def hole(x):
+        return (x[:, 0] > 0) & (np.abs(x[:, 1]) < 0.05) | (x[:, 0] > 2) & (x[:, 1] > 0) | (x[:, 0] > 2 + more) & (x[:, 1] < 0)
+
+    return without(whole, hole)
 
 
 def all_facets(mesh, name="all"):

@@ -32,6 +32,13 @@ def rigid_velocities(arm: Array) -> Array:
     return np.concatenate([shifts, np.stack(turns, axis=1)], axis=1)
 
 
+def rotations(sums: Array) -> Array:
+    """Rotations that turn vectors a nearest to vectors b, from ``sums`` of ``b a'``, ``(k, g, g)``."""
+    left, _, right = np.linalg.svd(sums)
+    left[:, :, -1] *= np.where(np.linalg.det(left @ right) < 0, -1.0, 1.0)[:, None]
+    return np.asarray(left @ right)
+
+
 _FOUND: WeakKeyDictionary[Nodes, tuple[Ints, int]] = WeakKeyDictionary()
 
 
@@ -91,3 +98,25 @@ def body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
     out = np.zeros((count, *values.shape[1:]))
     np.add.at(out, body, values)
     return np.asarray(reduced(comm, out))
+
+
+def carried_along(nodes: Nodes, body: Ints, count: int, before: Array, now: Array) -> Array:
+    """Where nodes would be had each body moved as one since ``before``, as far as it has, but rigidly ``(n_local, gdim)`` (collective).
+
+    Args:
+        nodes: the nodes.
+        body: of each local node ``(n_local,)``.
+        count: of bodies.
+        before: where nodes were ``(n_local, gdim)``.
+        now: where they are.
+    """
+    own, g = slice(nodes.n_owned), before.shape[1]
+
+    def means(values: Array) -> Array:
+        sums = body_sums(nodes.comm, np.column_stack([values[own], np.ones(nodes.n_owned)]), body[own], count)
+        return np.asarray(sums[:, :-1] / np.maximum(sums[:, -1:], 1.0))
+
+    there, here = np.split(means(np.column_stack([before, now])), 2, axis=1)
+    a, b = before - there[body], now - here[body]
+    R = rotations(means((b[:, :, None] * a[:, None]).reshape(-1, g * g)).reshape(-1, g, g))
+    return np.asarray(here[body] + np.einsum("nij,nj->ni", R[body], a))

@@ -1,7 +1,8 @@
 """Where straight ways of points cross moving facets: the exact times, and whether they lead into the body or out of it.
 
 Facets are cut into simplices between neighbouring nodes, whose nodes move straight as the points do: the height of a point over the
-plane of its simplex is a cubic of time (in 2D a square), which is bracketed between its extremes.
+plane of its simplex is a cubic of time (in 2D a square), which is bracketed between its extremes. Of one body that turns and bends ways
+are straight as seen from the facets, which turn with what is around them.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
-from uem_dolfinx.geometry.search import ON_SIDE
+from uem_dolfinx.geometry.bodies import rotations
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.parallel import Exchange
 
 #: Halvings that find a time to the last bit.
 #: [bound; halvings; -]
@@ -25,12 +28,16 @@ class Crossings:
 
     Attributes:
         point: which point crosses ``(k,)``.
+        facet: which simplex, or number over all ranks of the facet that it is a piece of ``(k,)``.
+        way: length of the point's way as seen from there ``(k,)``.
         time: when, 0 at the start and 1 at the end of its way ``(k,)``.
         inwards: whether it enters the body ``(k,)``, or leaves it.
         normal: outward unit normals there and then ``(k, gdim)``.
     """
 
     point: Ints
+    facet: Ints
+    way: Array
     time: Array
     inwards: Bools
     normal: Array
@@ -42,6 +49,7 @@ def find_crossings(
     sign: Array,
     reach: float,
     meet: Callable[[Ints, Ints], Bools] | None = None,
+    turning: bool = False,
 ) -> Crossings:
     """Crossings of ``n`` points with ``m`` simplices of ``gdim`` nodes each, all of which move straight.
 
@@ -51,14 +59,21 @@ def find_crossings(
         sign: 1 where a simplex is numbered so that its normal points out of its body, -1 where it points inwards ``(m,)``.
         reach: length by which each point's way is continued at both ends: points that rest on a facet cross it.
         meet: which of points and simplices ``(k,)`` each count; None are all.
+        turning: whether ways are straight as seen from the simplices, which turn, instead of in space.
     """
     (p0, x0), (p1, x1) = start, end
-    i, f = _near(p0, p1, x0, x1, reach)
+    i, f = _near(p0, p1, x0, x1, reach, not turning)
     if meet is not None:
         some = meet(i, f)
         i, f = i[some], f[some]
-    p0, p1, x0, x1 = p0[i], p1[i], x0[f], x1[f]
-    way = np.linalg.norm(p1 - p0 - (x1 - x0).mean(axis=1), axis=1)
+    if turning:
+        p0, x0 = _carried_along(p0, x0, x1, i, f)
+    else:
+        p0, x0 = p0[i], x0[f]
+    p1, x1 = p1[i], x1[f]
+    pass_by, way = _pass_by(p0, p1, x0, x1, reach)
+    i, f = i[pass_by], f[pass_by]
+    p0, p1, x0, x1, way = (a[pass_by] for a in (p0, p1, x0, x1, way))
     further = np.minimum(reach / np.where(way > 0, way, np.inf), 1.0)
 
     def height(t: Array, k: Ints) -> tuple[Array, Array, Array]:
@@ -81,18 +96,107 @@ def find_crossings(
         low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
     _, x, n = height(high, k)
     met = _contain_origin(x)
-    return Crossings(i[k[met]], high[met], falls[met], n[met] / np.linalg.norm(n[met], axis=1, keepdims=True))
+    k, n = k[met], n[met]
+    return Crossings(i[k], f[k], way[k], high[met], falls[met], n / np.linalg.norm(n, axis=1, keepdims=True))
 
 
-def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Ints, Ints]:
-    """Points and simplices whose ways can meet, ``(k,)`` each: balls about both ways intersect, and so do boxes."""
+def cross_target(
+    target: MeshTarget,
+    which: Ints,
+    points: tuple[Array, Array],
+    nodes: tuple[Array, Array],
+    reach: float,
+    told: Ints,
+    meet: Callable[[Ints, Ints], Bools],
+    turning: bool = False,
+) -> Crossings:
+    """Crossings of points with a target whose facets are spread over ranks, on the points' own ranks (collective).
+
+    Args:
+        target: the surface.
+        which: what the points are called ``(k,)``.
+        points: at the beginning and at the end ``(k, gdim)`` each.
+        nodes: of this rank's facets likewise ``(m, nn, gdim)`` each.
+        reach: as of ``find_crossings``.
+        told: what facets' ranks have to know of the points ``(k, ...)``.
+        meet: tells of which of these and of this rank's facets ``(k,)`` crossings count.
+        turning: as of ``find_crossings``.
+    """
+    comm, (p0, p1), g, pieces = target.comm, points, points[0].shape[1], target.shape.pieces
+    low, high = _boxes(p0[:, None], p1[:, None], turning)
+    x0, x1 = (x[:, pieces].reshape(-1, g, g) for x in nodes)
+    lowest, highest = _boxes(x0, x1, turning)
+    box = np.array([lowest.min(axis=0, initial=np.inf) - reach, highest.max(axis=0, initial=-np.inf) + reach])
+    rows = [np.flatnonzero(((low <= b[1]) & (high >= b[0])).all(axis=1)) for b in comm.allgather(box)]
+    there = Exchange(comm, rows)
+    q0, q1, number, told, home = there.send(p0, p1, which, told, np.full(len(which), comm.rank))
+    sign = np.repeat(target.facets.sign, len(pieces))
+    found = find_crossings((q0, x0), (q1, x1), sign, reach, lambda i, f: meet(told[i], f // len(pieces)), turning)
+    back, facet = Exchange.to(comm, home[found.point]), found.facet // len(pieces) + target.first[comm.rank]
+    return Crossings(*back.send(number[found.point], facet, found.way, found.time, found.inwards, found.normal))
+
+
+def entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
+    """Pairs of an entry and a later exit of the same point ``(k,)`` each, and the exits that no entry comes before."""
+    ins, outs = np.flatnonzero(found.inwards), np.flatnonzero(~found.inwards)
+    ins = ins[np.argsort(found.point[ins], kind="stable")]
+    first, last = (np.searchsorted(found.point[ins], found.point[outs], side=side) for side in ("left", "right"))
+    leaving = np.repeat(outs, last - first)
+    begins = np.repeat(np.cumsum(last - first) - (last - first), last - first)
+    entry = ins[np.repeat(first, last - first) + np.arange(len(leaving)) - begins]
+    later = found.time[leaving] > found.time[entry]
+    entry, leaving = entry[later], leaving[later]
+    return entry, leaving, np.setdiff1d(outs, leaving)
+
+
+def _carried_along(p0: Array, x0: Array, x1: Array, i: Ints, f: Ints) -> tuple[Array, Array]:
+    """Where points ``p0 (n, gdim)`` and simplices ``x0 (m, gdim, gdim)`` would be had they gone rigidly as simplices go to ``x1``.
+
+    Returns:
+        Points ``i (k,)`` had they gone with simplices ``f (k,)``, ``(k, gdim)``, and these ``(k, gdim, gdim)``.
+    """
+    middle, there = x0.mean(axis=1), x1.mean(axis=1)
+    some, which = np.unique(f, return_inverse=True)
+    a, b = (np.concatenate([x[:, 1:] - x[:, :1], _normals(x, as_long=True)[:, None]], axis=1) for x in (x0[some], x1[some]))
+    turned = rotations(np.einsum("mai,maj->mij", b, a))[which]
+    arms = np.concatenate([p0[i, None], x0[f]], axis=1) - middle[f, None]
+    carried = there[f, None] + np.einsum("kij,kaj->kai", turned, arms)
+    return carried[:, 0], carried[:, 1:]
+
+
+def _pass_by(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Bools, Array]:
+    """Which points come near the middles of simplices, as far as their nodes lie from these, and lengths of ways from there ``(k,)``."""
+    middles = x0.mean(axis=1), x1.mean(axis=1)
+    radius = np.stack([np.linalg.norm(x - m[:, None], axis=2).max(axis=1, initial=0.0) for x, m in zip((x0, x1), middles)])
+    a, b = p0 - middles[0], p1 - middles[1]
+    way = b - a
+    squares = np.einsum("kg,kg->k", way, way)
+    nearest = np.clip(-np.einsum("kg,kg->k", a, way) / np.where(squares > 0, squares, 1.0), 0.0, 1.0)
+    by = np.linalg.norm(a + nearest[:, None] * way, axis=1)
+    return np.asarray(by <= radius.max(axis=0) + reach), np.sqrt(squares)
+
+
+def _boxes(start: Array, end: Array, balls: bool = False) -> tuple[Array, Array]:
+    """Lower and upper corners of the boxes about ways of nodes ``(m, k, gdim)``, or about the balls about these ``(m, gdim)``."""
+    both = np.concatenate([start, end], axis=1)
+    low, high = both.min(axis=1), both.max(axis=1)
+    if not balls:
+        return low, high
+    middle, radius = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1, keepdims=True)
+    return middle - radius, middle + radius
+
+
+def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float, boxes: bool) -> tuple[Ints, Ints]:
+    """Points and simplices whose ways can meet, ``(k,)`` each: balls about both ways intersect, and so do ``boxes``.
+
+    Balls hold those as well whose ways meet as seen from a simplex that turns by a right angle or less.
+    """
     none = np.zeros(0, np.int64)
     if not len(p0) or not len(x0):
         return none, none
     from scipy.spatial import cKDTree
 
-    both = np.concatenate([x0, x1], axis=1)
-    low, high = both.min(axis=1), both.max(axis=1)
+    low, high = _boxes(x0, x1)
     radius = 0.5 * np.linalg.norm(high - low, axis=1)
     found = []
     # a graded mesh does not pay for its largest facet everywhere
@@ -103,16 +207,20 @@ def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Int
         hits = cKDTree(0.5 * (low + high)[members]).query_ball_point(0.5 * (p0 + p1), arm, return_sorted=False)
         for i, hit in enumerate(hits):
             f = members[np.asarray(hit, dtype=np.int64)]
-            meets = (np.minimum(p0[i], p1[i]) - reach <= high[f]) & (np.maximum(p0[i], p1[i]) + reach >= low[f])
-            f = f[meets.all(axis=1)]
+            if boxes:
+                meets = (np.minimum(p0[i], p1[i]) - reach <= high[f]) & (np.maximum(p0[i], p1[i]) + reach >= low[f])
+                f = f[meets.all(axis=1)]
             found.append((np.full(len(f), i), f))
     return np.concatenate([i for i, _ in found]), np.concatenate([f for _, f in found])
 
 
-def _normals(x: Array) -> Array:
-    """Normals of simplices ``x (k, gdim, gdim)`` in the sense of their numbering, as long as the simplices are large."""
+def _normals(x: Array, as_long: bool = False) -> Array:
+    """Normals of simplices ``x (k, gdim, gdim)`` in the sense of their numbering, as long as these are large, or ``as_long`` as sides."""
     t = x[:, 1:] - x[:, :1]
-    return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1) if x.shape[1] == 2 else cross_products(t[:, 0], t[:, 1])
+    if x.shape[1] == 2:
+        return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1)
+    n = cross_products(t[:, 0], t[:, 1])
+    return n / np.sqrt(np.linalg.norm(n, axis=1, keepdims=True)) if as_long else n
 
 
 def _extremes(f: Callable[[Array], Array], low: Array, high: Array) -> list[Array]:

@@ -113,7 +113,7 @@ class Neighbours:
         itself: Bools,
     ):  # fmt: skip
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
-        self._apart, self._overlap, self._itself = apart, overlap, itself
+        self._apart, self._overlap, self.itself = apart, overlap, itself
         config = self._config = skin.config
         watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
         #: Nodes whose motion counts, body by body, and where those of each body begin.
@@ -178,12 +178,9 @@ class Neighbours:
         most = gathered(comm, float(ahead.max(initial=0.0)))
         near, _ = box_distances(comm, points, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
         exchange = Exchange(comm, [np.flatnonzero(near[r] <= reach + most[r]) for r in range(comm.size)])
-        sides = np.column_stack(
-            [a[0][self.nodes] for a in self._apart] + [a[2][self.nodes] for a in self._apart] + [np.zeros(n, bool)]
-        )
         about = Asking(
             points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes),
-            skin.corners[self.nodes], skin.cones(self.nodes), sides, self.held.T,
+            skin.corners[self.nodes], skin.cones(self.nodes), self.sides, self.held.T,
         )  # fmt: skip
         *told, rows = exchange.send(*about, np.arange(n))
         node, facet, cosine, *about_pairs = self._pairs(Asking(*told))
@@ -268,7 +265,7 @@ class Neighbours:
         radius = skin.shape.lebesgue * np.linalg.norm(x - middle[:, None], axis=2).max(axis=1)
         i, f = balls_that_meet(points, of.reach, middle, radius + self._reach[skin.body])
         own, its = of.body[i], skin.body[f]
-        same = (own == its) & self._itself[own]
+        same = (own == its) & self.itself[own]
         follows = (self.place[its] > self.place[own]) | (of.corner[i] & (its != own))
         follows |= same & (skin.nodes[f] != of.node[i, None]).all(axis=1)
         i, f, same = i[follows], f[follows], same[follows]
@@ -281,12 +278,24 @@ class Neighbours:
         kept[same] &= of.corner[i[same]] | self._first_of_itself(of, i[same], f[same], cosines[same])
         holds = (of.held[i] == (f + self.skin.first[self._config.comm.rank])[:, None]).any(axis=1)
         kept, faces, front = kept | holds, faces | holds, front | holds
-        for k, (_, a, _, b) in enumerate(self._apart):
-            kept &= ~((of.sides[i, k] & b[f]) | (of.sides[i, len(self._apart) + k] & a[f]))
+        kept &= ~self.excluded(of.sides[i], f)
         i, f, faces, front, normal = i[kept], f[kept], faces[kept], front[kept], normal[kept]
         distance = np.sqrt(closest_point(skin.shape, x[f], points[i])[1])
         near = distance <= (of.reach[i] + self._reach[skin.body[f]]) * (1 + EQUALLY_NEAR)
         return i[near], f[near], cosine[kept][near], distance[near], faces[near], front[near], normal[near]
+
+    @cached_property
+    def sides(self) -> Bools:
+        """In which sets of facets that never touch each other nodes are ``(n, s)``."""
+        sets = [a[0] for a in self._apart] + [a[2] for a in self._apart] + [np.zeros(self._config.n_local, bool)]
+        return np.column_stack([a[self.nodes] for a in sets])
+
+    def excluded(self, sides: Bools, facet: Ints) -> Bools:
+        """Which nodes in these sets ``(k, s)`` never touch this rank's facets ``(k,)``."""
+        out, n = np.zeros(len(facet), bool), len(self._apart)
+        for k, (_, a, _, b) in enumerate(self._apart):
+            out |= (sides[:, k] & b[facet]) | (sides[:, n + k] & a[facet])
+        return out
 
     def _in_front(self, points: Array, facet: Ints) -> Bools:
         """Which nodes at ``points (k, gdim)`` were in front of this rank's facets ``(k,)``."""
@@ -371,14 +380,36 @@ class Neighbour(MeshTarget):
         self.neighbours.update()
         return self.neighbours.lists[self.number].empty
 
-    def told(self, which: Ints) -> Ints:
-        """Place of the contactors' bodies in the order; past the last for lists after the first, which tell of no passage."""
+    @property
+    def beside_themselves(self) -> Ints:
+        """Contactors that have facets of their own body on a list; for lists after the first none, which tell of no passage."""
         n = self.neighbours
-        return n.place[n.skin.body_of_node[n.nodes[which]]] if self.number == 0 else np.full(len(which), n.skin.n_bodies)
+        own = n.skin.body_of_node[n.nodes]
+        return np.flatnonzero((n.body == own).any(axis=0) & n.itself[own] & (self.number == 0))
+
+    @property
+    def behind_others(self) -> Bools:
+        """Contactors that follow other bodies, ``(n,)``; for lists after the first none, which tell of no passage."""
+        n = self.neighbours
+        last = n.place[n.skin.size > 0].max()
+        return np.asarray((n.place[n.skin.body_of_node[n.nodes]] < last) & (self.number == 0))
+
+    def told(self, which: Ints) -> Ints:
+        """Place of the contactors' bodies in the order, bodies, nodes and sets ``(k, 3 + s)``."""
+        n, nodes = self.neighbours, self.neighbours.nodes[which]
+        body = n.skin.body_of_node[nodes]
+        return np.column_stack([n.place[body], body, n.skin.config.to_global(nodes), n.sides[which]])
 
     def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` are of bodies that contactors follow, of whom this was told ``(k,)``."""
-        return np.asarray(self.neighbours.place[self.facets.body[facet]] > told)  # type: ignore[attr-defined]
+        """Whether this rank's facets ``(k,)`` are of bodies that contactors follow, of whom this was ``told``."""
+        n = self.neighbours
+        return np.asarray((n.place[n.skin.body[facet]] > told[:, 0]) & ~n.excluded(told[:, 3:] > 0, facet))
+
+    def of_itself(self, told: Ints, facet: Ints) -> Bools:
+        """Whether this rank's facets ``(k,)`` are of contactors' own bodies, but do not meet at them, of whom this was ``told``."""
+        n = self.neighbours
+        others = (n.skin.body[facet] == told[:, 1]) & (n.skin.nodes[facet] != told[:, 2, None]).all(axis=1)
+        return np.asarray(others & ~n.excluded(told[:, 3:] > 0, facet))
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Closest points of contactors on what they may touch; far away where there is nothing (collective)."""

@@ -152,7 +152,12 @@ class Nodes:
 
     def describe(self, node: int) -> str:
         """Where a local node is, for error messages."""
-        return "(" + ", ".join(f"{c:.6g}" for c in self.X[node]) + ")"
+        return described(self.X[node])
+
+
+def described(place: Array) -> str:
+    """A place ``(gdim,)``, for error messages."""
+    return "(" + ", ".join(f"{c:.6g}" for c in place) + ")"
 
 
 def check_places(mesh: Any) -> None:

@@ -5,23 +5,31 @@ to the new configuration. A contactor passes if it enters the target in one plac
 first. One that only cuts an edge or a crest short, or slides past an end, comes to the same place by shorter steps; in motion it has
 missed a blow. One that touches at the end has come to the wrong face if it comes from behind this, or from the sector in front of
 both faces of an edge, where a straight way does not tell which of them it meets.
+
+Of a body that may touch itself ways are straight as seen from its facets, each of which turns with what is around it: a body that turns,
+rolls or bends by much does not come nearer to itself by that, and what is next to a facet on the surface goes with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mpi4py import MPI
+
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.checks import CORNER
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.errors import TunnellingError
+from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.crossings import Crossings, find_crossings
+from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_exits
+from uem_dolfinx.geometry.neighbours import Neighbour
+from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.parallel import Exchange, agree
+from uem_dolfinx.parallel import agree, reduced
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
 #: [convention; the target's stride; test_thresholds_motion.py::test_depth_of_a_passage]
@@ -67,6 +75,12 @@ def refuse_passages(
             total = all_ways[:, k, 2:].sum(axis=0)
             depth = _through_mesh(pair, pair.target, start, du - total[:-1] / max(total[-1], 1.0), moving)
             behind, unsure = _came_from(pair, pair.target, start)
+            if isinstance(pair.target, Neighbour) and pair.target.neighbours.itself.any():
+                inside, facet = _through_itself(pair, pair.target, du, moving)
+                places = pair.target.of_facets(facet, pair.target.facets.middles(config.X[pair.target.dofs])[0])
+                _refuse(
+                    pair, inside, "passes through its own body within a step, {:.4g} inside on its way through {}", moving, places
+                )
         else:
             depth, behind = _through_surface(pair, ways[k][0], motion, longest, moving)
             unsure = np.zeros(len(depth))
@@ -76,14 +90,22 @@ def refuse_passages(
         _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away", moving)
 
 
-def _refuse(pair: Interface, by: Array, how: str, moving: bool) -> None:
-    """Raise if a contactor has passed, by a length that is positive ``(n,)``; ``moving`` as of ``refuse_passages`` (collective)."""
+def _refuse(pair: Interface, by: Array, how: str, moving: bool, places: Array | None = None) -> None:
+    """Raise if a contactor has passed, by a length that is positive ``(n,)``, at some place (collective).
+
+    Args:
+        pair: the contact.
+        by: the lengths.
+        how: what is told of them, and of the places.
+        moving: as of ``refuse_passages``.
+        places: in the reference configuration ``(n, gdim)``, if they are told.
+    """
     error = None
     if (by > 0.0).any():
         i = int(np.argmax(by))
-        where = pair.config.describe(int(pair.nodes[i]))
+        where, at = pair.config.describe(int(pair.nodes[i])), "" if places is None else described(places[i])
         advice = "" if moving else ", or give the bodies inertia if they snap from one equilibrium to another"
-        error = TunnellingError(f"{pair.name}: the contactor at {where} {how.format(by[i])}: take smaller steps{advice}")
+        error = TunnellingError(f"{pair.name}: the contactor at {where} {how.format(by[i], at)}: take smaller steps{advice}")
     agree(pair.config.comm, error)
 
 
@@ -108,18 +130,15 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     reach = PASSAGE_DEPTH * target.stride
     # only those that the target could have met on its way
     p = pair.projection
-    near = np.flatnonzero((length > target.stride) & ~pair.tied & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
+    follow = target.behind_others if isinstance(target, Neighbour) else ~pair.tied
+    near = np.flatnonzero((length > target.stride) & follow & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
     depth = np.zeros(len(points))
     if not any(comm.allgather(len(near))):
         return depth
-    found = _crossings(target, near, points[near] - way[near], points[near], moved, reach)
-    entry, leaving, out = _entries_and_exits(found)
-    i = found.point[entry]
-    cosine = _dot(found.normal[entry], found.normal[leaving])
-    # half of the way between two faces where they are parallel, less where they meet
-    inside = (found.time[leaving] - found.time[entry]) * length[i] * np.sqrt(np.maximum(1.0 - cosine, 0.0) / 8.0)
-    passed = (inside > reach) & ((cosine < LOOKING_AWAY) | (moving & ~pair.trial.active[i]))
-    np.maximum.at(depth, i[passed], inside[passed])
+    x, ends = points[near], target.facets.x
+    found = cross_target(target, near, (x - way[near], x), (ends - moved, ends), reach, target.told(near), target.may_touch)
+    entry, out, inside = _inside(found, length[found.point], reach, moving & ~pair.trial.active)
+    np.maximum.at(depth, found.point[entry], inside)
     # those that leave without having entered began inside, or on a curved facet that its pieces cut short
     i = np.unique(found.point[out])
     if any(comm.allgather(len(i))):
@@ -129,36 +148,58 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     return depth
 
 
-def _crossings(target: MeshTarget, which: Ints, p0: Array, p1: Array, moved: Array, reach: float) -> Crossings:
-    """Crossings of the points ``which (k,)`` from ``p0`` to ``p1 (k, gdim)`` with the whole target, on their own rank (collective)."""
-    comm, g = target.comm, p0.shape[1]
-    pieces = target.shape.pieces
-    x1 = target.facets.x
-    x0 = x1 - moved
-    nodes = np.concatenate([x0, x1]).reshape(-1, g)
-    box = np.array([nodes.min(axis=0, initial=np.inf) - reach, nodes.max(axis=0, initial=-np.inf) + reach])
-    low, high = np.minimum(p0, p1), np.maximum(p0, p1)
-    rows = [np.flatnonzero(((low <= b[1]) & (high >= b[0])).all(axis=1)) for b in comm.allgather(box)]
-    there = Exchange(comm, rows)
-    q0, q1, number, told, home = there.send(p0, p1, which, target.told(which), np.full(len(which), comm.rank))
-    sign = np.repeat(target.facets.sign, len(pieces))
-    ways = (q0, x0[:, pieces].reshape(-1, g, g)), (q1, x1[:, pieces].reshape(-1, g, g))
-    found = find_crossings(*ways, sign, reach, lambda i, f: target.may_touch(told[i], f // len(pieces)))
-    back = Exchange.to(comm, home[found.point])
-    return Crossings(*back.send(number[found.point], found.time, found.inwards, found.normal))
+def _inside(found: Crossings, way: Array, reach: float, at_all: Bools) -> tuple[Ints, Ints, Array]:
+    """Passages.
+
+    Args:
+        found: crossings.
+        way: lengths of the contactors' ways ``(k,)``.
+        reach: length by which contactors that pass are inside at least.
+        at_all: contactors that pass if they leave by any face ``(n,)``; others by one that looks away.
+
+    Returns:
+        Crossings by which they enter, those by which contactors leave that have not entered, and how deep the first were inside.
+    """
+    entry, leaving, out = entries_and_exits(found)
+    cosine = _dot(found.normal[entry], found.normal[leaving])
+    # half of the way between two faces where they are parallel, less where they meet
+    inside = (found.time[leaving] - found.time[entry]) * way[entry] * np.sqrt(np.maximum(1.0 - cosine, 0.0) / 8.0)
+    passed = (inside > reach) & ((cosine < LOOKING_AWAY) | at_all[found.point[entry]])
+    return entry[passed], out, inside[passed]
 
 
-def _entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
-    """Pairs of an entry and a later exit of the same point ``(k,)`` each, and the exits that no entry comes before."""
-    ins, outs = np.flatnonzero(found.inwards), np.flatnonzero(~found.inwards)
-    ins = ins[np.argsort(found.point[ins], kind="stable")]
-    first, last = (np.searchsorted(found.point[ins], found.point[outs], side=side) for side in ("left", "right"))
-    leaving = np.repeat(outs, last - first)
-    begins = np.repeat(np.cumsum(last - first) - (last - first), last - first)
-    entry = ins[np.repeat(first, last - first) + np.arange(len(leaving)) - begins]
-    later = found.time[leaving] > found.time[entry]
-    entry, leaving = entry[later], leaving[later]
-    return entry, leaving, np.setdiff1d(outs, leaving)
+def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool) -> tuple[Array, Ints]:
+    """How deep contactors that pass are in their own body, and the facets by which they enter, ``(n,)`` each (collective).
+
+    Only those near which their own body is on a list are looked at, and only if the body does not merely move as one. What tells are
+    ways as seen from the facets: what is around a node on the surface goes with it, however far it moves and turns.
+
+    Args:
+        pair: the contact.
+        target: its target.
+        du: displacements in the step ``(n_local, gdim)``.
+        moving: as of ``refuse_passages``.
+    """
+    config, skin, which = pair.config, target.neighbours.skin, target.beside_themselves
+    depth, facet = np.zeros(len(pair.nodes)), np.full(len(pair.nodes), -1)
+    if not reduced(config.comm, len(which)):
+        return depth, facet
+    now = config.x
+    before = carried_along(config, skin.body_of_node, skin.n_bodies, now - du, now)
+    farthest = reduced(config.comm, float(np.linalg.norm(now - before, axis=1).max(initial=0.0)), op=MPI.MAX)
+    if 2.0 * farthest <= target.stride:
+        return depth, facet
+    reach, nodes = PASSAGE_DEPTH * target.stride, pair.nodes[which]
+    found = cross_target(
+        target, which, (before[nodes], now[nodes]), (before[target.dofs], now[target.dofs]), reach, target.told(which),
+        target.of_itself, turning=True,
+    )  # fmt: skip
+    entry, _, inside = _inside(found, found.way, reach, moving & ~pair.trial.active)
+    # of several the deepest comes last, and stays
+    order = np.argsort(inside, kind="stable")
+    i = found.point[entry[order]]
+    depth[i], facet[i] = inside[order], found.facet[entry[order]]
+    return depth, facet
 
 
 def _normals_at_start(pair: Interface, target: MeshTarget, start: Array, which: Ints) -> Array:
