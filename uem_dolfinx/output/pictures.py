@@ -198,8 +198,8 @@ def plot_setup(
         problem: the scene.
         picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
             Jupyter shows it.
-        at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; all is as
-            it was after that. None is the full load in statics, and the present time in dynamics.
+        at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; then it
+            is asked for the present ones again. None is the full load in statics, and the present time in dynamics.
         loads: find the loads that are terms of the residual: it is assembled without displacement, what it integrates over surfaces apart.
         arrows: what else acts, such as what is prescribed later: places, directions ``(gdim,)`` and names.
         cells: draw the edges of the cells.
