@@ -69,7 +69,6 @@ KINDS = [
     slow("quadrilateral", 2),
     slow("triangle", 2),
     slow("hexahedron", 1),
-    slow("tetrahedron", 1),
 ]
 
 
@@ -94,7 +93,7 @@ def test_what_is_excluded_passes():
     assert tip < 0.6 and plate == pytest.approx(1.1, abs=0.01)
 
 
-@pytest.mark.parametrize("cell", ["quadrilateral", slow("hexahedron")])
+@pytest.mark.parametrize("cell", ["quadrilateral", slow("triangle")])
 def test_a_slot_closed_in_one_step(cell):
     """A load that presses the prongs of a fork flat together in one solve gives what four steps give."""
     g, found = dimension(cell), []
