@@ -65,7 +65,6 @@ class Needle:
 
 KINDS = [
     ("quadrilateral", 1),
-    slow("triangle", 1),
     slow("quadrilateral", 2),
     slow("triangle", 2),
     slow("hexahedron", 1),

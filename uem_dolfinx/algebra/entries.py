@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -20,23 +19,20 @@ from uem_dolfinx.parallel import reduced
 SYMMETRIC = 1e-11
 
 
-@dataclass(frozen=True)
 class Entries:
     """Entries of the owned rows of a square matrix, shared with PETSc.
 
     Those in own columns come first, row by row; on several ranks those in other ranks' columns follow, of row ``i`` in line ``n + i``.
 
-    Attributes:
+    Args:
         indptr: first entry of every line, and the number of entries ``(lines + 1,)``; lines are the n owned rows, or twice as many.
         columns: global numbers, sorted in every line ``(k,)``.
         values: of the entries ``(k,)``.
         mat: the matrix that has them; to be assembled after changes.
     """
 
-    indptr: Ints
-    columns: Ints
-    values: Array
-    mat: PETSc.Mat
+    def __init__(self, indptr: Ints, columns: Ints, values: Array, mat: PETSc.Mat):
+        self.indptr, self.columns, self.values, self.mat = indptr, columns, values, mat
 
     @staticmethod
     def of_arrays(indptr: Ints, columns: Ints, values: Array, like: PETSc.Mat) -> Entries:

@@ -10,8 +10,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.bernstein import Bernstein
-from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
-from uem_dolfinx.contact.nothing_near import NothingNear
+from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface, NothingNear
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.neighbours import Neighbour

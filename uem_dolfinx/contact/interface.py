@@ -17,7 +17,6 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.laws.law import FrictionLaw
-from uem_dolfinx.contact.nothing_near import NothingNear
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.contact.told import Told
 from uem_dolfinx.errors import NotFiniteError
@@ -103,8 +102,8 @@ class Interface(Told):
     def _project(self) -> None:
         if self.tie is not None and not self.tie.begin_placement():
             return
-        first, how = not hasattr(self, "kinematics"), self.discretisation
-        self.kinematics = NothingNear.at(how, self.points) if how.far else how.place(self.points, self.trial)
+        first = not hasattr(self, "kinematics")
+        self.kinematics = self.discretisation.place(self.points, self.trial)
         if self.kinematics.idle and not first:
             return
         p = self.projection

@@ -17,22 +17,18 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
-from uem_dolfinx.contact.on_target import OnTarget
+from uem_dolfinx.contact.on_target import END_HOLDS, OnTarget, near_target, past_end
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
-from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.concave_edges import ConcaveEdges
     from uem_dolfinx.contact.corners import Corners
-
-#: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
-#: [convention; length of the facet; test_large_sliding.py::test_an_end_holds_what_was_drawn_there]
-END_HOLDS = 0.1
 
 
 class NodeToSurface(OnTarget):
@@ -85,6 +81,8 @@ class NodeToSurface(OnTarget):
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
+        if self.far:
+            return NothingNear.at(self, points)
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)
@@ -382,20 +380,58 @@ class NodalKinematics:
         return None
 
 
-def past_end(p: Projection, state: PairState, thickness: float) -> Bools:
-    """Contactors that are past an open end of the target in a direction in which they can move ``(n,)``.
+class NothingNear(NodalKinematics):
+    """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
 
-    The end holds those that came to it there; one that has slid off is out until it is in front of the target again. Round the end of a
-    target of this ``thickness`` they come behind it, where a negative gap is no penetration.
-    """
-    limit = np.where(state.at_end & ~state.passed, END_HOLDS, ON_SIDE)
-    behind = state.passed & (p.gap < -thickness)
-    return behind | (p.way_beyond > limit * p.facet_size)
+    @classmethod
+    def at(cls, of: NodeToSurface, points: Array) -> NothingNear:
+        """Of contactors at ``points (n, gdim)``."""
+        p = of.target.nowhere(points) if isinstance(of.target, MeshTarget) else of.target.project(points)
+        return cls(of, points, p, p, p.gap, None, None)
 
+    @property
+    def idle(self) -> bool:
+        """Yes: nothing is near."""
+        return True
 
-def near_target(p: Projection, state: PairState, off: Bools) -> Bools:
-    """Contactors that are active or nearer to the target than one of its facets is long, unless they are ``off (n,)`` it: ``(n,)``."""
-    return state.active | ((p.gap < p.facet_size) & ~off)
+    @property
+    def movable(self) -> Bools:  # type: ignore[override]
+        """None can close its gap ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    @property
+    def cone(self) -> Array:  # type: ignore[override]
+        """There are no facets to push ``(n,)``."""
+        return np.ones(len(self.gap))
+
+    def placed_again(self, state: PairState) -> NodalKinematics:
+        """They stay where they are."""
+        return self
+
+    def predicted(self, du: Array) -> Array:
+        """The gap to nothing, as large as the model ``(n,)``."""
+        return self.gap
+
+    def off(self, state: PairState) -> Bools:
+        """None is past an end ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    def at_end(self, state: PairState) -> Bools:
+        """None is held by an end ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    def return_vectors(self, state: PairState) -> Array:
+        """None is moved ``(n, gdim)``."""
+        return np.zeros(self.points.shape)
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """There are none."""
+        none = np.zeros(len(self.gap))
+        return Traction(none, none, np.zeros(self.points.shape))
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Nothing turns."""
+        return []
 
 
 def _closing(normal: Array, gap: Array, free: Bools) -> Array:

@@ -18,7 +18,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.kinematics import Constraints, Discretisation, Traction
 from uem_dolfinx.contact.mortar import Mortar
-from uem_dolfinx.contact.node_to_surface import past_end
+from uem_dolfinx.contact.on_target import past_end
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.tied_rows import TiedRows, to_facets, to_means, to_surface
 from uem_dolfinx.errors import SurfaceError

@@ -15,8 +15,7 @@ from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
 from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_turning import Frictional, turning
-from uem_dolfinx.contact.node_to_surface import near_target, past_end
-from uem_dolfinx.contact.on_target import OnTarget
+from uem_dolfinx.contact.on_target import OnTarget, near_target, past_end
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration

@@ -15,7 +15,6 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.search import MeshTarget
 
@@ -160,7 +159,6 @@ class FarApart:
 
 
 def _may_be_far(pair: Interface) -> bool:
-    how, target = pair.discretisation, pair.target
-    nodal = isinstance(how, NodeToSurface) and how.can_be_far and how.sliding == "finite"
-    measured = isinstance(target, MeshTarget) or getattr(target, "measures", False)
+    measured = isinstance(pair.target, MeshTarget) or getattr(pair.target, "measures", False)
+    nodal = getattr(pair.discretisation, "can_be_far", False) and pair.sliding == "finite"
     return nodal and measured and pair.tie is None and pair.heat is None

@@ -13,6 +13,7 @@ rolls or bends by much does not come nearer to itself by that, and what is next 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from mpi4py import MPI
 
@@ -25,11 +26,13 @@ from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_exits
-from uem_dolfinx.geometry.neighbours import Neighbour
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import agree, reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.neighbours import Neighbour
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
 #: [convention; the target's stride; test_thresholds_motion.py::test_depth_of_a_passage]
@@ -75,7 +78,7 @@ def refuse_passages(
             total = all_ways[:, k, 2:].sum(axis=0)
             depth = _through_mesh(pair, pair.target, start, du - total[:-1] / max(total[-1], 1.0), moving)
             behind, unsure = _came_from(pair, pair.target, start)
-            if isinstance(pair.target, Neighbour) and pair.target.neighbours.itself.any():
+            if _listed(pair.target) and pair.target.neighbours.itself.any():
                 inside, facet = _through_itself(pair, pair.target, du, moving)
                 places = pair.target.of_facets(facet, pair.target.facets.middles(config.X[pair.target.dofs])[0])
                 _refuse(
@@ -88,6 +91,11 @@ def refuse_passages(
         behind = np.where(behind > PASSAGE_DEPTH * pair.target.stride, behind, 0.0)
         _refuse(pair, behind, "touches the target from behind after a step, {:.4g} inside on its way", moving)
         _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away", moving)
+
+
+def _listed(target: Any) -> TypeGuard[Neighbour]:
+    """Whether contactors meet what is on a list of general contact alone."""
+    return hasattr(target, "neighbours")
 
 
 def _refuse(pair: Interface, by: Array, how: str, moving: bool, places: Array | None = None) -> None:
@@ -130,7 +138,7 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     reach = PASSAGE_DEPTH * target.stride
     # only those that the target could have met on its way
     p = pair.projection
-    follow = target.behind_others if isinstance(target, Neighbour) else ~pair.tied
+    follow = target.behind_others if _listed(target) else ~pair.tied
     near = np.flatnonzero((length > target.stride) & follow & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
     depth = np.zeros(len(points))
     if not any(comm.allgather(len(near))):
