@@ -71,15 +71,18 @@ def test_a_pressure_that_changes_nothing(pressure):
 
 
 def test_going_on_in_time(folder):
-    """Read from a checkpoint amid the impact, the run goes on to the last bit."""
+    """Read from a checkpoint amid the impact, the run goes on to the last bit, on several ranks to rounding."""
     whole, first, last = Fall(1), Fall(1), Fall(1)
     rows = whole.go(0.04)
     first.go(0.02)
     uem.write_checkpoint(folder / "run", first.problem.state())
     uem.read_checkpoint(folder / "run", last.problem.state())
     rest = last.go(0.04)
-    assert len(rest) == 2 and np.array_equal(rest[:, :4], rows[2:, :4])
-    assert np.array_equal(last.problem.u.x.array, whole.problem.u.x.array)
+    # on several ranks MUMPS adds what they send in the order in which it comes
+    rounding = 0.0 if COMM.size == 1 else 1e-11
+    assert len(rest) == 2
+    for one, other in ((rest[:, :4], rows[2:, :4]), (last.problem.u.x.array, whole.problem.u.x.array)):
+        assert np.abs(one - other).max() <= rounding * np.abs(other).max()
 
 
 def test_the_mass_among_other_fields():
