@@ -24,11 +24,11 @@ from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
-from uem_dolfinx.solve.far_apart import FarApart
 from uem_dolfinx.solve.rigid_motions import LOADED, OPEN, RigidMotions
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.solve.far_apart import FarApart
 
 #: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]

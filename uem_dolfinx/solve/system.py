@@ -27,7 +27,6 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.exchanges import Exchanges, count
-from uem_dolfinx.solve.far_apart import FarApart
 from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
@@ -95,6 +94,8 @@ class BodySystem:
 
     def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
         """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
+        from uem_dolfinx.solve.far_apart import FarApart
+
         self.pairs, self.linear, self._here = list(pairs), linear, None
         self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
