@@ -123,7 +123,7 @@ def test_rotations_turn_the_stress_and_change_nothing_else(comm, cell, kind):
         full = np.eye(3)
         full[:g, :g] = R
         sigma, there = tensors(still, "stress"), tensors(turned, "stress")
-        assert highest(comm, np.abs(there - full @ sigma @ full.T)) < 1e-12 * FY
+        assert highest(comm, np.abs(there - full @ sigma @ full.T)) < 2e-12 * FY
         assert highest(comm, np.abs(turned.peeq.x.array - still.peeq.x.array)) < 1e-13
         assert highest(comm, np.abs(turned.plastic_strain.x.array - still.plastic_strain.x.array)) < 1e-13
     assert highest(comm, still.peeq.x.array) > 0.2
