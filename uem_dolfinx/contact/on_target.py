@@ -124,6 +124,7 @@ class OnTarget:
 
     def commit(self) -> None:
         """The next step is to find the feet anew; a rigid target that it moves is asked for them before."""
+        # contactors may be taken to where they were before
         self.far = False
         if self.sliding == "small":
             self._renewing = True

@@ -172,7 +172,7 @@ def check_places(mesh: Any) -> None:
     least, error = int(reduced(mesh.comm, int(number[order[0]]) if len(bad) else last, op=MPI.MIN)), None
     if len(bad) and number[order[0]] == least:
         error = MeshError(
-            f"node {least} of the mesh's input, counted from 0, is at ({', '.join(f'{c:.6g}' for c in x[order[0]])}): expected finite "
+            f"node {least} of the mesh's input, counted from 0, is at {described(x[order[0]])}: expected finite "
             "coordinates; mend the mesh, or what has moved its nodes"
         )
     agree(mesh.comm, error)

@@ -12,8 +12,7 @@ from dolfinx import fem
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.geometry.rigid import RigidSurface
-from uem_dolfinx.parallel import ask_together
-from uem_dolfinx.solve.checks import set_constant
+from uem_dolfinx.solve.checks import set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -72,12 +71,6 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
 
 def _set_load(problem: UnitedProblem, at: float) -> None:
     """What a problem's ``load`` and its couplings set at a load factor or time; nothing of contacts (collective)."""
-    load = problem.load
-    if isinstance(load, Mapping):
-        for constant, value in load.items():
-            what = f"the load of a Constant at {at:.6g}"
-            set_constant(constant, ask_together(problem.comm, what, value, at) if callable(value) else value * at)
-    elif callable(load):
-        ask_together(problem.comm, f"load({at:.6g})", load, at)
+    set_loads(problem.comm, problem.load, at)
     for one in problem.couplings:
         one.take_load(at)

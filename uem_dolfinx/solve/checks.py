@@ -1,6 +1,6 @@
 """What a problem is handed, looked at before anything is made of it: residual, load, Dirichlet conditions and their values.
 
-Each check looks at this rank's part; whoever asks has the ranks agree.
+Each check looks at this rank's part; whoever asks has the ranks agree. Loads are set here, too.
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import ufl
@@ -22,6 +24,7 @@ from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, Space
 from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
+from uem_dolfinx.parallel import agreed, ask_together
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
@@ -112,13 +115,20 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None
     return load
 
 
-def set_constant(constant: fem.Constant, value: Any) -> None:
-    """Set a Constant to a value of its shape.
+def set_loads(comm: MPI.Comm, load: Any, at: float) -> None:
+    """Set what a problem's ``load`` sets at a load factor or time; None sets nothing (collective).
 
     Raises:
-        InputError, InputTypeError: where it is no finite number, or numbers of another shape.
+        InputError, InputTypeError: where the value of a Constant is no finite number, or numbers of another shape.
+        UserFunctionError: if a function raises.
     """
-    constant.value = _fitting(constant, value)
+    if isinstance(load, Mapping):
+        for constant, value in load.items():
+            now = ask_together(comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
+            with agreed(comm):
+                constant.value = _fitting(constant, now)
+    elif load is not None:
+        ask_together(comm, f"load({at:.6g})", load, at)
 
 
 def _fitting(constant: fem.Constant, value: Any) -> Any:

@@ -114,9 +114,9 @@ class FarApart:
             self._look_at(self._boxes.apart <= self._near)
 
     def look_within(self, way: float) -> None:
-        """Look at those that may come near if no node moves by more than ``way``, a length (collective)."""
+        """Look at those that may come near if nodes move by no more than ``way`` along any axis, a length (collective)."""
         if self._any_far:
-            for pair in self._look_at(self._boxes.apart <= self._near + 2.0 * way):
+            for pair in self._look_at(self._boxes.apart <= self._near + 2.0 * np.sqrt(self._config.gdim) * way):
                 pair.project()
 
     def look_along(self, ways: Array) -> bool:

@@ -44,7 +44,7 @@ def touch_ahead(
     free, prescribed = bodies.free[: config.n_owned], bodies.prescribed[: config.n_owned]
     du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
     way = float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
-    look_within(np.sqrt(config.gdim) * way)
+    look_within(way)
     near = OPEN * way
     gaps = [pair.predicted(du) for pair in pairs]
     violated = []

@@ -24,7 +24,7 @@ from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.materials.elastic import HistoryMaterial
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
@@ -35,7 +35,7 @@ from uem_dolfinx.solve.checks import (
     check_materials,
     check_residual,
     check_values,
-    set_constant,
+    set_loads,
 )
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
@@ -277,13 +277,7 @@ class UnitedProblem:
         """
         if self.stage is not None:
             self.stage.take_load(at)
-        if isinstance(self.load, Mapping):
-            for constant, value in self.load.items():
-                now = ask_together(self.comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
-                with agreed(self.comm):
-                    set_constant(constant, now)
-        elif self.load is not None:
-            ask_together(self.comm, f"load({at:.6g})", self.load, at)
+        set_loads(self.comm, self.load, at)
         for contact in self.contacts:
             contact.take_load(at, known)
         if self.linear is not None:

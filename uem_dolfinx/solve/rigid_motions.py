@@ -275,10 +275,6 @@ class RigidMotions:
         turns = np.array([rotation_matrix(_turn(angles)) for angles in parts[:, g:] / self.radius[:, None]]) - np.eye(g)
         return np.asarray(np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g])
 
-    def move(self, motion: Array) -> None:
-        """Move the bodies, ghosts included."""
-        self.config.shift(slice(None), self.ways(motion))
-
     # -- what keeps the system regular -------------------------------------------------------------------------------------
 
     def supports(self, motions: Any, equations: UnitingEquations, left: Bools | None = None) -> Bools:

@@ -280,7 +280,7 @@ class BodySystem:
         with timed("uniting equations"):
             increment = du.array_r[: self._n].reshape(-1, self.config.gdim)
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            self.far_apart.look_within(np.sqrt(self.config.gdim) * way)
+            self.far_apart.look_within(way)
             F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             near = max(PREDICTED, left) * way
