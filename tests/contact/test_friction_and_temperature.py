@@ -13,7 +13,7 @@ import ufl
 from dolfinx import fem
 from field_scenes import fields, strain, stress
 from helpers import blocks, highest, linear, refused, slow
-from restart_scenes import bits
+from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 
@@ -116,7 +116,7 @@ def test_a_rigid_surface_is_as_warm_as_the_conductance_says(coupling):
 
 
 def test_going_on_from_a_checkpoint(folder):
-    """To the last bit, where friction follows place and load factor, too."""
+    """Where friction follows place and load factor, too."""
 
     def mu(x, t, T):
         return (1.5 - t) * falling(T) * (1.0 + x[0])
@@ -128,8 +128,9 @@ def test_going_on_from_a_checkpoint(folder):
         if step.number == 2:
             break
     assert len(last.run(checkpoint=uem.Checkpoint(folder / "run", every=1))) == 2
-    assert np.array_equal(bits(whole.f.w.x.array), bits(last.f.w.x.array))
-    assert np.array_equal(bits(whole.contact.slip.x.array), bits(last.contact.slip.x.array))
+    for own, alone in zip(last.f.w.split(), whole.f.w.split()):
+        goes_on_alike(own.collapse().x.array, alone.collapse().x.array)
+    goes_on_alike(last.contact.slip.x.array, whole.contact.slip.x.array)
 
 
 def test_what_is_refused():

@@ -21,6 +21,19 @@ def bits(a):
     return np.ascontiguousarray(a).view(np.uint8)
 
 
+def goes_on_alike(own, whole):
+    """Assert that two runs end alike: to the last bit, on several ranks to rounding, where MUMPS adds what comes in the order it comes in.
+
+    Args:
+        own: values of the run that went on, on this rank.
+        whole: of the one that was left alone.
+    """
+    if COMM.size == 1:
+        assert np.array_equal(bits(own), bits(whole))
+    scale = COMM.allreduce(np.abs(whole).max(initial=0.0), MPI.MAX)
+    assert COMM.allreduce(np.abs(own - whole).max(initial=0.0), MPI.MAX) <= 1e-11 * scale
+
+
 def slider(comm=COMM, cell="quadrilateral", *, normals="facet", degree=1, name=None, target=None):
     """A block led along a wave of a slab, up and down its facets; ``problem.load(k)`` is for step k of 10."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
