@@ -152,3 +152,9 @@ def test_what_has_no_gradient():
     J = corner.contact.pressure * ufl.ds
     refused(uem.InputError, "a concave corner of the target holds contactors", lambda: uem.gradient(corner.problem, J, []))
     refused(uem.InputError, "a concave corner", lambda: uem.tangent(corner.problem, [], of=corner.contact.pressure))
+    b = blocks(COMM, "triangle", 2, 2)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.01])]
+    many = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[uem.GeneralContact()])
+    run(many)
+    J = many.contacts[0].pressure * ufl.ds
+    refused(uem.InputError, "of a general contact have no derivatives", lambda: uem.gradient(many, J, []))

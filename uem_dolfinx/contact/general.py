@@ -170,6 +170,7 @@ class GeneralContact:
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
             parts.append(RigidContact(surface, target, coupling=self.coupling, name=f"{self.name} on {name}", **options))
+            parts[-1]._skin = skin
         if self._pairs is not None:
             self._give_friction(parts)
         self._parts = parts
@@ -187,7 +188,10 @@ class GeneralContact:
         # as many bodies as others meet one in a corner of a grid of blocks
         n_lists = 2**self._config.gdim - 1
         neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
-        return [AmongContact(neighbours, k, name=self._name(k), normals=self.normals, **options) for k in range(n_lists)]
+        together: list[AmongContact] = []
+        for k in range(n_lists):
+            together.append(AmongContact(neighbours, k, together, name=self._name(k), normals=self.normals, **options))
+        return list(together)
 
     def _mortar(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.law import FrictionLaw
@@ -22,12 +22,22 @@ from uem_dolfinx.parallel import reduced
 if TYPE_CHECKING:
     from uem_dolfinx.contact.among_mortar import Body
     from uem_dolfinx.geometry.neighbours import Neighbours
+    from uem_dolfinx.geometry.skin import Skin
 
 
 class GeneralPart(Contact):
     """One of the contacts that a general contact consists of."""
 
     of_all_surfaces = True
+    #: Of all bodies.
+    _skin: Skin
+
+    def measured_areas(self) -> Array:
+        """As of ``ContactResults``: of nodes on sharp edges the facets count as far as they face what touches (collective)."""
+        if self.coupling == "mortar":
+            return super().measured_areas()
+        current, pair = self.measure == "current", self.pair
+        return pair.areas(self._skin.areas_facing(pair.nodes, pair.projection.normal, current), current, self._areas)
 
     def friction_values(self) -> Array:
         """Values that friction has at this rank's contactors, by whatever pair."""
@@ -66,19 +76,52 @@ class BodiesContact(GeneralPart):
 class AmongContact(BodiesContact):
     """One of the contacts that a general contact consists of: every node against one body near it."""
 
-    def __init__(self, neighbours: Neighbours, number: int, **options: Any):
+    def __init__(self, neighbours: Neighbours, number: int, together: list[AmongContact], **options: Any):
         from uem_dolfinx.contact.among_bodies import AmongBodies, AmongQuadraticBodies
 
         skin = neighbours.skin
         quadratic = skin.config.degree == 2
         coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
         super().__init__(skin.tag, skin.tag, coupling=coupling, **options)
-        self._neighbours, self._number = neighbours, number
+        self._neighbours, self._number, self._skin = neighbours, number, skin
+        self._together = together
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         from uem_dolfinx.geometry.neighbours import Neighbour
 
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
+
+    def _pressing(self) -> tuple[Array, Array]:
+        """With forces by which nodes at sharp edges are followed by what they follow: these press on the same areas (collective)."""
+        (across, along), pair = super()._pressing(), self.pair
+        received, normal, spread = self._received(), pair.projection.normal, pair.discretisation.spread
+        pressing = np.einsum("ng,ng->n", received, normal)
+        sliding = received - pressing[:, None] * normal
+        return across + spread(pressing), along + np.column_stack([spread(part) for part in sliding.T])
+
+    def _received(self) -> Array:
+        """Forces on active contactors by nodes of the body that they touch which follow them, where either is at a sharp edge.
+
+        Returns:
+            ``(n, gdim)`` (collective).
+        """
+        skin, config, told = self._skin, self.config, []
+        for one in self._together:
+            pair = one.pair
+            row, node, weight = pair.kinematics.means()[1]
+            own = np.flatnonzero(pair.trial.active[row])
+            row, i = row[own], pair.nodes[row[own]]
+            forces = -weight[own, None] * pair.trial.force[row]
+            told.append(np.column_stack([node[own], skin.body_of_node[i], skin.corners[i], forces]))
+        both = np.concatenate(told)
+        there, arrived = config.send_to_owners(both[:, 0].astype(np.int64), both[:, 1:])
+        active = np.flatnonzero(self.pair.trial.active)
+        place = np.full(config.n_owned, -1)
+        place[self.pair.nodes[active]] = active
+        body = np.full(len(place), -1)
+        body[self.pair.nodes[active]] = skin.values_at(self.pair.projection.facet[active], skin.body)
+        counts = (body[there] == arrived[:, 0]) & ((arrived[:, 1] > 0) | skin.corners[there])
+        return sums_of_rows(place[there][counts], arrived[counts, 2:], len(self.pair.nodes))
 
     def begin(self) -> None:
         """Take the contact for that of a problem that is complete (collective)."""

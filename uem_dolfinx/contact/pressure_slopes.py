@@ -48,12 +48,18 @@ class PressureSlopes:
         equations: of its pair, in the present state.
 
     Raises:
-        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn.
+        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn; and for a
+            part of a general contact of nodes, at whose sharp edges the areas do.
     """
 
     def __init__(self, contact: Contact, equations: Constraints):
         self.contact, self._pair, self._equations = contact, contact.pair, equations
         self._config, self._current = contact.config, contact.measure == "current"
+        if contact.of_all_surfaces and contact.coupling != "mortar":
+            raise InputError(
+                f"contact '{contact.name}': pressures of nodes of a general contact have no derivatives: expected a Contact of "
+                "a pair of surfaces"
+            )
         held = self._pair.trial.active & self._pair.trial.in_corner
         if reduced(self._config.comm, int(held.sum())):
             raise InputError(

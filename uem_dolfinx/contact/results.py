@@ -123,6 +123,10 @@ class ContactResults:
         areas = self.surface.current[self.pair.nodes] if current else self._areas
         return self.pair.areas(areas, current, self._areas)
 
+    def _pressing(self) -> tuple[Array, Array]:
+        """Forces across ``(n_contactors,)`` and along ``(n_contactors, gdim)`` the target that these are divided into (collective)."""
+        return self.pair.pressing()
+
     @property
     def nodes(self) -> Indices:
         """Nodes of this rank's contactors, its own alone, by which fields of the displacement's space are asked ``(n_contactors,)``."""
@@ -141,7 +145,7 @@ class ContactResults:
         whether of the reference or of the current surface. It is negative where tied surfaces pull.
         """
         areas = self.measured_areas()
-        return np.where(areas > 0, self.pair.pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
+        return np.where(areas > 0, self._pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
@@ -180,7 +184,7 @@ class ContactResults:
     @property
     def traction(self) -> fem.Function:
         """Force of friction, or of a tie, along the target per area that ``pressure`` is measured on, a vector field (collective)."""
-        tau, areas = self.pair.pressing()[1], self.measured_areas()[:, None]
+        tau, areas = self._pressing()[1], self.measured_areas()[:, None]
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array, Indices, cross_products
-from uem_dolfinx.forms import create_lagrange_element, reference_topology
+from uem_dolfinx.forms import create_lagrange_element, quadrature_rule, reference_topology
 
 #: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
 #: [bound; iterations; -]
@@ -177,6 +177,16 @@ def area_vectors(tab: Tabulated, x: Array) -> Array:
 def nodal_area_vectors(shape: FacetShape, x: Array) -> Array:
     """The same at the nodes of facets ``x (n, nn, gdim)``: ``(n, nn, gdim)``."""
     return _across(np.einsum("kaf,nag->nkfg", shape.nodal.dN, x))
+
+
+def integrals(shape: FacetShape, x: Array, axisymmetric: bool = False) -> Array:
+    """Integrals of the shape functions over facets ``x (n, nn, gdim)``, of bodies of revolution over whole circles: ``(n, nn)``."""
+    points, weights = quadrature_rule(shape.cell, 2 * shape.degree + 1)
+    tab = shape.tabulate(points)
+    area = weights * np.linalg.norm(_across(np.einsum("qaf,nag->nqfg", tab.dN, x)), axis=2)
+    if axisymmetric:
+        area *= 2.0 * np.pi * x[:, :, 0] @ tab.N.T
+    return np.asarray(area @ tab.N)
 
 
 def _across(t: Array) -> Array:

@@ -14,6 +14,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
+from uem_dolfinx.geometry.shapes import integrals
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced, sums_by_keys
@@ -171,6 +172,28 @@ class Skin(TargetFacets):
             there, sums = self._of_one_face(self._areas_beside())
             self._spread[there] = spread_of(sums)
         return self._spread
+
+    def areas_facing(self, nodes: Indices, normal: Array, current: bool) -> Array:
+        """Areas of owned nodes towards what touches them with outward normals ``normal (n, gdim)``: ``(n,)`` (collective).
+
+        Off sharp edges they are the integrals of the shape functions. At a sharp edge the facets count as far as they face what
+        touches, so that of a block's edge on a plane it is the base alone: ``sum_f (int_f N_i) max(0, -n_f . n_i)``.
+
+        Args:
+            nodes: contactors ``(n,)``.
+            normal: of what they touch.
+            current: whether of facets where they are now, else as they were drawn; normals are those of now.
+        """
+        config, g = self.config, self.config.gdim
+        areas = integrals(self.shape, self.x if current else config.X[self.dofs], config.axisymmetric)
+        told: Array = np.concatenate([np.stack([areas, self._sharp_nodes], axis=2), self.normals()], axis=2).reshape(-1, 2 + g)
+        there, arrived = config.send_to_owners(self.nodes.ravel(), told)
+        row = np.full(config.n_owned, -1)
+        row[nodes] = np.arange(len(nodes))
+        own = row[there] >= 0
+        row, (area, sharp), facing = row[there][own], arrived[own, :2].T, arrived[own, 2:]
+        cosine = np.where(sharp > 0, np.maximum(-np.einsum("kg,kg->k", facing, normal[row]), 0.0), 1.0)
+        return sums_of_rows(row, (area * cosine)[:, None], len(nodes))[:, 0]
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
