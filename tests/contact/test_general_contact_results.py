@@ -183,51 +183,6 @@ def test_forces_and_moments_balance(mu):
             assert np.abs(told - nodal).max() < 1e-14
 
 
-@pytest.mark.parametrize(
-    "cell,degree",
-    [
-        ("triangle", 1),
-        ("quadrilateral", 2),
-        ("tetrahedron", 1),
-        slow("hexahedron", 1),
-        slow("triangle", 2),
-        slow("tetrahedron", 2),
-    ],
-)
-@pytest.mark.parametrize("measure", ["reference", "current"])
-def test_pressures_at_sharp_edges(cell, degree, measure):
-    """A block that is pressed between a block and a wall has one pressure up to its edges, beside which nothing touches its sides."""
-    g, press = dimension(cell), 0.01
-    b = blocks(COMM, cell, 3, 3, degree=degree)
-    wall = uem.RigidPlane([0.0] * (g - 1) + [1.0 - press], [0.0] * (g - 1) + [-1.0])
-    contact = uem.GeneralContact(measure=measure, rigid=wall, max_penetration=0.1)
-    bcs = [*clamp(b.V, b.bottom), *(uem.dirichlet(b.V, b.high, c) for c in range(g - 1))]
-    problem = uem.UnitedProblem(linear(b.u, 1.0, 0.0), b.u, bcs=bcs, contacts=[contact], rtol=1e-12)
-    run(problem)
-    for part in contact.parts:
-        on = part.pair.trial.active
-        assert highest(COMM, np.abs(part.pressures[on] / (0.5 * press) - 1.0)) < 1e-9
-    total = contact.between("body 2", "body 1").force[-1]
-    assert total == pytest.approx(0.5 * press, rel=1e-9) and contact.max_pressure() == pytest.approx(0.5 * press, rel=1e-9)
-
-
-@pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
-def test_friction_at_sharp_edges(cell):
-    """Where a block slips, edges included, the traction is mu times the pressure; in 3D nodes that share a force have other normals."""
-    g, mu = dimension(cell), 0.2
-    b = blocks(COMM, cell, 2, 3)
-    contact = uem.GeneralContact(friction=mu)
-    aside = [0.1] + [0.0] * (g - 2) + [-0.02]
-    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=aside)]
-    problem = uem.UnitedProblem(linear(b.u, 1.0, 0.0), b.u, bcs=bcs, contacts=[contact])
-    run(problem, 2)
-    for part in contact.parts:
-        on = part.pair.trial.active
-        traction = np.linalg.norm(part.traction.x.array.reshape(-1, g)[part.nodes[on]], axis=1)
-        most = mu * part.pressures[on]
-        assert highest(COMM, np.abs(traction - most) - (0.0 if g == 2 else 0.01) * most) < 1e-9
-
-
 def test_written_as_one(folder):
     """Files have one set of fields and columns for all that it consists of; the resultant is that of the rigid surfaces."""
     plane = uem.RigidPlane((0.0, -1.0), (0.0, 1.0))

@@ -362,9 +362,9 @@ class Contact(WatchedContact):
         if self.heat is not None:
             from uem_dolfinx.contact.heat import Heat
 
-            current, surface = self.measure == "current", self.surface
+            current, pair = self.measure == "current", self._pair
             self._pair.heat = Heat(
-                self._pair, self.heat, areas=lambda: (surface.current if current else surface.reference)[nodes], current=current,
+                pair, self.heat, areas=lambda: self.areas_facing(nodes, pair.kinematics, current), current=current,
                 pressed=self.measured_areas,
             )  # fmt: skip
             if self.heat.perfect:
@@ -413,7 +413,7 @@ class Contact(WatchedContact):
             )
         return Sliding(
             self.config, nodes, discretisation, law=law, value=np.zeros(len(nodes)) if value is None else value,
-            limits=Limits(lambda: self.surface.reference[nodes], duration), free=free, keeps_feet=self.sliding != "finite",
+            limits=Limits(lambda at: self.areas_facing(nodes, at, False), duration), free=free, keeps_feet=self.sliding != "finite",
             value_now=self._friction_now,
         )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -15,7 +16,7 @@ from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
 
@@ -32,12 +33,10 @@ class GeneralPart(Contact):
     #: Of all bodies.
     _skin: Skin
 
-    def measured_areas(self) -> Array:
-        """As of ``ContactResults``: of nodes on sharp edges the facets count as far as they face what touches (collective)."""
-        if self.coupling == "mortar":
-            return super().measured_areas()
-        current, pair = self.measure == "current", self.pair
-        return pair.areas(self._skin.areas_facing(pair.nodes, pair.projection.normal, current), current, self._areas)
+    @cached_property
+    def surface(self) -> Areas:
+        """See ``ContactResults``."""
+        return super().surface if self.coupling == "mortar" else self._skin.areas
 
     def friction_values(self) -> Array:
         """Values that friction has at this rank's contactors, by whatever pair."""

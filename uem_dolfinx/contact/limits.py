@@ -19,7 +19,8 @@ class Limits:
     """Limits of friction of the contactors of one interface.
 
     Args:
-        areas: of the contactors' reference surface ``(n,)``, asked for by laws that need them (collective).
+        areas: of the contactors' reference surface towards what they touch ``(n,)``, asked for by laws that need them; before
+            contactors have been placed, for None, all of it (collective).
         duration: length of the present step, a time; None in statics.
 
     Attributes:
@@ -32,7 +33,7 @@ class Limits:
     law: FrictionLaw
     value: Array
 
-    def __init__(self, areas: Callable[[], Array], duration: Callable[[], float] | None):
+    def __init__(self, areas: Callable[[Kinematics | None], Array], duration: Callable[[], float] | None):
         self._areas_of, self._duration = areas, duration
         #: Forces along the normal that limits stay with while these change ``(n,)``.
         self._held: Array | None = None
@@ -40,7 +41,7 @@ class Limits:
     def set(self, law: FrictionLaw, value: Array) -> Array:
         """Take a law, and the values of its parameter ``(n,)``: the slopes of the cones of contactors that do not press (collective)."""
         self.law = law
-        self.area = self._areas = self._areas_of() if law.per_area else np.zeros(len(value))
+        self.area = self._areas_of(None) if law.per_area else np.zeros(len(value))
         self.speed = np.zeros(len(value))
         return self.change(value)
 
@@ -52,7 +53,7 @@ class Limits:
     def grow(self, kinematics: Kinematics) -> None:
         """Take the areas where contactors are now (collective)."""
         if self.law.per_area:
-            self.area = kinematics.areas(self._areas, False)
+            self.area = kinematics.areas(self._areas_of(kinematics), False)
 
     def see(self, way: Array) -> None:
         """Take how far contactors have slipped in the present step ``(n,)``."""

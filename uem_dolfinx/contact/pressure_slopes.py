@@ -48,23 +48,24 @@ class PressureSlopes:
         equations: of its pair, in the present state.
 
     Raises:
-        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn; and for a
-            part of a general contact of nodes, at whose sharp edges the areas do.
+        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn; likewise at sharp
+            edges of contactors, without mortar.
     """
 
     def __init__(self, contact: Contact, equations: Constraints):
         self.contact, self._pair, self._equations = contact, contact.pair, equations
         self._config, self._current = contact.config, contact.measure == "current"
-        if contact.of_all_surfaces and contact.coupling != "mortar":
-            raise InputError(
-                f"contact '{contact.name}': pressures of nodes of a general contact have no derivatives: expected a Contact of "
-                "a pair of surfaces"
-            )
         held = self._pair.trial.active & self._pair.trial.in_corner
         if reduced(self._config.comm, int(held.sum())):
             raise InputError(
                 f"contact '{contact.name}': a concave corner of the target holds contactors, whose pressures have no derivatives here; "
                 "take forces: the residual with a Function in place of its test function"
+            )
+        sharp = contact.coupling != "mortar" and self._pair.trial.active & contact.surface.at_sharp_edges(contact.nodes)
+        if reduced(self._config.comm, int(np.sum(sharp))):
+            raise InputError(
+                f"contact '{contact.name}': nodes at sharp edges of the contactor touch, and their areas towards the target have no "
+                "derivatives here: leave the facets beside the edge out of the contactor, or take forces"
             )
         areas, self._pressures = contact.measured_areas(), contact.pressures
         self._over = np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from mpi4py import MPI
 
@@ -15,6 +16,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Indices, cross_products
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import Areas
@@ -68,6 +70,7 @@ class ContactResults:
     Attributes:
         name: for messages and files.
         contactor: facets whose nodes are the contactors, or points.
+        coupling: word for the discretisation, or a class of the user's.
         measure: what pressures and tractions are forces per area of: ``"reference"`` or ``"current"``.
         config: configuration of the displacement, once the contact belongs to a problem.
         taken: whether it does.
@@ -75,6 +78,7 @@ class ContactResults:
 
     name: str
     contactor: Part
+    coupling: Any
     measure: str
     config: Configuration
     taken: bool
@@ -120,8 +124,16 @@ class ContactResults:
     def measured_areas(self) -> Array:
         """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
         current = self.measure == "current"
-        areas = self.surface.current[self.pair.nodes] if current else self._areas
-        return self.pair.areas(areas, current, self._areas)
+        return self.pair.areas(self.areas_facing(self.nodes, self.pair.kinematics, current), current, self._areas)
+
+    def areas_facing(self, nodes: Indices, kinematics: Kinematics | None, current: bool) -> Array:
+        """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over what faces the target (collective).
+
+        They are those over the whole surface with mortar, whose segments tell what faces the target, and before any placement.
+        """
+        if self.coupling == "mortar" or kinematics is None:
+            return (self.surface.current if current else self.surface.reference)[nodes]
+        return self.surface.facing(nodes, kinematics.projection.normal, current)
 
     def _pressing(self) -> tuple[Array, Array]:
         """Forces across ``(n_contactors,)`` and along ``(n_contactors, gdim)`` the target that these are divided into (collective)."""
@@ -141,8 +153,9 @@ class ContactResults:
     def pressures(self) -> Array:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
-        The normal force over the node's tributary area, of which ``coupling="mortar"`` takes what the target covers; ``measure`` says
-        whether of the reference or of the current surface. It is negative where tied surfaces pull.
+        The normal force over the node's tributary area: with ``coupling="mortar"`` what the target covers of it, else at sharp edges
+        what faces the target. ``measure`` says whether of the reference or of the current surface. It is negative where tied surfaces
+        pull.
         """
         areas = self.measured_areas()
         return np.where(areas > 0, self._pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)

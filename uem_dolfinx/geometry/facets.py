@@ -21,6 +21,11 @@ from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered
 FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
 
 
+#: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
+#: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
+SHARP_EDGE = 0.7
+
+
 @dataclass(frozen=True)
 class FacetData:
     """Target facets of one rank now.
@@ -145,9 +150,9 @@ class TargetFacets:
         """Nodes of the facets where they are now ``(m, nn, gdim)``."""
         return self.config.X[self.dofs] + self.config.displacement[self.dofs]
 
-    def normals(self) -> Array:
-        """Outward unit normals of the facets at their nodes, each its own ``(m, nn, gdim)``."""
-        return unit(self._area_vectors(self.x))
+    def normals(self, drawn: bool = False) -> Array:
+        """Outward unit normals of the facets at their nodes, each its own, now or as they were ``drawn``: ``(m, nn, gdim)``."""
+        return unit(self._area_vectors(self.config.X[self.dofs] if drawn else self.x))
 
     def middles(self, x: Array) -> tuple[Array, Array]:
         """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
@@ -219,3 +224,14 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
                 row += list(layout.entity_dofs(dim, number[dim][tuple(sorted(vertices[v] for v in local))]))
         rows.append(row)
     return np.array(rows, dtype=np.int32)
+
+
+def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
+    """Places of numbers ``(n,)`` that are equal, each with each and with itself ``(k,)``."""
+    order = np.argsort(numbers, kind="stable")
+    first = np.searchsorted(numbers[order], numbers[order], side="left")
+    end = np.searchsorted(numbers[order], numbers[order], side="right")
+    count = end - first
+    i = np.repeat(np.arange(len(numbers)), count)
+    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+    return order[i], order[j]

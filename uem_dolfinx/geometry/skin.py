@@ -13,15 +13,11 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
-from uem_dolfinx.geometry.shapes import integrals
-from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.facets import SHARP_EDGE, FacetData, TargetFacets, pairs_of_equals, spread_of, unit
+from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced, sums_by_keys
 
-#: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
-#: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
-SHARP_EDGE = 0.7
 #: Classes of bodies by the size of their facets, which differs by less than this factor in a class: there the order of the mesh's
 #: input tells who follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
@@ -173,27 +169,10 @@ class Skin(TargetFacets):
             self._spread[there] = spread_of(sums)
         return self._spread
 
-    def areas_facing(self, nodes: Indices, normal: Array, current: bool) -> Array:
-        """Areas of owned nodes towards what touches them with outward normals ``normal (n, gdim)``: ``(n,)`` (collective).
-
-        Off sharp edges they are the integrals of the shape functions. At a sharp edge the facets count as far as they face what
-        touches, so that of a block's edge on a plane it is the base alone: ``sum_f (int_f N_i) max(0, -n_f . n_i)``.
-
-        Args:
-            nodes: contactors ``(n,)``.
-            normal: of what they touch.
-            current: whether of facets where they are now, else as they were drawn; normals are those of now.
-        """
-        config, g = self.config, self.config.gdim
-        areas = integrals(self.shape, self.x if current else config.X[self.dofs], config.axisymmetric)
-        told: Array = np.concatenate([np.stack([areas, self._sharp_nodes], axis=2), self.normals()], axis=2).reshape(-1, 2 + g)
-        there, arrived = config.send_to_owners(self.nodes.ravel(), told)
-        row = np.full(config.n_owned, -1)
-        row[nodes] = np.arange(len(nodes))
-        own = row[there] >= 0
-        row, (area, sharp), facing = row[there][own], arrived[own, :2].T, arrived[own, 2:]
-        cosine = np.where(sharp > 0, np.maximum(-np.einsum("kg,kg->k", facing, normal[row]), 0.0), 1.0)
-        return sums_of_rows(row, (area * cosine)[:, None], len(nodes))[:, 0]
+    @cached_property
+    def areas(self) -> Areas:
+        """Of the whole surface."""
+        return Areas(self.config, self.tag, self)
 
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
@@ -213,14 +192,3 @@ class Skin(TargetFacets):
         cones[there, place + 1] = arrived.reshape(-1, 2, g)
         cones[:, 0] = unit(cones.sum(axis=1))
         return cones[nodes]
-
-
-def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
-    """Places of numbers ``(n,)`` that are equal, each with each and with itself ``(k,)``."""
-    order = np.argsort(numbers, kind="stable")
-    first = np.searchsorted(numbers[order], numbers[order], side="left")
-    end = np.searchsorted(numbers[order], numbers[order], side="right")
-    count = end - first
-    i = np.repeat(np.arange(len(numbers)), count)
-    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
-    return order[i], order[j]

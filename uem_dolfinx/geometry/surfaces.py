@@ -5,19 +5,22 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Indices
-from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.errors import OrientationError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, pairs_of_equals
+from uem_dolfinx.geometry.shapes import integrals
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import Exchange, agree, reduced
 
 
 def surface_nodes(config: Configuration, tag: Tag) -> Indices:
@@ -33,10 +36,11 @@ class Areas:
     Args:
         config: configuration of the displacement.
         tag: of the surface, or of points, which have no area.
+        facets: of the surface, if they are made already.
     """
 
-    def __init__(self, config: Configuration, tag: Tag):
-        self._config, self._tag = config, tag
+    def __init__(self, config: Configuration, tag: Tag, facets: TargetFacets | None = None):
+        self._config, self._tag, self._made = config, tag, facets
 
     def integral(self, q: Any, current: bool) -> ufl.Form:
         """Of a scalar q over the surface of facets, where it is now or as it was drawn, in UFL."""
@@ -77,6 +81,66 @@ class Areas:
     def current(self) -> Array:
         """Over the surface where it is now, per local node ``(n_local,)`` (collective)."""
         return self.reference if self._tag.dim == 0 else self._assembled(self._stretched)
+
+    @cached_property
+    def _sharp(self) -> tuple[TargetFacets, Ints, Ints, Exchange] | None:
+        """Facets, some of them with a node of theirs at a sharp edge ``(k,)``, and the exchange of these with the nodes' owners.
+
+        None if no rank has any (first time: collective).
+        """
+        config, comm = self._config, self._config.comm
+        try:
+            facets = self._made or TargetFacets(config, self._tag, "contactor")
+        except OrientationError:
+            # inside a body there is no outside to face
+            return None
+        nodes, drawn = facets.nodes.ravel(), facets.normals(drawn=True).reshape(-1, config.gdim)
+        exchange = Exchange.to(comm, config.owner_of(nodes))
+        there, normal = exchange.send(nodes, drawn)
+        i, j = pairs_of_equals(there)
+        apart = np.einsum("kg,kg->k", normal[i], normal[j]) < SHARP_EDGE
+        at = np.isin(there, there[i[apart]])
+        if not reduced(comm, bool(at.any()), op=MPI.LOR):
+            return None
+        sharp = np.zeros(len(nodes), bool)
+        (sharp[exchange.rows],) = exchange.back(at)
+        facet, node = np.nonzero(sharp.reshape(facets.nodes.shape))
+        return facets, facet, node, Exchange.to(comm, config.owner_of(facets.nodes[facet, node]))
+
+    def at_sharp_edges(self, nodes: Indices) -> Bools:
+        """Which owned ``nodes (n,)`` are at edges or corners where normals of facets are more than 45 degrees apart (collective)."""
+        at = np.zeros(self._config.n_owned, bool)
+        if self._tag.dim > 0 and self._sharp is not None:
+            facets, facet, node, exchange = self._sharp
+            (there,) = exchange.send(facets.nodes[facet, node])
+            at[there - self._config.first] = True
+        return at[nodes]
+
+    def facing(self, nodes: Indices, normal: Array, current: bool) -> Array:
+        """Areas of contactors towards what they touch ``(n,)`` (collective).
+
+        Those of the whole surface, but at a sharp edge, whose facets count as far as they face what is touched:
+        ``sum_f (int_f N_i) max(0, -n_f . n)``. So the area of a block's edge on a plane is that of its base.
+
+        Args:
+            nodes: owned nodes of the surface ``(n,)``.
+            normal: outward normals of what they touch ``(n, gdim)``.
+            current: whether of facets where they are now, else as they were drawn; normals are those of now.
+        """
+        areas = np.array((self.current if current else self.reference)[nodes])
+        if self._tag.dim == 0 or self._sharp is None:
+            return areas
+        config, (facets, facet, node, exchange) = self._config, self._sharp
+        x = facets.x if current else config.X[facets.dofs]
+        integral = integrals(facets.shape, x, config.axisymmetric)[facet, node]
+        there, area, facing = exchange.send(facets.nodes[facet, node], integral, facets.normals()[facet, node])
+        row = np.full(config.n_owned, -1)
+        row[nodes] = np.arange(len(nodes))
+        row = row[there - config.first]
+        row, area, facing = row[row >= 0], area[row >= 0], facing[row >= 0]
+        areas[row] = 0.0
+        np.add.at(areas, row, area * np.maximum(-np.einsum("kg,kg->k", facing, normal[row]), 0.0))
+        return areas
 
 
 def tributary_areas(config: Configuration, tag: Tag) -> Array:
