@@ -315,11 +315,6 @@ def test_what_is_refused():
     refused(uem.InputError, ("contact 'c'", "temperature", "leave it out"), lambda: made(temperature=1.0))
     refused(uem.InputError, ("contact 'c'", "rigid target", "give temperature"), lambda: made(target=floor))
     refused(uem.InputError, ("contact 'c'", "no friction"), lambda: made(friction_share=0.5))
-    refused(
-        uem.InputTypeError,
-        ("heat", "general contact", "declare a Contact"),
-        lambda: uem.GeneralContact(heat=uem.Conductance(1.0, field=1)),
-    )
     other = uem.Contact(b.high, b.low, heat=uem.Conductance(1.0, field=1))
     method = lambda *of, **how: None  # noqa: E731
     refused(

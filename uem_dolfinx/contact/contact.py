@@ -362,11 +362,7 @@ class Contact(WatchedContact):
         if self.heat is not None:
             from uem_dolfinx.contact.heat import Heat
 
-            current, pair = self.measure == "current", self._pair
-            self._pair.heat = Heat(
-                pair, self.heat, areas=lambda: self.areas_facing(nodes, pair.kinematics, current), current=current,
-                pressed=self.measured_areas,
-            )  # fmt: skip
+            self._pair.heat = Heat(self._pair, self.heat, self)
             if self.heat.perfect:
                 self._pair.trial = self._pair.committed = replace(self._pair.committed, heat=np.zeros(len(nodes)))
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])

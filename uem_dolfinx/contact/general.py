@@ -33,6 +33,7 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.pair_friction import FrictionOfPairs
     from uem_dolfinx.geometry.skin import Apart, Skin
 
@@ -61,6 +62,7 @@ class GeneralContact:
         max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
         measure: as of ``Contact``.
         name: for messages and files.
+        heat: as of ``Contact``: heat that passes where surfaces touch; with a ``temperature`` through rigid surfaces, too.
 
     Raises:
         InputError, InputTypeError: for an unknown word, or numbers out of their range.
@@ -81,7 +83,7 @@ class GeneralContact:
         max_penetration: float | None = None,
         measure: str = "reference",
         name: str = "general contact",
-        heat: None = None,
+        heat: Conductance | None = None,
         tied: None = None,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
@@ -103,9 +105,11 @@ class GeneralContact:
             if max_penetration is not None:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
-            for what, value, does in (("heat", heat, "lets no heat through"), ("tied", tied, "ties nothing")):
-                given.kind(what, value, value is None, f"None: a general contact {does}", "declare a Contact for it")
-        self.surfaces, self.bodies, self.friction = surfaces, dict(bodies or {}), friction
+            given.kind("heat", heat, heat is None or hasattr(heat, "conductances"), "a Conductance, or None")
+            given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
+            if heat is not None and heat.temperature is not None and not self.rigid:
+                raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
+        self.surfaces, self.bodies, self.friction, self.heat = surfaces, dict(bodies or {}), friction, heat
         self.max_penetration, self.name, self.self_contact = max_penetration, name, self_contact
         self.taken = False  # whether a problem has been made of it
         self._parts, self._fields = list[Contact](), dict[str, fem.Function]()
@@ -157,6 +161,7 @@ class GeneralContact:
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
                 "itself"
             )
+        self._refuse_open_conductance(config, bound)
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
             apart: list[Apart] = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
@@ -165,7 +170,10 @@ class GeneralContact:
                 tied = [False] * (len(pairs) - len(others)) + [c.tied is True for c in others]
                 apart = [_with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
             among = self._mortar if self.coupling == "mortar" else self._nodes
-            parts += among(nodes, place, itself, apart, bound, options)
+            heat = {} if self.heat is None else {"heat": self.heat.beside(None)}
+            parts += among(nodes, place, itself, apart, bound, options | heat)
+        if self.heat is not None and self.heat.temperature is not None:
+            options["heat"] = self.heat
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
@@ -175,6 +183,18 @@ class GeneralContact:
             self._give_friction(parts)
         self._parts = parts
         return parts
+
+    def _refuse_open_conductance(self, config: Configuration, bound: float) -> None:
+        """Raise InputError for heat that passes through gaps: what is farther than a facet is not looked at (collective)."""
+        if self.heat is None or not callable(self.heat.h):
+            return
+        gaps = bound * np.array([1.0, 1e-2, 1e-4])
+        open_ = self.heat.conductances(config.comm, self.name, np.zeros(3), gaps, np.zeros(3, bool))
+        if open_.any():
+            raise InputError(
+                f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
+                "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
+            )
 
     def _nodes(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
@@ -278,6 +298,15 @@ class GeneralContact:
     def active(self) -> fem.Function:
         """The number of bodies and rigid surfaces that contactors touch, as a scalar field (collective)."""
         return self._sum("active")
+
+    @property
+    def heat_flux(self) -> fem.Function:
+        """Power per area that goes from contactors to what they touch, as a scalar field; 0 without ``heat`` (collective)."""
+        return self._sum("heat_flux")
+
+    def heat_balance(self) -> float:
+        """Heat summed over all bodies over the sum of its nodal sizes, the largest of all contacts between bodies (collective)."""
+        return max([part.heat_balance() for part in self.parts if part.pair.target.n_nodes], default=0.0)
 
     @property
     def gap(self) -> fem.Function:

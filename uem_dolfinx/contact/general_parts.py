@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices, Ints, sums_of_rows
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.law import FrictionLaw
@@ -90,13 +90,19 @@ class AmongContact(BodiesContact):
 
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
 
-    def _pressing(self) -> tuple[Array, Array]:
+    def pressing(self) -> tuple[Array, Array]:
         """With forces by which nodes at sharp edges are followed by what they follow: these press on the same areas (collective)."""
-        (across, along), pair = super()._pressing(), self.pair
+        (across, along), pair = super().pressing(), self.pair
         received, normal, spread = self._received(), pair.projection.normal, pair.discretisation.spread
         pressing = np.einsum("ng,ng->n", received, normal)
         sliding = received - pressing[:, None] * normal
         return across + spread(pressing), along + np.column_stack([spread(part) for part in sliding.T])
+
+    def leads(self) -> Bools:
+        """See ``ContactResults``: those whose bodies follow, not those at edges that are followed as well (collective)."""
+        skin, place = self._skin, self._neighbours.place
+        body = skin.values_at(self.pair.projection.facet, skin.body)
+        return np.asarray((body >= 0) & (place[skin.body_of_node[self.pair.nodes]] <= place[body]))
 
     def _received(self) -> Array:
         """Forces on active contactors by nodes of the body that they touch which follow them, where either is at a sharp edge.

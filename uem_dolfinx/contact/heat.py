@@ -11,7 +11,6 @@ closed: one unknown of each contactor that touches is eliminated, and the heat i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -71,8 +70,23 @@ class Pair(Protocol):
     def off(self) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""
 
+
+class Declared(Protocol):
+    """What heat asks of the contact; as those of ``ContactResults``."""
+
+    measure: str
+
+    def areas_facing(self, nodes: Indices, kinematics: Kinematics | None, current: bool) -> Array:
+        """Areas of contactors towards the target ``(n,)`` (collective)."""
+
+    def measured_areas(self) -> Array:
+        """Areas that pressures are forces over ``(n,)``, zero where there is none (collective)."""
+
     def pressing(self) -> tuple[Array, Array]:
         """Forces across ``(n,)`` and along ``(n, gdim)`` the target (collective)."""
+
+    def leads(self) -> Bools:
+        """Contactors through which heat passes ``(n,)`` (collective)."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +95,11 @@ class Passage(Sides):
 
     Attributes:
         areas: that heat passes through ``(n,)``.
+        leads: contactors that it passes where they touch ``(n,)``.
     """
 
     areas: Array
+    leads: Bools
 
     @property
     def jump(self) -> Array:
@@ -91,9 +107,9 @@ class Passage(Sides):
         return self.own - self.theirs
 
 
-def passage(pair: Pair, areas: Array, current: bool) -> Passage:
+def passage(pair: Pair, areas: Array, current: bool, leads: Bools) -> Passage:
     """What is opposite to contactors where they have been placed; ``areas`` and ``current`` as of ``Kinematics`` (collective)."""
-    return Passage(**vars(sides_of(pair)), areas=pair.kinematics.mean_areas(areas, current))
+    return Passage(**vars(sides_of(pair)), areas=pair.kinematics.mean_areas(areas, current), leads=leads)
 
 
 class HeatEquations(NamedTuple):
@@ -116,15 +132,13 @@ class Heat:
     Args:
         pair: the interface.
         law: what conducts.
-        areas: tells integrals of the shape functions at the contactors ``(n,)`` (collective).
-        current: whether they are those of the surface where it is now.
-        pressed: tells areas that pressures are forces over ``(n,)``, zero where there is none (collective).
+        contact: which tells areas and pressures.
 
     Raises:
         InputError, SpaceError: if there is no such field, or if the target's temperature is not known, or given twice.
     """
 
-    def __init__(self, pair: Pair, law: Conductance, *, areas: Callable[[], Array], current: bool, pressed: Callable[[], Array]):
+    def __init__(self, pair: Pair, law: Conductance, contact: Declared):
         words, config = f"contact '{pair.name}': heat", pair.config
         if not isinstance(config, ConfigurationAmongFields):
             raise InputError(
@@ -139,7 +153,7 @@ class Heat:
                 f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
             )
         self.law, self.field, self._pair = law, nodal_field(config, law.field, words), pair
-        self._areas, self._current, self._pressed = areas, current, pressed
+        self._contact = contact
         if law.perfect and self.field.weights.shape[1] > 1:
             raise SpaceError(
                 f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
@@ -158,7 +172,7 @@ class Heat:
     def equations(self) -> HeatEquations:
         """Of the temperatures of contactors that touch, and of those that may, which only keep their place (collective)."""
         pair, at, g = self._pair, self.passage, self._pair.config.gdim
-        which = np.flatnonzero(pair.united | pair.reserved)
+        which = np.flatnonzero((pair.united | pair.reserved) & self.passage.leads)
         place = np.full(len(pair.nodes), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         known: Any = at.halo.take(self.field.terms)
@@ -191,7 +205,7 @@ class Heat:
         """Largest jump of temperatures that are united, over the largest temperature there (collective)."""
         if not self.law.perfect:
             return 0.0
-        at, united = self.passage, self._pair.united & ~self._held
+        at, united = self.passage, self._pair.united & self.passage.leads & ~self._held
         hot = at.means(at.own, np.abs(self.field.values)) + at.means(at.theirs, np.abs(self.field.values))
         both = np.array([np.abs(self.jump()[united]).max(initial=0.0), hot[united].max(initial=0.0)])
         jump, size = reduced(self._pair.config.comm, both, op=MPI.MAX)
@@ -204,7 +218,9 @@ class Heat:
         """Of the last placement (collective)."""
         # a projection that is the same on one rank is so on all
         if self._passage is None or self._passage.projection is not self._pair.projection:
-            self._passage = passage(self._pair, self._areas(), self._current)
+            pair, current = self._pair, self._contact.measure == "current"
+            areas = self._contact.areas_facing(pair.nodes, pair.kinematics, current)
+            self._passage = passage(pair, areas, current, self._contact.leads())
         return self._passage
 
     def conductances(self) -> Array:
@@ -216,18 +232,18 @@ class Heat:
         closed = self._pair.united
         p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self._pair.projection.gap, 0.0))
         if callable(self.law.h):
-            p = np.where(closed, self._pair.pressing()[0] * self._per_area(), 0.0)
+            p = np.where(closed, self._contact.pressing()[0] * self._per_area(), 0.0)
         return p, g
 
     def _per_area(self) -> Array:
         """Pressures over forces ``(n,)`` (collective)."""
-        areas = self._pressed()
+        areas = self._contact.measured_areas()
         return np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)
 
     def _conductances(self, p: Array, g: Array) -> Array:
         pair, closed = self._pair, self._pair.united
         h = self.law.conductances(pair.config.comm, pair.name, p, g, closed)
-        return np.where(closed | ~pair.off, h, 0.0)
+        return np.where((closed | ~pair.off) & self.passage.leads, h, 0.0)
 
     def _slopes(self) -> Array:
         """Derivatives of the power with the pressures of closed contactors, and with the gaps of open ones ``(n,)`` (collective)."""
@@ -257,7 +273,8 @@ class Heat:
         if not self.law.perfect:
             return np.asarray(self.conductances() * self.jump())
         # shape functions of degree 2 have no integral at some nodes
-        power, areas = (self._pair.discretisation.spread(part) for part in (self.power(), self.passage.areas))
+        through = np.where(self._pair.united & self.passage.leads, self.passage.areas, 0.0)
+        power, areas = (self._pair.discretisation.spread(part) for part in (self.power(), through))
         return np.where(areas > 0, power / np.where(areas > 0, areas, 1.0), 0.0)
 
     def friction(self) -> Array:
@@ -274,6 +291,9 @@ class Heat:
 
         Collective.
         """
+        if self._pair.kinematics.idle:
+            none = np.zeros(self._pair.config.n_owned)
+            return none, none
         at = self.passage
         passing = at.hand_on(at.jump, self.power())
         if self.law.friction_share is None:
@@ -283,6 +303,8 @@ class Heat:
 
     def sizes(self) -> Array:
         """Sizes of what the heat's terms are differences of, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        if self._pair.kinematics.idle:
+            return self.field.rows(np.zeros(self._pair.config.n_owned))
         at, pair, hot = self.passage, self._pair, np.abs(self.field.values)
         size = np.zeros(len(at.areas))
         if not self.law.perfect:
@@ -304,6 +326,8 @@ class Heat:
         Returns:
             Pairs of global rows ``(k, m)``, -1 for none, and blocks ``(k, m gdim, m gdim)``.
         """
+        if self._pair.kinematics.idle:
+            return []
         at, jumps = self.passage, self._jumps()
         kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
         found = [_dyads(kappa, jumps, jumps)]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.arrays import Array, Indices, cross_products
+from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.errors import InputError, SurfaceError
@@ -135,9 +135,13 @@ class ContactResults:
             return (self.surface.current if current else self.surface.reference)[nodes]
         return self.surface.facing(nodes, kinematics.projection.normal, current)
 
-    def _pressing(self) -> tuple[Array, Array]:
+    def pressing(self) -> tuple[Array, Array]:
         """Forces across ``(n_contactors,)`` and along ``(n_contactors, gdim)`` the target that these are divided into (collective)."""
         return self.pair.pressing()
+
+    def leads(self) -> Bools:
+        """Contactors through which heat passes where they touch: of two that follow each other one ``(n_contactors,)`` (collective)."""
+        return np.ones(len(self.nodes), bool)
 
     @property
     def nodes(self) -> Indices:
@@ -158,7 +162,7 @@ class ContactResults:
         pull.
         """
         areas = self.measured_areas()
-        return np.where(areas > 0, self._pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
+        return np.where(areas > 0, self.pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
@@ -197,7 +201,7 @@ class ContactResults:
     @property
     def traction(self) -> fem.Function:
         """Force of friction, or of a tie, along the target per area that ``pressure`` is measured on, a vector field (collective)."""
-        tau, areas = self._pressing()[1], self.measured_areas()[:, None]
+        tau, areas = self.pressing()[1], self.measured_areas()[:, None]
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
     @property

@@ -262,7 +262,7 @@ class ResultsWriter(Closing):
         for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
             found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
             found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
-            if isinstance(contact, Contact) and contact.heat is not None:
+            if contact.heat is not None:
                 found[f"heat_flux{suffix}"] = contact.heat_flux
         return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any, TypeAlias
 
 from mpi4py import MPI
@@ -59,6 +60,12 @@ class Conductance:
     def perfect(self) -> bool:
         """Whether temperatures are the same where surfaces touch."""
         return self.h == np.inf
+
+    def beside(self, temperature: float | fem.Constant | None) -> Conductance:
+        """The same with another temperature of the target."""
+        other = copy(self)
+        other.temperature = temperature
+        return other
 
     @property
     def parameters(self) -> dict[str, Any]:
