@@ -21,6 +21,7 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
+from uem_dolfinx.compiled import kept
 from uem_dolfinx.errors import InputError, MissingBackendError
 
 if TYPE_CHECKING:
@@ -125,9 +126,6 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
             of these in a list make a mixed space, as ``[("Lagrange", 2, (2,)), 1]`` of a displacement and a pressure.
         shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
 
-    Returns:
-        The function space.
-
     Raises:
         InputError: for another element.
     """
@@ -148,6 +146,7 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
         raise InputError(f"element = {element!r} ({error}): expected a family and a degree that DOLFINx knows") from error
 
 
+@kept()
 def _mixed_space(domain: Any, elements: list[Any]) -> Any:
     if DOLFINX_VERSION < (0, 7):
         return fem.FunctionSpace(domain, ufl.MixedElement(elements))
@@ -156,6 +155,7 @@ def _mixed_space(domain: Any, elements: list[Any]) -> Any:
     return fem.functionspace(domain, mixed_element(elements))
 
 
+@kept()
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
     if hasattr(fem, "functionspace"):
         return fem.functionspace(domain, (family, degree, shape) if shape else (family, degree))

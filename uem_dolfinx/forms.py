@@ -28,6 +28,7 @@ from ufl.mathfunctions import MathFunction
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
+from uem_dolfinx.compiled import kept
 from uem_dolfinx.parallel import reduced
 
 #: Integrands that are no polynomials get a quadrature rule of this times the degree of the displacement.
@@ -142,13 +143,14 @@ def sum_ghosts(u: Any) -> None:
 def form(integrals: Any) -> Any:
     """Compile a UFL form, or a nested sequence of them, for real arithmetic; one with two kinds of rules becomes a list of parts."""
     if not isinstance(integrals, ufl.Form):
-        return fem.form(integrals, dtype=np.float64)
+        with kept():
+            return fem.form(integrals, dtype=np.float64)
     parts = [_compiled(part) for part in _by_rules(integrals)]
     return parts[0] if len(parts) == 1 else parts
 
 
 def _compiled(F: ufl.Form) -> Any:
-    with compat.named_for_code(F):
+    with compat.named_for_code(F), kept():
         return fem.form(_of_one_subdomain_data(_of_sensible_degree(F)), dtype=np.float64)
 
 

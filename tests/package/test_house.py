@@ -17,7 +17,7 @@ import thresholds
 REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
-    ("arrays", "errors", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
+    ("arrays", "errors", "compiled", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
     ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("output",), ("scripting",),
 ]  # fmt: skip
 LONGEST = 450
