@@ -12,6 +12,7 @@ from helpers import at, box, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.geometry import candidates
 from uem_dolfinx.geometry.candidates import candidate_pairs
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -101,9 +102,11 @@ def test_curved_facets_are_within_their_bounds(cell, degree):
     assert (N @ worst).max() == pytest.approx(1 + 0.5 * (shape.lebesgue - 1))
 
 
+@pytest.mark.parametrize("at_once", [0, candidates.ALL_PAIRS])
 @pytest.mark.parametrize("cell", ["interval", "triangle", "quadrilateral"])
-def test_no_facet_is_forgotten(cell):
-    """Facets as wild as they can be: the candidates of a point hold the facet that is nearest by samples."""
+def test_no_facet_is_forgotten(cell, at_once, monkeypatch):
+    """Facets as wild as they can be: the candidates of a point hold the facet that is nearest by samples, of many and of few."""
+    monkeypatch.setattr(candidates, "ALL_PAIRS", at_once)
     shape, rng = facet_shape(cell, 2), np.random.default_rng(1)
     x = rng.normal(size=(40, 1, shape.dim + 1)) + 0.7 * rng.normal(size=(40, len(shape.nodes), shape.dim + 1))
     points = 2.0 * rng.normal(size=(200, shape.dim + 1))

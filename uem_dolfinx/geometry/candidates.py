@@ -11,11 +11,14 @@ from uem_dolfinx.log import timed
 #: Facets whose distances differ by less are equally near, and those whose heights do are faced alike.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
 EQUALLY_NEAR = 1e-9
+#: So few pairs are all measured at once, which takes less time than trees.
+#: [bound; points times facets; test_thresholds_geometry.py::test_no_facet_is_forgotten]
+ALL_PAIRS = 2**15
 
 
 @timed("search")
 def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
-    """Indices ``(k,)`` of points and of facets that can be closest, from trees over the facets' middles, one per size class.
+    """Indices ``(k,)`` of points and of facets that can be closest, of many from trees over the facets' middles, one per size class.
 
     A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
     into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
@@ -23,16 +26,21 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
     """
     if len(points) == 0 or len(x) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    from scipy.spatial import cKDTree
-
-    tab = shape.tabulate(np.tile(shape.middle, (len(x), 1)))
+    tab = shape.at_middle(len(x))
     middle = np.einsum("na,nag->ng", tab.N, x)
     arm = x - middle[:, None]
     radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
     normal = unit_normals(tab, x)
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
-    bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
-    i, f = balls_that_meet(points, bound, middle, radius)
+    if len(points) * len(x) <= ALL_PAIRS:
+        distance = np.sqrt(sum((points[:, None, k] - middle[:, k]) ** 2 for k in range(points.shape[1])))
+        bound = distance.min(axis=1) * (1 + EQUALLY_NEAR)
+        i, f = np.nonzero(distance <= bound[:, None] + radius)
+    else:
+        from scipy.spatial import cKDTree
+
+        bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
+        i, f = balls_that_meet(points, bound, middle, radius)
     # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))

@@ -101,7 +101,7 @@ class TargetFacets:
     def _orient(self, cell_dofs: Indices) -> None:
         """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
         X, x = self.config.X, self.config.X[self.dofs]
-        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
+        tab = self.shape.at_middle(len(x))
         inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
         height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
         self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
@@ -156,7 +156,7 @@ class TargetFacets:
 
     def middles(self, x: Array) -> tuple[Array, Array]:
         """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
-        tab = self.shape.tabulate(np.tile(self.shape.middle, (len(x), 1)))
+        tab = self.shape.at_middle(len(x))
         return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
 
     def _area_vectors(self, x: Array) -> Array:

@@ -118,7 +118,7 @@ class MeshTarget:
             n, g, nn, d = len(points), self.facets.config.gdim, self.n_nodes, self.shape.dim
             facet, none = np.zeros((nn, g)), np.zeros((n, g))
             facet[:, :d] = self.stride * self.shape.nodes
-            tab = self.shape.tabulate(np.tile(self.shape.middle, (n, 1)))
+            tab = self.shape.at_middle(n)
             self._nowhere = FacetProjection(
                 np.full(n, self.facets.config.size), none, np.full((n, nn), -1), np.zeros((n, nn)), np.full(n, -1), none,
                 np.full(n, np.inf), np.zeros((n, d)), none, none, np.tile(facet, (n, 1, 1)), tab.dN, tab.ddN, np.zeros((n, d, g)),

@@ -131,6 +131,15 @@ class FacetShape:
         pieces[turned, 1:] = pieces[turned, :0:-1]
         return pieces
 
+    def at_middle(self, n: int) -> Tabulated:
+        """Shape functions at the middles of n facets (a view: not to be changed)."""
+        tab = self._at_middle
+        return Tabulated(*(np.broadcast_to(values, (n, *values.shape[1:])) for values in (tab.N, tab.dN, tab.ddN)))
+
+    @cached_property
+    def _at_middle(self) -> Tabulated:
+        return self.tabulate(self.middle[None])
+
     def contains(self, xi: Array) -> npt.NDArray[np.bool_]:
         """Which ``xi (n, fdim)`` lie in the closed reference facet."""
         below = xi.sum(axis=1) <= 1 if self.cell == "triangle" else (xi <= 1).all(axis=1)
@@ -146,6 +155,10 @@ class FacetShape:
 
     def edges(self) -> list[tuple[FacetShape, Indices, Array, Array]]:
         """Boundary of the facet: per side its shape, its nodes in the facet, and the map ``xi = o + s @ D``."""
+        return self._edges
+
+    @cached_property
+    def _edges(self) -> list[tuple[FacetShape, Indices, Array, Array]]:
         if self.dim == 0:
             return []
         corners = facet_shape(self.cell, 1).nodes
@@ -235,19 +248,22 @@ def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> tuple[Arra
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
     """Newton on ``(p - y) . y,alpha = 0``; infinitely far where it ends outside the facet."""
     xi, d2, todo = _nearest_sample(shape, x, p), np.full(len(p), np.inf), np.arange(len(p))
-    for _ in range(1 if shape.affine else iterations):
+    if shape.affine:
+        tab = shape.at_middle(len(p))
+        t, r = tangents(tab, x), p - np.einsum("na,nag->ng", tab.N, x)
+        xi += np.linalg.solve(np.einsum("nfg,neg->nfe", t, t), np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
+    for _ in range(0 if shape.affine else iterations):
         if not len(todo):
             break
         tab = shape.tabulate(xi[todo])
         r = p[todo] - np.einsum("na,nag->ng", tab.N, x[todo])
         t = tangents(tab, x[todo])
         m = np.einsum("nfg,neg->nfe", t, t)
-        if not shape.affine:
-            curved = m - np.einsum("ng,nag,nafe->nfe", r, x[todo], tab.ddN)
-            convex = np.linalg.eigvalsh(curved)[:, 0] > 0.0
-            m = np.where(convex[:, None, None], curved, m)
+        curved = m - np.einsum("ng,nag,nafe->nfe", r, x[todo], tab.ddN)
+        convex = np.linalg.eigvalsh(curved)[:, 0] > 0.0
+        m = np.where(convex[:, None, None], curved, m)
         step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
-        xi[todo] += step if shape.affine else _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))
+        xi[todo] += _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))
         far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1)
         todo = todo[(np.abs(step).max(axis=1) > 1e-15) & ~far]
     inside = shape.contains(xi)
@@ -277,5 +293,5 @@ def _descending(shape: FacetShape, x: Array, p: Array, xi: Array, step: Array) -
 
 def _squared_distance(shape: FacetShape, x: Array, p: Array, xi: Array) -> Array:
     """Of points ``p (n, gdim)`` to their facets' points ``xi (n, fdim)``: ``(n,)``."""
-    r = p - np.einsum("na,nag->ng", shape.tabulate(xi).N, x)
+    r = p - np.einsum("na,nag->ng", shape.functions(xi), x)
     return np.einsum("ng,ng->n", r, r)
