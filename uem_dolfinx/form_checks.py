@@ -21,6 +21,8 @@ from ufl.differentiation import CompoundDerivative, Derivative
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
 
+#: Signatures of forms in which every term was found to hold all arguments once.
+_with_all_arguments: set[str] = set()
 #: What a functional may be differentiated by.
 Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
 
@@ -64,13 +66,16 @@ def _arguments(what: str, form: Any, domain: Any, fault: str, expected: str) -> 
     # UFL fails where meshes mix
     _check_mesh(what, form, domain)
     try:
-        arguments = form.arguments()
+        arguments, alike = form.arguments(), form.signature()
+        if alike in _with_all_arguments:
+            return arguments
         # gradients are linear, and take longer to be expanded than all the rest
         if not (_is_expanded(form) and _holds_once(apply_algebra_lowering(form), arguments)):
             # as form compilers do: the conj of ufl.inner is none of a real form
             check_form_arity(remove_complex_nodes(ufl.algorithms.expand_derivatives(form)), arguments)
     except (Exception, ArityMismatch) as error:  # of which class depends on the version of UFL
         raise InputError(f"{what} is {fault} ({error}): expected {expected}") from error
+    _with_all_arguments.add(alike)
     return arguments
 
 

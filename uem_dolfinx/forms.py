@@ -63,6 +63,28 @@ def expanded(form: ufl.Form) -> ufl.Form | None:
     return None if found.empty() else found
 
 
+#: Of forms that have been expanded: which integrals are left, and which Functions and Constants of these, by the forms' signatures.
+_left: dict[str, tuple[list[int], list[int], list[int]]] = {}
+
+
+def with_derivatives(form: ufl.Form) -> tuple[ufl.Form, list[Any]]:
+    """The integrals of a form in which something is left once derivatives are taken, and the Functions and Constants that is made of.
+
+    The derivatives stay as they are written, for the compiler. Forms that are alike are expanded once in a process.
+    """
+    key = form.signature()
+    if key not in _left:
+        integrals = [k for k, one in enumerate(form.integrals()) if expanded(ufl.Form([one])) is not None]
+        kept_form = ufl.Form([form.integrals()[k] for k in integrals])
+        found = ufl.algorithms.expand_derivatives(kept_form)
+        functions = [kept_form.coefficients().index(f) for f in found.coefficients()]
+        _left[key] = integrals, functions, [kept_form.constants().index(c) for c in found.constants()]
+    integrals, functions, constants = _left[key]
+    if len(integrals) < len(form.integrals()):
+        form = ufl.Form([form.integrals()[k] for k in integrals])
+    return form, [*(form.coefficients()[k] for k in functions), *(form.constants()[k] for k in constants)]
+
+
 def cells_of_facets(domain: Any, facets: npt.ArrayLike) -> tuple[Indices, Indices]:
     """Cells of facets, ghosts included, and which of its cell's facets each is ``(k,)``; one that lies between two comes twice."""
     topology, entities = domain.topology, np.asarray(facets, dtype=np.int32)
@@ -227,6 +249,8 @@ def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
 
     Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
     """
+    if all(i.subdomain_data() is None for i in F.integrals()):
+        return F
     integrals = []
     for kind in dict.fromkeys(i.integral_type() for i in F.integrals()):
         own = F.integrals_by_type(kind)

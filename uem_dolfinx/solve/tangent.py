@@ -58,13 +58,12 @@ class Tangent:
         J = ufl.derivative(F, u)
         for material in materials:
             J += revolved(material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0]))
-        J = ufl.algorithms.expand_derivatives(J)
+        J, self._inputs = forms.with_derivatives(J)
         if J.empty():
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
         #: Whether K is the same for every u.
-        self.linear: bool = u not in J.coefficients()
+        self.linear: bool = not any(f is u for f in self._inputs)
         self._dynamics, self._factor, self._points = dynamics, 0.0, points
-        self._inputs = [*J.coefficients(), *J.constants()]
         self._values: list[Array] | None = None
         with compiling("the tangent"):
             self._form = forms.form(J)
