@@ -314,9 +314,9 @@ class _Dense:
         from scipy.linalg import lapack
 
         self._used, self._lapack = used, lapack
-        M = np.asarray((P if Q is None else Q).T @ np.ascontiguousarray((P.T @ S.T).T))
-        if G is not None:
-            M += ((P if Q is None else Q).T @ G @ P).toarray()
+        A, trial = S if G is None else S + G.toarray(), P.T
+        test = trial if Q is None else Q.T
+        M = np.asarray(test @ np.ascontiguousarray((trial @ A.T).T))
         self._positive = self.negative = self.indefinite = False
         if not len(M):
             # every component is eliminated or prescribed

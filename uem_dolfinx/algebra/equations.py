@@ -97,6 +97,8 @@ def least_left(A: Array) -> Array:
     """What nodes have left to eliminate by k equations each with directions ``A (n, k, block)``, the least singular value ``(n,)``."""
     if A.shape[1] > A.shape[2]:
         return np.zeros(len(A))
+    if A.shape[1] == 1:
+        return np.asarray(np.linalg.norm(A[:, 0], axis=1))
     return np.asarray(np.linalg.svd(A, compute_uv=False)[:, -1])
 
 

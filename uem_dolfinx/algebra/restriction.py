@@ -200,7 +200,9 @@ class Restriction:
             return T
         assert self._halo is not None
         M, asked = self._couplings(self.equations.active), self._follows
-        terms, power = [T], product(M, Blocks(asked, asked, self._halo.take(lambda i: self._turned(i).value)))
+        # T has blocks on its diagonal alone
+        turned = self._halo.take(lambda i: self._turned(i).value)
+        terms, power = [T], Blocks(M.row, M.column, M.value @ turned[self._term])
         while True:
             terms.append(power)
             if len(terms) > self.chain:
