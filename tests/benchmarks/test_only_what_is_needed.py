@@ -14,10 +14,12 @@ import pytest
 import ufl
 from counting import CONDENSED, CROSSED, FACTORISATION, HISTORY, MASS, OUTPUT, PRODUCT, PROJECTION, SEARCH, TANGENT, P, counted
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, environment, linear, run, scene, serial, st_venant
+from helpers import at, blocks, box, clamp, environment, linear, lowest, run, scene, serial, st_venant
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, form_checks, forms
+from uem_dolfinx.geometry import bodies
+from uem_dolfinx.geometry.facets import TargetFacets
 
 
 def block_over(comm, target_of, *, height=1.0, law=linear, **how):
@@ -210,6 +212,80 @@ def test_output_only_where_asked_for(comm, folder):
         writer.write(1.0)
     uem.write_checkpoint(folder / "state", problem.state())
     assert calls["write fields"] == calls["write table"] == 1
+
+
+# -- the same mesh again, and the same place -----------------------------------------------------------------------------------
+
+
+def calls_of(monkeypatch, where, name):
+    """Arguments of all calls of a function from now on."""
+    made, original = [], getattr(where, name)
+    monkeypatch.setattr(where, name, lambda *args, **how: made.append(args) or original(*args, **how))
+    return made
+
+
+def test_a_second_problem_on_a_mesh(comm, monkeypatch):
+    """Forms alike are neither expanded nor checked again, and which cells are connected is known, in spaces of any degree."""
+    b = blocks(comm, "triangle")
+    expanded = calls_of(monkeypatch, forms, "expanded")
+    checked = calls_of(monkeypatch, form_checks, "check_form_arity")
+    connected = calls_of(monkeypatch, bodies, "connected")
+    for k, degree in enumerate((1, 1, 2)):
+        V = compat.function_space(b.scene.mesh, degree, (2,))
+        u, E = fem.Function(V), fem.Constant(b.scene.mesh, 1000.0)
+        traction = ufl.inner(ufl.as_vector((0.0, 1.0)), ufl.TestFunction(V)) * uem.ds(b.top)
+        bcs, contact = clamp(V, b.bottom), uem.Contact(b.high, b.low)
+        problem = uem.UnitedProblem(linear(u, E) + traction, u, bcs=[*bcs, *clamp(V, b.top, 0)], contacts=[contact])
+        if k != 1:
+            assert expanded and checked
+        else:
+            assert not (expanded or checked)
+        assert len(connected) == (k == 0)
+        label, count = bodies.find_bodies(problem.config)
+        assert count == 2 and len(label) == problem.config.n_local
+        run(problem)
+        assert contact.resultant().force[1] == pytest.approx(1.0, rel=1e-8)
+        # the tangent knows of which Constants it is made
+        E.value *= 2.0
+        sunk = lowest(comm, problem.config.displacement[:, 1])
+        problem.solve()
+        assert lowest(comm, problem.config.displacement[:, 1]) == pytest.approx(0.5 * sunk, rel=1e-3)
+        for made in (expanded, checked, connected):
+            made.clear()
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_facets_are_placed_once_where_they_are(comm, cell, monkeypatch):
+    """Normals of a target that has not moved since are those that it had, whatever asks for them; after a motion they are others."""
+    b = blocks(comm, cell)
+    problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+    target, points = problem.contacts[0].pair.target, problem.contacts[0].pair.points
+    first, made = target.facets.current(corners=True), calls_of(monkeypatch, TargetFacets, "_summed")
+    for _ in range(3):
+        target.project_on(points, target.project(points).facet)
+    assert not made and target.facets.current() is first
+    b.u.x.array.reshape(-1, b.gdim)[:] = 0.3 * problem.config.X[:, ::-1] ** 2
+    now = target.facets.current(corners=True)
+    assert len(made) == 2
+    anew = TargetFacets(problem.config, b.low).current(corners=True)
+    for name in ("x", "nodal_normals", "corner_normals"):
+        assert np.array_equal(getattr(now, name), getattr(anew, name))
+    # on several ranks one whose facets stay takes part in what the others do
+    made.clear()
+    if comm.rank == 0:
+        b.u.x.array[:] = 0.0
+    target.facets.current()
+    assert len(made) == 1
+
+
+def test_surface_that_no_corner_comes_near(comm, monkeypatch):
+    """Facets of contactors are not oriented for corners of the target that are beside a contactor, or far away."""
+    made = calls_of(monkeypatch, TargetFacets, "__init__")
+    for overhang in (0.0, 0.5):
+        b = blocks(comm, "quadrilateral", overhang=overhang)
+        problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
+        run(problem)
+    assert [tag.name for _, _, tag, *_ in made] == ["low", "low"]
 
 
 # -- imports ---------------------------------------------------------------------------------------------------------------

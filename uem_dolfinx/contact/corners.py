@@ -197,18 +197,15 @@ def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints,
     if not reduced(comm, len(which)):
         return None
     k, gdim = facets.shape
-    first = target.project_on(points, facets[:, 0])
-    normals = np.zeros((k, gdim, gdim))
-    normals[:, 0] = target.outward(first)
+    row, j = np.nonzero(facets >= 0)
+    every = target.project_on(points[row], facets[row, j])
+    first = every.take(np.flatnonzero(j == 0))
+    normals, middles = np.zeros((2, k, gdim, gdim))
+    normals[row, j], middles[row, j] = target.outward(every), every.x.mean(axis=1)
     common = np.ones(first.nodes.shape, dtype=bool)
-    middles = np.zeros((k, gdim, gdim))
-    middles[:, 0] = first.x.mean(axis=1)
-    for j in range(1, gdim):
-        i = np.flatnonzero(facets[:, j] >= 0)
-        other = target.project_on(points[i], facets[i, j])
-        normals[i, j] = target.outward(other)
-        common[i] &= (first.nodes[i][:, :, None] == other.nodes[:, None, :]).any(axis=2)
-        middles[i, j] = other.x.mean(axis=1)
+    for n in range(1, gdim):
+        other, i = every.nodes[j == n], row[j == n]
+        common[i] &= (first.nodes[i][:, :, None] == other[:, None, :]).any(axis=2)
     count = (facets >= 0).sum(axis=1)
     place = _shared_place(target, first, points, common, count, normals)
     arms = middles - place.foot[:, None]

@@ -7,6 +7,7 @@ this place, is force that the contact lacks; beside the contact force it tells h
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from mpi4py import MPI
 
@@ -17,7 +18,7 @@ from uem_dolfinx.contact.active_set import TIED
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.facets import TargetFacets, nodes_of_facets
 from uem_dolfinx.geometry.search import MeshTarget, nearest_of
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
@@ -66,24 +67,26 @@ class TargetCorners:
     """
 
     def __init__(self, pair: Interface, tag: Tag):
-        self.pair, config = pair, pair.config
+        self.pair, self._tag, config = pair, tag, pair.config
         self._largest = 0.0
         #: Owned nodes of the target at corners and ends ``(k,)``, and whether any rank has one.
         self.nodes = corner_nodes(config, pair.target.facets) if isinstance(pair.target, MeshTarget) else np.zeros(0, np.int32)
         self.some = isinstance(pair.target, MeshTarget) and bool(reduced(config.comm, len(self.nodes)))
         if not self.some:
             return
-        try:
-            self.surface = MeshTarget(TargetFacets(config, tag, "contactor"))
-        except OrientationError:
-            # contactors inside a body have no outside that a corner could come from
-            self.some = False
-            return
-        x = self.surface.facets.x
+        x = config.x[nodes_of_facets(config, tag).dofs]
         sides = np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
         #: Sizes of the largest and of the smallest facet, lengths.
         self.reach: float = reduced(config.comm, float(np.ptp(x, axis=1).max(initial=0.0)), op=MPI.MAX)
         self.smallest: float = reduced(config.comm, float(sides.min(initial=np.inf)), op=MPI.MIN)
+
+    @cached_property
+    def surface(self) -> MeshTarget | None:
+        """The contactors' surface; None inside a body, which has no outside that a corner could come from (first time: collective)."""
+        try:
+            return MeshTarget(TargetFacets(self.pair.config, self._tag, "contactor"))
+        except OrientationError:
+            return None
 
     @timed("corners of the target")
     def find(self, stiffness: Array) -> CornerInside | None:
@@ -105,7 +108,7 @@ class TargetCorners:
         points, least = pair.points, ON_FACET * self.smallest
         distance, _ = nearest_of(comm, config.x[near], points, least, np.zeros((len(points), 1)))
         near = near[distance > least]
-        if not reduced(comm, len(near)):
+        if not reduced(comm, len(near)) or self.surface is None:
             return None
         points = config.x[near]
         p = self.surface.project(points)

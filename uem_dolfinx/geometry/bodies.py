@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 from weakref import WeakKeyDictionary
 
 from mpi4py import MPI
@@ -11,7 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
 
@@ -40,17 +41,26 @@ def rotations(sums: Array) -> Array:
 
 
 _FOUND: WeakKeyDictionary[Nodes, tuple[Ints, int]] = WeakKeyDictionary()
+#: Bodies of the cells of meshes, ghosts included, and their numbers: spaces on a mesh have the same bodies.
+_OF_CELLS: WeakKeyDictionary[Any, tuple[Ints, int]] = WeakKeyDictionary()
 
 
 def find_bodies(nodes: Nodes) -> tuple[Ints, int]:
-    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective; found once)."""
+    """Bodies as the cells connect them: the body of each local node ``(n_local,)`` and their number (collective; once for a mesh)."""
     if nodes not in _FOUND:
-        _FOUND[nodes] = _find_bodies(nodes)
+        cells = compat.cell_dofs(nodes.V)
+        if nodes.mesh not in _OF_CELLS:
+            body, count = _find_bodies(nodes, cells)
+            _OF_CELLS[nodes.mesh] = body[cells[:, 0]], count
+        of_cells, count = _OF_CELLS[nodes.mesh]
+        body = np.zeros(nodes.n_local, np.int64)
+        body[cells] = of_cells[:, None]
+        _FOUND[nodes] = body, count
     return _FOUND[nodes]
 
 
-def _find_bodies(nodes: Nodes) -> tuple[Ints, int]:
-    cells, label = compat.cell_dofs(nodes.V), fem.Function(nodes.V)
+def _find_bodies(nodes: Nodes, cells: Indices) -> tuple[Ints, int]:
+    label = fem.Function(nodes.V)
     view = label.x.array.reshape(-1, nodes.block)
 
     def shared(mine: Ints) -> Ints:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,7 @@ from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered
+from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered, reduced
 
 FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
 
@@ -59,21 +61,18 @@ class TargetFacets:
 
     def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
         self.config, self.tag, self.role = config, tag, role
-        mesh = config.mesh
-        cells, sides = forms.cells_of_facets(mesh, tag.entities)
-        own = cells < mesh.topology.index_map(config.tdim).size_local
-        self.cells: Indices = cells[own]
-        self.sides: Indices = sides[own]
-        self.shape: FacetShape = facet_shape(FACET_OF[compat.cell_name(mesh)], config.degree)
-        cell_dofs = compat.cell_dofs(config.V)
-        self.dofs = cell_dofs[self.cells[:, None], _facet_closure(config, self.shape)[self.sides]]
+        cell_dofs, of = compat.cell_dofs(config.V), nodes_of_facets(config, tag)
+        self.cells, self.sides, self.dofs = of.cells, of.sides, of.dofs
+        self.shape: FacetShape = _shape_of(config)
         self.nodes = config.to_global(self.dofs)
         self._refuse_inner()
         #: Local numbers of the facets in the mesh ``(m,)``.
-        self.entities: Indices = tag.entities[own]
+        self.entities: Indices = tag.entities[of.own]
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
         self.open_nodes = self._open_nodes()
+        #: The facets where they were when they were asked for last; None before.
+        self._placed: FacetData | None = None
 
     @cached_property
     def keys(self) -> Ints:
@@ -164,19 +163,26 @@ class TargetFacets:
         return self.sign[:, None, None] * nodal_area_vectors(self.shape, x)
 
     def current(self, corners: bool = False) -> FacetData:
-        """Facets where they are now, with normals at corners if they are asked for (collective: normals are summed over ranks)."""
+        """Facets where they are now, with normals at corners if they are asked for (collective).
+
+        What was made where no node has moved since is kept: it is asked for several times in each placement.
+        """
         x = self.x
-        # every node sees its facet under the angle-free area weight
-        vectors = self._area_vectors(x)
-        data = FacetData(x, self.nodes, unit(self._summed(vectors)))
-        if not corners:
-            return data
-        angles = self.shape.corner_angles(x)
-        return replace(data, corner_normals=self._summed(angles[:, :, None] * unit(vectors[:, : angles.shape[1]])))
+        if self._placed is None or reduced(self.config.comm, not np.array_equal(x, self._placed.x), op=MPI.LOR):
+            self._placed = self._placed_at(x)
+        if corners and self._placed.corner_normals is None:
+            angles = self.shape.corner_angles(x)
+            unit_vectors = unit(self._area_vectors(x)[:, : angles.shape[1]])
+            self._placed = replace(self._placed, corner_normals=self._summed(angles[:, :, None] * unit_vectors))
+        return self._placed
+
+    def _placed_at(self, x: Array) -> FacetData:
+        """Facets with nodes at ``x (m, nn, gdim)``; every node sees its facet under the angle-free area weight (collective)."""
+        return FacetData(x, self.nodes, unit(self._summed(self._area_vectors(x))))
 
     def _summed(self, vectors: Array) -> Array:
         """Sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, seen from each of them (collective)."""
-        field, dofs = self._normal_field, self.dofs[:, : vectors.shape[1]]
+        field, dofs = self._normal_field, self.dofs[:, : vectors.shape[1]].astype(np.int64)
         nodal = field.x.array.reshape(-1, self.config.gdim)
         nodal[:] = sums_of_rows(dofs.ravel(), vectors.reshape(-1, self.config.gdim), len(nodal))
         forms.sum_ghosts(field)
@@ -191,6 +197,35 @@ class TargetFacets:
         """Outward normals at the nodes, as long as the facets are large, and beside them their lengths ``(m, nn, gdim + 1)``."""
         vectors = self._area_vectors(self.x)
         return np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2)
+
+
+class FacetNodes(NamedTuple):
+    """Nodes of the facets of a surface behind which this rank owns the cell.
+
+    Attributes:
+        own: which sides of facets, in the order of these, are of cells that this rank owns ``(n,)``.
+        cells: behind them ``(m,)``.
+        sides: which of the cell's facets each is ``(m,)``.
+        dofs: local nodes, in the numbering of the facet's own element ``(m, nn)``.
+    """
+
+    own: Bools
+    cells: Indices
+    sides: Indices
+    dofs: Indices
+
+
+def nodes_of_facets(config: Configuration, tag: Tag) -> FacetNodes:
+    """Nodes of the facets of a surface, of those cells that this rank owns."""
+    cells, sides = forms.cells_of_facets(config.mesh, tag.entities)
+    own = cells < config.mesh.topology.index_map(config.tdim).size_local
+    cells, sides = cells[own], sides[own]
+    dofs = compat.cell_dofs(config.V)[cells[:, None], _facet_closure(config, _shape_of(config))[sides]]
+    return FacetNodes(own, cells, sides, dofs)
+
+
+def _shape_of(config: Configuration) -> FacetShape:
+    return facet_shape(FACET_OF[compat.cell_name(config.mesh)], config.degree)
 
 
 def heights(points: Array, facet: Ints, planes: tuple[Array, Array]) -> Array:

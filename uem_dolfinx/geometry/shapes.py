@@ -238,7 +238,7 @@ def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> tuple[Arra
     """
     tab = shape.tabulate(xi)
     t = tangents(tab, x)
-    for _ in range(IN_PLANE):
+    for _ in range(1 if shape.affine else IN_PLANE):
         missing = np.einsum("nfg,ng->nf", t, places - np.einsum("na,nag->ng", tab.N, x))
         xi = xi + np.linalg.solve(np.einsum("nfg,neg->nfe", t, tangents(tab, x)), missing[..., None])[..., 0]
         tab = shape.tabulate(xi)

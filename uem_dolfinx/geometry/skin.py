@@ -46,8 +46,7 @@ class Skin(TargetFacets):
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")
-        #: Facets where they were asked for last, and their spread there if it was asked for.
-        self._placed: FacetData | None = None
+        #: Spread of the facets where they were asked for last; None if it was not.
         self._spread: Array | None = None
         label, self.n_bodies = find_bodies(config)
         first = np.full(self.n_bodies, np.iinfo(np.int64).max)
@@ -146,19 +145,14 @@ class Skin(TargetFacets):
         (sums,) = exchange.back(sums_of_rows(i, arrived[j], len(arrived)))
         return (facet[exchange.rows], node[exchange.rows]), sums
 
-    def current(self, corners: bool = False) -> FacetData:
-        """Facets where they are now; at sharp edges normals are averaged over facets of one face alone (collective).
-
-        What was made where no node has moved since is kept: all contacts among bodies ask for the same.
-        """
-        x = self.x
-        if self._placed is None or reduced(self.config.comm, not np.array_equal(x, self._placed.x), op=MPI.LOR):
-            data = super().current(corners=True)
-            normals = data.nodal_normals.copy()
-            there, sums = self._of_one_face(self._area_vectors(x))
-            normals[there] = unit(sums)
-            self._placed, self._spread = replace(data, nodal_normals=normals), None
-        return self._placed
+    def _placed_at(self, x: Array) -> FacetData:
+        """See ``TargetFacets``; at sharp edges normals are averaged over facets of one face alone (collective)."""
+        data = super()._placed_at(x)
+        normals = data.nodal_normals.copy()
+        there, sums = self._of_one_face(self._area_vectors(x))
+        normals[there] = unit(sums)
+        self._spread = None
+        return replace(data, nodal_normals=normals)
 
     def spread(self) -> Array:
         """See ``TargetFacets``; at sharp edges of facets of one face alone (collective)."""
