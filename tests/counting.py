@@ -11,12 +11,12 @@ from uem_dolfinx import compat
 
 SEARCH, PROJECTION = "search", "projection"
 P, PRODUCT, CROSSED = "restriction matrix P", "united matrix P'KP", "cross out prescribed components"
-CONDENSED = "condensed matrix"
+CONDENSED, INSIDE = "condensed matrix", "solve without the contact"
 TANGENT, FACTORISATION, SOLVE = "assemble tangent", "factorisation or preconditioner set-up", "linear solve"
 MASS = ("assemble mass", "redistribute mass", "first acceleration", "inertia forces")
 HISTORY = ("return mapping", "commit history")
 OUTPUT = ("write fields", "write table", "write checkpoint", "read checkpoint")
-STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, CONDENSED, TANGENT, FACTORISATION, SOLVE, *MASS, *HISTORY, *OUTPUT)
+STAGES = (SEARCH, PROJECTION, P, PRODUCT, CROSSED, CONDENSED, INSIDE, TANGENT, FACTORISATION, SOLVE, *MASS, *HISTORY, *OUTPUT)
 
 
 class Calls(dict):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from contact_on_block import pressed
-from counting import CONDENSED, FACTORISATION, counted
+from counting import CONDENSED, FACTORISATION, INSIDE, counted
 from equation_scenes import CASES, triangles, turned, united
 from helpers import gathered_matrix, gathered_vector, raised, scattered, st_venant
 from petsc4py import PETSc
@@ -156,6 +156,8 @@ def test_one_factorisation_of_linear_bodies():
         history = problem.solve()
     solves = sum(i.linear_iterations for i in history)
     assert len(history) > 3 and sum(i.exchanges for i in history) > 1 and contact.n_active > 2
+    # exchanges ask for no solve of the bodies, iterations for one each; one is of the loads with each factorisation
+    assert calls[INSIDE] == len(history) - 1 + calls[FACTORISATION]
     # one more where contactors touch first
     assert calls[FACTORISATION] == 2 and calls[CONDENSED] == solves == len(history) - 1 + sum(i.exchanges for i in history)
     with counted() as calls:

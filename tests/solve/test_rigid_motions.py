@@ -76,6 +76,23 @@ def test_what_counts_as_loaded(body):
         assert motions.share == pytest.approx(part, rel=0.05)
 
 
+def test_rates_of_bodies_that_have_moved():
+    """A square that turns finitely about the middle where it is now, not where it was asked before: its own middle rests."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [2.0, 2.0], [2, 2])])
+    u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+    config = uem.UnitedProblem(linear(u, 1.0), u).config
+    motions = RigidMotions(config, np.ones((config.n_owned, 2), dtype=bool), True)
+    motions.open_motions(None)
+    config.shift(slice(None), np.array([3.0, -5.0]))
+    node = np.flatnonzero((np.abs(config.X[: config.n_owned] - 1.0) < 1e-9).all(axis=1)).astype(np.int32)
+    k, none = len(node), np.zeros((len(node), 0))
+    equations = UnitingEquations.along(
+        node, np.tile([0.6, 0.8], (k, 1)), none.astype(np.int64), none, np.zeros(k), np.ones(k, bool)
+    )
+    rates = motions.rates(equations).toarray()
+    assert COMM.allreduce(k) == 1 and np.allclose(rates, np.tile([0.6, 0.8, 0.0], (k, 1)), atol=1e-12)
+
+
 def test_supports_are_the_same_on_every_number_of_ranks():
     """The corners of a square hold it equally well: which of them do is settled by their places, not by ranks or rounding."""
 

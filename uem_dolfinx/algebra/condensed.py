@@ -7,8 +7,8 @@ components of these nodes, and I, all others,
     Q'(S + G)P dq_C = Q'(r_C - K_CI K_II^-1 r_I)                        dense, by LAPACK on rank 0
     dq_I = K_II^-1 (r_I - K_IC P dq_C)
 
-for the right-hand side ``(Q'r_C, r_I)``. C grows with what is touched, as long as K stays. From a solution du that is known, others under
-the same forces on I are dense problems alone, as long as only C is asked:
+for the right-hand side ``(Q'r_C, r_I)``. C grows with what is touched, as long as K stays. From an increment du under the forces on I,
+first that with C at rest, others under the same are dense problems alone, as long as only C is asked:
 
     K (du + e) = K du + S e_C on C, and as K du on I                    e_I = -K_II^-1 K_IC e_C in the end
 """
@@ -62,21 +62,21 @@ class Condensed:
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
         #: Whether a step begins, which may not depend on what others have touched.
         self._begins = False
-        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S there, and whether K_II has a
+        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S' there, and whether K_II has a
         #: negative determinant, and negative eigenvalues.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._pc = None
-        self._S: Any = None
+        self._St: Any = None
         self._negative_inside = self._indefinite_inside = False
         #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
         self.made_of: Any = None
         self._dense: _Dense | None = None
         #: Whether the united matrix has a negative determinant, and, where it is symmetric, negative eigenvalues.
         self.negative = self.indefinite = False
-        #: What the increment is without dq, one of the last solves with K du, and whether the last solve was of I, too.
-        self.closure: PETSc.Vec | None = None
+        self.begin_at(None)
+        #: An increment du under the forces on I of the last solve, with K du, and whether unknowns of I have been solved for, too.
         self._known: tuple[PETSc.Vec, PETSc.Vec] | None = None
         self.whole = True
 
@@ -153,7 +153,9 @@ class Condensed:
             if pc.getFailedReason() != PETSc.PC.FailedReason.NOERROR:
                 self.drop()
                 return False
-        self._pc, self._S, self._made_for = pc, S, (K, K.stateGet(), P.free)
+        self._pc, self._made_for = pc, (K, K.stateGet(), P.free)
+        # rows of the transpose are what sparse matrices multiply
+        self._St = np.ascontiguousarray(S.T)
         return True
 
     def _is_cheaper(self, size: int, K: PETSc.Mat, pc: PETSc.PC) -> bool:
@@ -185,39 +187,55 @@ class Condensed:
             used = self._gathered(P.used.ravel()[self._at].astype(float)) > 0
             self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
             if self.space.comm.rank == 0:
-                self._dense = _Dense(self._S, curvature, trial[:, used], None if P is Q else test[:, used], used)
+                self._dense = _Dense(self._St, curvature, trial[:, used], None if P is Q else test[:, used], used)
             negative, indefinite = self.space.comm.bcast(self._dense and (self._dense.negative, self._dense.indefinite))
             self.negative, self.indefinite = self._negative_inside != negative, self._indefinite_inside or indefinite
 
+    def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:
+        """Take what the increment is without the unknowns that are solved for next.
+
+        Args:
+            c: that increment; None is none, and unknowns of I are then solved for at once.
+            rounding: norm of forces that are none on I.
+        """
+        self._closure, self._rounding = c, rounding
+
     def solve(self, rhs: PETSc.Vec, again: bool = False) -> PETSc.Vec:
-        """Unknowns dq of the united problem; not finite where it is singular (collective).
+        """Unknowns dq of the united problem, those of I to be completed; not finite where it is singular (collective).
 
         Args:
             rhs: the right-hand side.
-            again: whether the forces on I are those of the increment whose forces were asked for last; then I is left as it is there.
+            again: whether the forces on I are those of the increment whose forces were asked for last.
         """
         (P, Q, K, _), at = self.made_of, self._at
-        self._begins = False
-        self.whole = not (again and self._known is not None)
+        c = self.space.vector(np.zeros_like(rhs.array_r)) if self._closure is None else self._closure
+        self._begins = self.whole = False
         with timed("linear solve"):
-            if self._known is not None and not self.whole:
-                assert self.closure is not None
-                du, forces = self._known
-                left = forces - forms.product(K, self.closure)
-                left.array[at] += self._stiffness(self.closure.array_r[at] - du.array_r[at])
-                dq = du.copy()
-            else:
-                dq = self._solve_inside(P, rhs)
-                left = forms.product(K, dq)
+            if self._known is None or not again:
+                self._known = self._resting(P, K, rhs, c)
+            du, forces = self._known
+            left = forces - forms.product(K, c)
+            left.array[at] += self._stiffness(c.array_r[at] - du.array_r[at])
             left = Q.transpose(left)
+            dq = du.copy()
             dq.array[at] = self._on_contact(rhs.array_r[at] - left.array_r[at])
             dq.array[~P.used.ravel()] = 0.0
-            if self.whole:
-                outer = self.space.vector(np.zeros_like(dq.array_r))
-                outer.array[at] = dq.array_r[at]
-                inside = self._solve_inside(P, rhs - forms.product(K, P.expand(outer)))
-                dq.array[:] = outer.array_r + inside.array_r
-        return dq
+        return self.complete(dq) if self._closure is None else dq
+
+    def _resting(self, P: Restriction, K: PETSc.Mat, rhs: PETSc.Vec, c: PETSc.Vec) -> tuple[PETSc.Vec, PETSc.Vec]:
+        """The increment du under the forces on I while C rests, and ``K du`` (collective).
+
+        On I ``r + K c`` is there without what c does to C: where K was solved with last, and no load has changed, that is rounding.
+        """
+        inner, du = P.used.ravel().copy(), c.copy()
+        inner[self._at] = False
+        du.array[self._at] = 0.0
+        moved = c - du
+        inside = rhs + forms.product(K, moved)
+        inside.array[~inner] = 0.0
+        if inside.norm() > self._rounding:
+            du.axpy(1.0, self._solve_inside(P, inside))
+        return du, forms.product(K, du)
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec, exact: bool) -> PETSc.Vec:
         """``K du`` of an increment that the last solve has found, but for prescribed components away from the contact (collective).
@@ -237,14 +255,15 @@ class Condensed:
         return forces
 
     def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
-        """Unknowns of the last solve, those of I as well (collective)."""
+        """Unknowns dq of the last solve, those of I as well (collective)."""
         if self.whole:
             return dq
-        assert self._known is not None and self.closure is not None
+        assert self._known is not None
         (P, _, K, _), at = self.made_of, self._at
         with timed("linear solve"):
             du = P.expand(dq)
-            du.axpy(1.0, self.closure)
+            if self._closure is not None:
+                du.axpy(1.0, self._closure)
             du.axpy(-1.0, self._known[0])
             change = self.space.vector(np.zeros_like(du.array_r))
             change.array[at] = du.array_r[at]
@@ -255,7 +274,8 @@ class Condensed:
     def _solve_inside(self, P: Restriction, rhs: PETSc.Vec) -> PETSc.Vec:
         """``K_II^-1 r_I``, zero where unknowns are not used, and on C (collective)."""
         found = rhs.duplicate()
-        self._pc.apply(rhs, found)
+        with timed("solve without the contact"):
+            self._pc.apply(rhs, found)
         found.array[~P.used.ravel()] = 0.0
         found.array[self._at] = 0.0
         return found
@@ -268,7 +288,7 @@ class Condensed:
     def _stiffness(self, du: Array) -> Array:
         """``S du_C`` of this rank's components of C (collective)."""
         every = self._gathered(du)
-        return self._scattered(self._S @ every if self.space.comm.rank == 0 else None)
+        return self._scattered(every @ self._St if self.space.comm.rank == 0 else None)
 
     def _on_root(self, blocks: Blocks, numbers: Ints) -> Any:
         """A matrix of C as SciPy's, on rank 0; None elsewhere (collective).
@@ -303,20 +323,20 @@ class _Dense:
     """``Q'(S + G)P`` of the used components, factorised.
 
     Args:
-        S: Schur complement ``(k, k)``.
+        transposed: Schur complement, transposed ``(k, k)``.
         G: curvature, sparse, or None.
         P: its used columns, sparse ``(k, m)``.
         Q: those of Q, or None where it is P.
         used: of all components ``(k,)``.
     """
 
-    def __init__(self, S: Array, G: Any, P: Any, Q: Any, used: Bools):
+    def __init__(self, transposed: Array, G: Any, P: Any, Q: Any, used: Bools):
         from scipy.linalg import lapack
 
         self._used, self._lapack = used, lapack
-        A, trial = S if G is None else S + G.toarray(), P.T
+        A, trial = transposed if G is None else transposed + G.T.toarray(), P.T
         test = trial if Q is None else Q.T
-        M = np.asarray(test @ np.ascontiguousarray((trial @ A.T).T))
+        M = np.asarray(test @ np.ascontiguousarray((trial @ A).T))
         self._positive = self.negative = self.indefinite = False
         if not len(M):
             # every component is eliminated or prescribed

@@ -156,6 +156,7 @@ class UnitedSolver:
         The matrix is the same, ``roughly``, where all but coefficients in P, Q and G is.
         """
         test = test or restriction
+        self._condensed.begin_at(None)
         before, self._made_of = self._made_of, made_of(restriction, test, K, G, roughly)
         same = before is not None and before == self._made_of
         # a step that begins is solved as if it were the first
@@ -364,8 +365,7 @@ class UnitedSolver:
         """Solve for dq, and the number of linear iterations (collective).
 
         An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side; it begins
-        with the unknowns ``near``, if they are given. They are of the last solve, under the same forces of the bodies: one on the
-        contact alone needs to be completed then.
+        with the unknowns ``near``, if they are given, of the last solve under the same forces of the bodies.
 
         Raises:
             LinearSolveError: with PETSc's reason.
@@ -429,9 +429,9 @@ class UnitedSolver:
         """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
         return forms.product(K, du) if self.iterative else self._condensed.forces(K, du, self.exact)
 
-    def begin_at(self, c: PETSc.Vec) -> None:
-        """Take what the increment is without the unknowns that are solved for next."""
-        self._condensed.closure = c
+    def begin_at(self, c: PETSc.Vec, rounding: float = 0.0) -> None:
+        """Take what the increment is without the unknowns that are solved for next, to be completed, and what norm of forces is none."""
+        self._condensed.begin_at(c, rounding)
 
     def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
         """The unknowns of the last solve, all of them (collective)."""

@@ -126,7 +126,8 @@ class ArcLength:
         system, state = self._system, problem.state
         load = state.test.transpose(self._slope)
         load.scale(-1.0)
-        free, by_load = (system.solve(problem._replace(rhs=rhs), accuracy, None) for rhs in (problem.rhs, load))
+        both = (problem._replace(rhs=rhs) for rhs in (problem.rhs, load))
+        free, by_load = (system.complete(one, system.solve(one, accuracy, None)) for one in both)
         still = load.duplicate()
         still.set(0.0)
         along = self._along(by_load.du - system.move(state, still))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -42,8 +42,22 @@ LIGHT = 1e-3
 #: A body that falls comes to rest in so many steps at most.
 #: [bound; steps; -]
 MOST_RIGID_STEPS = 200
-#: What an equation is of: a contactor in front of its target, one that follows it, one that friction holds.
-AHEAD, UNITED, HELD = range(3)
+
+
+class _Held(NamedTuple):
+    """What holds bodies.
+
+    Attributes:
+        rows: equations of contactors that follow their target, and of users.
+        rates: how fast each motion opens their gaps, a sparse matrix ``(m, n_motions)``.
+        which: those that cannot part again ``(m,)``: with friction, of ties and of users.
+        basis: motions that these leave open ``(n_motions, k)``.
+    """
+
+    rows: UnitingEquations
+    rates: Any
+    which: Bools
+    basis: Any
 
 
 class FloatingBodies:
@@ -142,9 +156,10 @@ class FloatingBodies:
         """
         if self.motions is None:
             return free
-        self._open = self._sliding = self.motions.open_motions(self._rates(resisting))
-        if resisting is not equations:
-            self._sliding = self.motions.open_motions(self._rates(equations))
+        self._open = self._sliding = self.motions.open_motions(self._rates(equations))
+        if resisting is not equations and self.neutral:
+            # where friction resists no less is resisted
+            self._open = self.motions.open_motions(self._rates(resisting))
         rigid, parted = None if self._linear is None else self._linear.rigid, None
         if rigid is not None:
             # what couplings leave of their nodes holds these
@@ -167,6 +182,11 @@ class FloatingBodies:
         return FAR * self._bodies.config.size * self.motions.field(motion / size) if (size := np.linalg.norm(motion)) else None
 
     @property
+    def neutral(self) -> bool:
+        """Whether conditions and contacts leave motions open, along which bodies stay where they are."""
+        return self.motions is not None and self._sliding.shape[1] > 0
+
+    @property
     def adrift(self) -> bool:
         """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
         if self.motions is None:
@@ -187,8 +207,13 @@ class FloatingBodies:
         """
         if self.motions is None:
             return False
+        if not (changed or in_equilibrium):
+            return False
+        if not self._held().basis.shape[1]:
+            self.motions.share = 0.0
+            return False
         # a body that has lost its hold on the way falls only when the others have come to rest
-        return (changed or in_equilibrium) and self._fall(place, freely=not changed)
+        return self._fall(place, freely=not changed)
 
     def without_open_motions(self, du: Array) -> Array:
         """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
@@ -237,9 +262,41 @@ class FloatingBodies:
             if self._far_apart is not None and self._far_apart.look_along(ways):
                 continue
             motions.config.shift(slice(None), ways)
-            back = (v * before).reshape(motions.count, -1).sum(axis=1) < 0
-            damping, before, changed = np.where(back, 0.5 * damping, np.minimum(1.0, 2.0 * damping)), v, True
+            damping, before, changed = self._pace(damping, before, v), v, True
         raise motions.error(before)
+
+    def _pace(self, damping: Array, before: Array, v: Array) -> Array:
+        """Factors of every body's next step ``(count,)``, after one in which it has gone by v, and before that by ``before``.
+
+        A body that turns back goes half as far; one that goes on the same way at least as fast, as from where it is balanced, twice as far
+        if it stays within what it may turn.
+        """
+        motions = self.motions
+        assert motions is not None
+        last, now = before.reshape(motions.count, -1), v.reshape(motions.count, -1)
+        along, size = (last * now).sum(axis=1), np.abs(now).max(axis=1)
+        on = (along > 0) & (along >= (last**2).sum(axis=1)) & (2.0 * size <= TURN * motions.radius)
+        return np.where(
+            along < 0, 0.5 * damping, np.where(on, 2.0 * damping, np.maximum(damping, np.minimum(1.0, 2.0 * damping)))
+        )
+
+    def _looked_at(self) -> list[Interface]:
+        """Pairs that are not far apart."""
+        return [pair for pair in self._pairs if not pair.discretisation.far]
+
+    def _held(self) -> _Held:
+        """What contacts and equations of users hold where the bodies are now (collective)."""
+        motions, g = self.motions, self._bodies.config.gdim
+        assert motions is not None
+        pairs = self._looked_at()
+        equations = [pair.equations() for pair in pairs]
+        more = [] if self._linear is None else [self._linear.at_present()]
+        rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
+        # friction holds what sticks in all directions; contactors without it may part again
+        firm = [(e.tied | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
+        which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
+        rates = motions.rates(rows)
+        return _Held(rows, rates, which, motions.open_motions(rates[which]))
 
     def _step(self, damping: Array, freely: bool) -> tuple[Array | None, bool]:
         """Contactors that touch and carry become active; an increment of all motions under the loads (collective).
@@ -254,37 +311,36 @@ class FloatingBodies:
         Raises:
             FloatingBodyError: if the bodies move and no gap closes.
         """
+        from scipy.sparse import vstack
+
+        from uem_dolfinx.solve.rigid_steps import least_motion, weighted
+
         motions, config, comm = self.motions, self._bodies.config, self._bodies.comm
         assert motions is not None
-        pairs = [pair for pair in self._pairs if not pair.discretisation.far]
-        ahead = [pair.approach for pair in pairs]
-        equations = [pair.equations() for pair in pairs]
-        united = [e.resisting.select(e.resisting.active) for e in equations]
-        more = [] if self._linear is None else [self._linear.at_present()]
-        rows = UnitingEquations.join(ahead + united + more, config.gdim)
-        kinds = [np.full(len(e), AHEAD) for e in ahead]
-        for pair, e in zip(pairs, equations):
-            kinds.append(np.where(e.tied | pair.frictional, HELD, UNITED)[e.resisting.active])
-        kind = np.concatenate([np.zeros(0, int), *kinds, *(np.full(len(e), HELD) for e in more)])
-        R, force, scale = motions.rates(rows), *motions.forces(self._forces())
-        loose = motions.load(motions.open_motions(R[kind != AHEAD]), self._forces()).any()
+        held, motions.share, n = self._held(), 0.0, motions.n_modes
+        basis = held.basis
+        if not basis.shape[1]:
+            return None, False
+        residual = self._forces()
+        loose = motions.load(motions.open_motions(held.rates), residual).any()
+        motions.share = 0.0
         if not (loose or freely):
             return None, False
-        # friction holds what sticks in all directions; contactors without it may part again
-        basis, n = motions.open_motions(R[kind == HELD]), motions.n_modes
+        force, scale = motions.forces(residual)
         f = basis @ (basis.T @ force)
         size = np.linalg.norm(f.reshape(-1, n), axis=1)
-        motions.share = 0.0
         if size.max() <= LOADED * scale:
             return None, False
-        R, gap = R[kind != HELD], rows.gap[kind != HELD]
+        pairs = self._looked_at()
+        ahead = [pair.approach for pair in pairs]
+        front = UnitingEquations.join(ahead, config.gdim)
+        R = vstack([motions.rates(front), held.rates[~held.which]]).tocsr()
+        gap = np.concatenate([front.gap, held.rows.gap[~held.which]])
         # as if each body were as heavy as its load, those without any hardly at all
         weight, turn = np.maximum(size, LIGHT * size.max()), TURN * motions.radius
         ways = self._ways(R, gap, f / np.repeat(weight, n))
         shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
         M = ((weight / damping)[:, None] / np.where(np.arange(n) < config.gdim, shift[:, None], turn[:, None])).ravel()
-        from uem_dolfinx.solve.rigid_steps import least_motion, weighted
-
         B = weighted(basis, M)
         v, push = least_motion(comm, f, B, R, gap)
         took = False

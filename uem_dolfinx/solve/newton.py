@@ -178,13 +178,12 @@ class ContactMethod(Protocol):
         """
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Solve a linearised problem.
+        """Solve a linearised problem, in the unknowns that contact asks for; ``complete`` tells the others.
 
         Args:
             problem: the last one.
             accuracy: part of the right-hand side that may be left.
-            near: unknowns to begin with, those of another active set or accuracy, or None; with them only those need change that contact
-                asks for.
+            near: unknowns to begin with, those of another active set or accuracy, or None.
         """
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:

@@ -68,6 +68,8 @@ class RigidMotions:
         self._springs: Array | None = None
         #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; where bodies turn little always the same.
         self._unheld: Any | None = None
+        #: Velocities of the owned nodes in the modes of their bodies, where bodies turn little; None before they were asked for.
+        self._drawn: Array | None = None
         self.share = 0.0
 
     # -- motions ---------------------------------------------------------------------------------------------------------
@@ -88,6 +90,12 @@ class RigidMotions:
         modes = rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
         modes[:, self._strained] = 0.0
         return modes
+
+    def _own_modes(self) -> Array:
+        """Velocities of the owned nodes in the modes of their bodies ``(n_owned, n_modes, gdim)``."""
+        if self.finite or self._drawn is None:
+            self._drawn = self._modes(self._places, self._body[: self.config.n_owned])
+        return self._drawn
 
     @property
     def n_modes(self) -> int:
@@ -118,6 +126,8 @@ class RigidMotions:
     def rates(self, equations: UnitingEquations) -> Any:
         """How fast each motion opens the gap of each equation, a sparse matrix ``(m, n_motions)`` (collective)."""
         config, g = self.config, self.config.gdim
+        if self.finite:
+            self.middle = self._middles()
         own, x = self._body[: config.n_owned], self._places
         known = config.ask_owners(equations.followed, np.column_stack([own, x]))
         body = np.append(own[equations.node], known[:, 0].astype(np.int64))
@@ -129,9 +139,9 @@ class RigidMotions:
         """Orthonormal motions that neither conditions nor equations resist, a sparse matrix ``(n_motions, k)`` (collective).
 
         Args:
-            rates: of this rank's equations ``(m, n_motions)``, or None.
+            rates: of this rank's equations ``(m, n_motions)`` where the bodies are now, or None.
         """
-        if self.finite:
+        if self.finite and rates is None:
             self.middle = self._middles()
         if self.finite or self._unheld is None:
             body, modes, _ = self._held()
@@ -221,7 +231,7 @@ class RigidMotions:
             among: forces beside which they count ``(n_owned, gdim)``; None takes the residual itself.
         """
         own = self._body[: self.config.n_owned]
-        work = -np.einsum("nmg,ng->nm", self._modes(self._places, own), residual)
+        work = -np.einsum("nmg,ng->nm", self._own_modes(), residual)
         force = sums_of_rows(own, work, self.count)
         total, scale = (
             sum(part) for part in zip(*self.comm.allgather((force.ravel(), np.abs(residual if among is None else among).sum())))
@@ -236,6 +246,9 @@ class RigidMotions:
             residual: see ``forces``.
             among: see ``forces``.
         """
+        if not motions.shape[1]:
+            self.share = 0.0
+            return np.zeros(motions.shape[0])
         total, scale = self.forces(residual, among)
         along = np.asarray(motions.T @ total)
         self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
@@ -247,7 +260,7 @@ class RigidMotions:
         """The velocities of the owned nodes in a motion ``(n_owned, gdim)``."""
         own = self._body[: self.config.n_owned]
         parts = motion.reshape(self.count, self.n_modes)
-        return np.asarray(np.einsum("nmg,nm->ng", self._modes(self._places, own), parts[own]))
+        return np.asarray(np.einsum("nmg,nm->ng", self._own_modes(), parts[own]))
 
     def part(self, motions: Array, du: Array) -> Array:
         """What an increment ``(n_owned, gdim)`` holds of some motions ``(n_motions, k)``, of the same shape (collective).
@@ -259,7 +272,7 @@ class RigidMotions:
         if not motions.shape[1]:
             return np.zeros_like(du)
         own = self._body[: self.config.n_owned]
-        modes = self._modes(self._places, own).transpose(0, 2, 1).reshape(du.size, self.n_modes)
+        modes = self._own_modes().transpose(0, 2, 1).reshape(du.size, self.n_modes)
         fields = self._spread(modes, np.repeat(own, self.config.gdim)) @ motions
         gram, along = (sum(a) for a in zip(*self.comm.allgather(((fields.T @ fields).tocsc(), fields.T @ du.ravel()))))
         return np.asarray(fields @ spsolve(gram, along)).reshape(du.shape)
@@ -287,7 +300,9 @@ class RigidMotions:
             equations: whose nodes are spared.
             left: components that rigid couplings do not eliminate ``(n_owned, gdim)``; None for all.
         """
-        if self._supports is not None and motions.shape[1]:
+        if not motions.shape[1]:
+            return np.zeros((self.config.n_owned, self.config.gdim), dtype=bool)
+        if self._supports is not None:
             before, pins = self._supports
             gone = left is not None and reduced(self.comm, bool((pins & ~left).any()), op=MPI.LOR)
             if not gone and before.shape == motions.shape and abs(before @ (before.T @ motions) - motions).max() < OPEN:

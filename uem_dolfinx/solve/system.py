@@ -99,7 +99,6 @@ class BodySystem:
         self.pairs, self.linear, self._here = list(pairs), linear, None
         self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
-        #: How equations of several contacts can meet.
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
         self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
 
@@ -406,7 +405,7 @@ class BodySystem:
         curvature = together(self.curvature, state.added)
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
-        self.solver.begin_at(c := P.c)
+        self.solver.begin_at(c := P.c, first(state.rounding))
         linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
         # momentum is kept exactly where solves can be
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
@@ -421,12 +420,13 @@ class BodySystem:
         )
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Unknowns dq, and ``du = P dq + c``; bodies stay where they are along neutral motions (collective)."""
+        """Unknowns dq, and ``du = P dq + c``, first of all nodes where neutral motions or far contacts ask for them (collective)."""
         # held limits follow what a solve predicts: it is as good as a direct one
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
-        left = 0.0 if self.solver.exact else accuracy
-        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, left)
+        if near is None and (self.floating.neutral or any(pair.discretisation.far for pair in self.pairs)):
+            dq = self.solver.complete(dq)
+        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
         """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
