@@ -25,7 +25,8 @@ def test_conditions_of_the_minimum(seed, k, m, length):
     f, M = rng.normal(size=n), 10.0 ** rng.uniform(-2, 2, n) / length
     R, g = rng.normal(size=(m, n)), length * np.where(rng.random(m) < 0.3, 0.0, rng.random(m))
     own = rng.integers(0, COMM.size, m) == COMM.rank
-    v, push = least_motion(COMM, f, weighted(csr_matrix(Z), M), csr_matrix(R[own]), g[own])
+    likely = (rng.random(m) < 0.5)[own] if rng.random() < 0.5 else None
+    v, push = least_motion(COMM, f, weighted(csr_matrix(Z), M), csr_matrix(R[own]), g[own], likely)
     assert COMM.allgather(v.tobytes()) == [v.tobytes()] * COMM.size
     way = np.abs(v).max(initial=0.0)
     assert np.abs(v - Z @ (Z.T @ v)).max(initial=0.0) <= 1e-9 * way
@@ -37,6 +38,18 @@ def test_conditions_of_the_minimum(seed, k, m, length):
     assert (pushes >= 0).all() and (pushes[g + R @ v > 1e-7 * max(way, length)] <= 1e-12 * np.linalg.norm(f)).all()
     left = Z.T @ (M * v - f - R.T @ pushes)
     assert np.linalg.norm(left) <= 1e-6 * (np.linalg.norm(f) + np.linalg.norm(Z.T @ (M * v)))
+
+
+def test_rows_that_bear_nothing_go(monkeypatch):
+    """However many rows are broken on the way, the point is asked of no more than those that bear, one more, and some that come back."""
+    rng, sizes = np.random.default_rng(3), []
+    monkeypatch.setattr(rigid_steps, "nearest_point", lambda p, G, h: sizes.append(len(h)) or nearest_point(p, G, h))
+    k, m = 6, 300
+    own = np.arange(m) % COMM.size == COMM.rank
+    for _ in range(20):
+        f, R, g = rng.normal(size=k), rng.normal(size=(m, k)), 0.1 * rng.random(m)
+        least_motion(COMM, f, csr_matrix(np.eye(k)), csr_matrix(R[own]), g[own])
+    assert len(sizes) > 60 and max(sizes) < 2 * k + COMM.size
 
 
 def test_couplings_that_cancel():

@@ -268,17 +268,15 @@ class FloatingBodies:
     def _pace(self, damping: Array, before: Array, v: Array) -> Array:
         """Factors of every body's next step ``(count,)``, after one in which it has gone by v, and before that by ``before``.
 
-        A body that turns back goes half as far; one that goes on the same way at least as fast, as from where it is balanced, twice as far
-        if it stays within what it may turn.
+        A body that turns back goes half as far; one that goes on twice as far, as from where it is nearly balanced, if it stays within
+        what it may turn.
         """
         motions = self.motions
         assert motions is not None
         last, now = before.reshape(motions.count, -1), v.reshape(motions.count, -1)
-        along, size = (last * now).sum(axis=1), np.abs(now).max(axis=1)
-        on = (along > 0) & (along >= (last**2).sum(axis=1)) & (2.0 * size <= TURN * motions.radius)
-        return np.where(
-            along < 0, 0.5 * damping, np.where(on, 2.0 * damping, np.maximum(damping, np.minimum(1.0, 2.0 * damping)))
-        )
+        along, small = (last * now).sum(axis=1), 2.0 * np.abs(now).max(axis=1) <= TURN * motions.radius
+        faster = np.where((along > 0) & small, 2.0 * damping, np.maximum(damping, np.minimum(1.0, 2.0 * damping)))
+        return np.where(along < 0, 0.5 * damping, faster)
 
     def _looked_at(self) -> list[Interface]:
         """Pairs that are not far apart."""
@@ -342,7 +340,7 @@ class FloatingBodies:
         shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
         M = ((weight / damping)[:, None] / np.where(np.arange(n) < config.gdim, shift[:, None], turn[:, None])).ravel()
         B = weighted(basis, M)
-        v, push = least_motion(comm, f, B, R, gap)
+        v, push = least_motion(comm, f, B, R, gap, np.arange(len(gap)) >= len(front))
         took = False
         if loose:
             free = B @ (B.T @ f)

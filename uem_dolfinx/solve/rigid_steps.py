@@ -35,8 +35,8 @@ def weighted(basis: Any, M: Array) -> Any:
     return (basis @ by_block(basis.T @ diags(M) @ basis, make)).tocsc()
 
 
-def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array) -> tuple[Array, Array]:
-    """Solve the programme among the motions ``v = B x``; rows that the others do not keep are added until none is left (collective).
+def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array, likely: Bools | None = None) -> tuple[Array, Array]:
+    """Solve the programme among the motions ``v = B x``; rows that those which bear do not keep are added until none is left (collective).
 
     Bodies that the rows do not couple are programmes of their own.
 
@@ -46,6 +46,7 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array) -> tuple[Ar
         B: motions that conditions leave open, of ``weighted``.
         R: derivatives of this rank's gaps, a sparse matrix ``(m, n)``.
         g: this rank's gaps ``(m,)``; what is negative is brought to zero where that can be.
+        likely: rows to begin with, as those that bore before ``(m,)``; None for none.
 
     Returns:
         v ``(n,)``, the same on all ranks, and the contact forces of this rank's gaps ``(m,)``.
@@ -58,26 +59,32 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array) -> tuple[Ar
     # rounding couples no bodies, and stops no motion
     G.data[np.abs(G.data) <= NEGLIGIBLE * np.repeat(length, np.diff(G.indptr)) * _lengths(B.T)[G.indices]] = 0.0
     G.eliminate_zeros()
-    chosen, alike = _lengths(G) == 0, _same_columns(R)
-    rows, gaps, lam = G[:0], g[:0], np.zeros(0)
-    own, place = [], []
+    idle, alike, been = _lengths(G) == 0, _same_columns(R), np.zeros(len(g), dtype=bool)
+    # rows of all ranks that the point is found with, gaps, whose they are, which, and whether they stay, and forces
+    rows, gaps, whose, lam = G[:0], g[:0], np.zeros((0, 3), np.int64), np.zeros(0)
     while True:
         v = B @ x
-        slack = np.where(chosen, 0.0, g + R @ v)
+        own = whose[whose[:, 0] == comm.rank, 1]
+        slack = np.where(idle, 0.0, g + R @ v)
+        slack[own] = 0.0
         broken = np.flatnonzero(slack < -KEPT * np.abs(v).max(initial=0.0) * length)
         # of rows of the same bodies that which is broken most
         broken = broken[np.argsort(slack[broken] / length[broken], kind="stable")]
         worst = broken[np.unique(alike[broken], return_index=True)[1]]
-        chosen[worst] = True
-        new = comm.allgather((G[worst], g[worst]))
-        before = len(gaps) + sum(len(h) for _, h in new[: comm.rank])
-        own.append(worst)
-        place.append(before + np.arange(len(worst)))
-        if not sum(len(h) for _, h in new):
+        if likely is not None:
+            worst, likely = np.union1d(worst, np.flatnonzero(likely & ~idle)), None
+        told = np.column_stack([np.full(len(worst), comm.rank), worst, been[worst]]).astype(np.int64)
+        been[worst] = True
+        new = comm.allgather((G[worst], g[worst], told))
+        if not sum(len(h) for _, h, _ in new):
             push = np.zeros(len(g))
-            push[np.concatenate(own)] = lam[np.concatenate(place)]
+            push[own] = lam[whose[:, 0] == comm.rank]
             return v, push
-        rows, gaps = vstack([rows, *(r for r, _ in new)]).tocsr(), np.concatenate([gaps, *(h for _, h in new)])
+        # rows that bear nothing may go: the point is farther from p each time; those that come back stay
+        kept = (lam > 0) | (whose[:, 2] > 0)
+        rows = vstack([rows[kept], *(r for r, _, _ in new)]).tocsr()
+        gaps = np.concatenate([gaps[kept], *(h for _, h, _ in new)])
+        whose = np.concatenate([whose[kept], *(t for _, _, t in new)])
         # couplings by several rows must not cancel
         block, _, _ = blocks_of(abs(rows).T @ abs(rows))
         of, x, lam = block[rows.indices[rows.indptr[:-1]]], p.copy(), np.zeros(len(gaps))
