@@ -400,12 +400,11 @@ class BodySystem:
         if iteration is not None:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
-        K, P, Q = self.bodies.tangent.K, state.trial, state.test
+        K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
         state = state.with_pressures(self.pairs, K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
-        self.solver.begin_at(c := P.c, first(state.rounding))
         linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
         # momentum is kept exactly where solves can be
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
@@ -423,6 +422,7 @@ class BodySystem:
         """Unknowns dq, and ``du = P dq + c``, first of all nodes where neutral motions or far contacts ask for them (collective)."""
         # held limits follow what a solve predicts: it is as good as a direct one
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
+        self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
         if near is None and (self.floating.neutral or any(pair.discretisation.far for pair in self.pairs)):
             dq = self.solver.complete(dq)
