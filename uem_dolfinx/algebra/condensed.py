@@ -200,19 +200,20 @@ class Condensed:
         """
         self._closure, self._rounding = c, rounding
 
-    def solve(self, rhs: PETSc.Vec, again: bool = False) -> PETSc.Vec:
+    def solve(self, rhs: PETSc.Vec, again: bool = False, accuracy: float = 0.0) -> PETSc.Vec:
         """Unknowns dq of the united problem, those of I to be completed; not finite where it is singular (collective).
 
         Args:
             rhs: the right-hand side.
             again: whether the forces on I are those of the increment whose forces were asked for last.
+            accuracy: part of the right-hand side that may be left on I if it is rounding, too.
         """
         (P, Q, K, _), at = self.made_of, self._at
         c = self.space.vector(np.zeros_like(rhs.array_r)) if self._closure is None else self._closure
         self._begins = self.whole = False
         with timed("linear solve"):
             if self._known is None or not again:
-                self._known = self._resting(P, K, rhs, c)
+                self._known = self._resting(P, K, rhs, c, accuracy)
             du, forces = self._known
             left = forces - forms.product(K, c)
             left.array[at] += self._stiffness(c.array_r[at] - du.array_r[at])
@@ -222,7 +223,9 @@ class Condensed:
             dq.array[~P.used.ravel()] = 0.0
         return self.complete(dq) if self._closure is None else dq
 
-    def _resting(self, P: Restriction, K: PETSc.Mat, rhs: PETSc.Vec, c: PETSc.Vec) -> tuple[PETSc.Vec, PETSc.Vec]:
+    def _resting(
+        self, P: Restriction, K: PETSc.Mat, rhs: PETSc.Vec, c: PETSc.Vec, accuracy: float
+    ) -> tuple[PETSc.Vec, PETSc.Vec]:
         """The increment du under the forces on I while C rests, and ``K du`` (collective).
 
         On I ``r + K c`` is there without what c does to C: where K was solved with last, and no load has changed, that is rounding.
@@ -233,7 +236,7 @@ class Condensed:
         moved = c - du
         inside = rhs + forms.product(K, moved)
         inside.array[~inner] = 0.0
-        if inside.norm() > self._rounding:
+        if inside.norm() > min(self._rounding, accuracy * rhs.norm()):
             du.axpy(1.0, self._solve_inside(P, inside))
         return du, forms.product(K, du)
 

@@ -371,7 +371,7 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         if self._on_condensed:
-            dq = self._condensed.solve(rhs, near is not None)
+            dq = self._condensed.solve(rhs, near is not None, accuracy)
             self._tell_unused()
             if np.isfinite(dq.norm()):
                 return dq, 1
