@@ -55,6 +55,9 @@ class Mortar(Contactors):
     chained, two_pass = True, False
     pointwise = False
 
+    #: Whether the last rows were made when no facets had faced each other in the step.
+    _afresh = False
+
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, surface=surface, **how)
         # tells equal nodes apart, alike in any partition
@@ -77,11 +80,13 @@ class Mortar(Contactors):
             nearest, locked = self.on_target(points), state.changes >= MOST_CHANGES
             known = np.column_stack([locked, state.cover])
             same = self._united is not None and self._united[0] is nearest and np.array_equal(self._united[1], known)
-            if self._united is None or not reduced(self.config.comm, same, op=MPI.LAND):
+            if not reduced(self.config.comm, same, op=MPI.LAND):
+                self._afresh = not len(self.faced)
                 placed = nearest
                 if self.target.faceted and isinstance(nearest, FacetProjection):
                     placed = with_averaged_normals(nearest, locked, points)
                 self._united = nearest, known, self._unite(placed, points, self.remembered.shares(state.cover))
+            assert self._united is not None
             rows = self._united[2]
         elif self._kept is None:
             nearest = self.take_feet(points)
@@ -334,7 +339,8 @@ class Mortar(Contactors):
     def begin_step(self) -> None:
         """Facets that no longer face each other are forgotten."""
         super().begin_step()
-        self._united = None
+        if not self._afresh:
+            self._united = None
 
     def let_go(self) -> None:
         """Keep no feet and no segments."""
