@@ -135,7 +135,7 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         if contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
         if contact.pair.frictional:
-            coulomb(contact.pair, 1e-12 * config.size, 1e-7 * scale + rounding)
+            coulomb(contact.pair.whole, 1e-12 * config.size, 1e-7 * scale + rounding)
         balance = contact.balance()
         # where the foot stays behind, the forces of a pair lie on two lines
         assert balance is None or (balance.force < 1e-11 and (balance.moment < lever(contact) or contact.sliding != "finite"))

@@ -121,7 +121,7 @@ def test_contactors_that_are_left_inside(depth, free, left_out, refused, size):
     pair = uem.UnitedProblem(linear(b.u, 1.0), b.u, contacts=[contact]).contacts[0].pair
     n = len(pair.nodes)
     seen = SimpleNamespace(
-        name=pair.name, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), movable=np.full(n, free),
+        name_at=lambda i: pair.name, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), movable=np.full(n, free),
         redundant=np.full(n, left_out), trial=SimpleNamespace(active=np.ones(n, bool)),
         projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)), torn=lambda: np.zeros(n), kinematics=pair.kinematics,
     )  # fmt: skip

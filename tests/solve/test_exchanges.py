@@ -37,6 +37,7 @@ class Nodes:
             comm=COMM, X=X, gdim=X.shape[1], size=1.0, describe=lambda i: "(" + ", ".join(f"{c:.6g}" for c in X[i]) + ")"
         )
         self.config, self.nodes, self.name, self.frictional, self.friction = config, np.arange(len(X)), name, frictional, None
+        self.members, self.label, self.name_at = [self], np.zeros(len(X), int), lambda i: name
         self.active, self.calmed, self.trial = np.zeros(len(X), bool), False, SimpleNamespace(active=np.ones(len(X), bool))
 
     @property

@@ -27,7 +27,7 @@ def pressed(cell, gap, way, rigid=False, degree=1, **how):
 
 
 def far(problem):
-    return [pair.discretisation.far for pair in problem.pairs]
+    return [pair.far for pair in problem.pairs]
 
 
 def always_looking(monkeypatch):

@@ -52,6 +52,11 @@ def check_initial(pair: Interface) -> None:
     """
     gap = np.where(pair.off, np.inf, pair.projection.gap)
     error = None
+    if len(pair.members) > 1:
+        if reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR):
+            for one in pair.members:
+                check_initial(one)
+        return
     if len(gap) and gap.min() < -pair.max_penetration:
         i = int(gap.argmin())
         error = PenetrationError(
@@ -88,7 +93,7 @@ def check_prescribed(pair: Interface) -> None:
     if inside.any():
         i = int(np.argmin(np.where(inside, pair.projection.gap, np.inf)))
         error = ConflictError(
-            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
+            f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
             f"{-pair.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
             "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
         )
@@ -144,15 +149,28 @@ def facet_curvatures(target: MeshTarget) -> Array:
     return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)
 
 
-def warn_of_sagging_facets(pair: Interface) -> None:
-    """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
+def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
+    """Contactors whose clearance is less than the straight facets of the target sag, how far these do, and the clearances (collective).
+
+    Of ``n`` contactors, ``(n,)`` each; none of a target that is no mesh.
+    """
     target, p = pair.target, pair.projection
     if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
-        return
+        none = np.zeros(len(pair.nodes))
+        return none > 0.0, none, none
     arms = p.x - p.foot[:, None]
     sag = 0.5 * np.einsum("na,nag,ngh,nah->n", p.weights, arms, target.of_facets(p.facet, facet_curvatures(target)), arms)
     clearance, rounding = np.abs(p.gap - sag), TOUCHING * pair.config.size
     close = (clearance < np.abs(sag)) & (np.abs(sag) > rounding) & (np.abs(p.beyond).max(axis=1) < rounding)
+    return close, sag, clearance
+
+
+def warn_of_sagging_facets(pair: Interface) -> None:
+    """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
+    if not isinstance(pair.target, MeshTarget):
+        return
+    (close, sag, clearance), p = sagging(pair), pair.projection
+    assert isinstance(p, FacetProjection)
     comm = pair.config.comm
     facets = len(set().union(*comm.allgather(set(p.facet[close].tolist()))))
     if facets > CONFORMING ** (pair.config.gdim - 1):

@@ -31,7 +31,7 @@ from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.watched import WatchedContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shared_target import shared_target
@@ -233,7 +233,7 @@ class Contact(WatchedContact):
         value, friction = self._friction_at(law, self.pair.nodes, at), self.pair.friction
         assert value is not None and friction is not None
         if known:
-            friction.set(law, value)
+            self.pair.know_friction(law, value)
         elif reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
             self.pair.set_friction(law, value)
 
@@ -441,6 +441,6 @@ class Contact(WatchedContact):
         if hasattr(self.target, "project"):
             return nodes, shared_target(self.target, config.comm, config.gdim)
         self.target = as_tag(self.target, config.mesh, (config.tdim - 1,), "target")
-        surface = TargetFacets(config, self.target)
+        surface = facets_of(config, self.target)
         check_distinct(config, nodes, surface, (name_of(self.contactor), name_of(self.target)))
         return nodes, MeshTarget(surface, averaged=self.normals == "averaged")

@@ -68,8 +68,10 @@ class BodiesContact(GeneralPart):
             return super()._friction_now(kinematics)
         return None if kinematics.idle else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
 
-    def look_at_ends(self) -> None:
-        """Contactors come and go past the edges of bodies."""
+    @property
+    def watches_ends(self) -> bool:
+        """No: contactors come and go past the edges of bodies."""
+        return False
 
 
 class AmongContact(BodiesContact):
@@ -128,11 +130,10 @@ class AmongContact(BodiesContact):
         counts = (body[there] == arrived[:, 0]) & ((arrived[:, 1] > 0) | skin.corners[there])
         return sums_of_rows(place[there][counts], arrived[counts, 2:], len(self.pair.nodes))
 
-    def begin(self) -> None:
-        """Take the contact for that of a problem that is complete (collective)."""
-        super().begin()
-        # every node is beside something, and every corner of one body within the surface of all
-        self._corners = None
+    @property
+    def sees_corners(self) -> bool:
+        """No: every node is beside something, and every corner of one body within the surface of all."""
+        return False
 
 
 class MortarContact(BodiesContact):

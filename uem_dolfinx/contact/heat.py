@@ -76,7 +76,7 @@ class Declared(Protocol):
 
     measure: str
 
-    def areas_facing(self, nodes: Indices, kinematics: Kinematics | None, current: bool) -> Array:
+    def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
         """Areas of contactors towards the target ``(n,)`` (collective)."""
 
     def measured_areas(self) -> Array:
@@ -219,7 +219,7 @@ class Heat:
         # a projection that is the same on one rank is so on all
         if self._passage is None or self._passage.projection is not self._pair.projection:
             pair, current = self._pair, self._contact.measure == "current"
-            areas = self._contact.areas_facing(pair.nodes, pair.kinematics, current)
+            areas = self._contact.areas_facing(pair.nodes, pair.projection.normal, current)
             self._passage = passage(pair, areas, current, self._contact.leads())
         return self._passage
 

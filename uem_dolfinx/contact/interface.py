@@ -78,8 +78,7 @@ class Interface(Told):
     ):
         self.config, self.nodes, self.discretisation, self.friction, self.tie = config, nodes, discretisation, friction, tie
         self.name, self.sliding, self.max_penetration, self.thickness = name, sliding, max_penetration, thickness
-        n, g = len(nodes), config.gdim
-        state = PairState.initial(n, g)
+        state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.initial_overlap, self.mutual = 0.0, False
@@ -95,7 +94,7 @@ class Interface(Told):
         Raises:
             NotFiniteError: if the target's functions return what is not finite.
         """
-        if not (self.discretisation.far and self.kinematics.idle):
+        if not (self.far and self.kinematics.idle):
             self._project()
 
     @timed("projection")
@@ -110,18 +109,13 @@ class Interface(Told):
         bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
         error = None
         if len(bad):
+            i = int(bad[0])
             error = NotFiniteError(
-                f"{self.name}: gap {p.gap[bad[0]]}, normal {p.normal[bad[0]]} at {self.config.describe(int(self.nodes[bad[0]]))}: "
+                f"{self.name_at(i)}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
             )
         agree(self.config.comm, error)
         self._place_friction()
-
-    def look(self) -> None:
-        """Place contactors that were not looked at since the surfaces are far apart (collective)."""
-        if self.discretisation.far:
-            self.discretisation.far = False
-            self.project()
 
     def _place_friction(self) -> None:
         if self.friction is not None:
@@ -136,12 +130,19 @@ class Interface(Told):
             if self.acting is not None:
                 self.acting.replace(kinematics)
 
+    def look(self) -> None:
+        """Place contactors that were not looked at since the surfaces are far apart (collective)."""
+        if self.far:
+            self.far = False
+            self.project()
+
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
         correction = self.kinematics.return_vectors(self.trial)
         if self.acting is not None:
             correction = correction + self.acting.return_vectors(self.trial)
-        correction[np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size] = 0.0
+        # surfaces that follow each other would both make up for the same gap
+        correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual] = 0.0
         return correction
 
     # -- activation and release ------------------------------------------------------------------------------------------
@@ -184,7 +185,7 @@ class Interface(Told):
 
     def _at_end(self, state: PairState) -> Bools:
         """Contactors that an end of the target holds in the next step ``(n,)``: where surfaces follow each other, the end touches."""
-        return self.kinematics.at_end(state) & (not self.mutual)
+        return self.kinematics.at_end(state) & np.logical_not(self.mutual)
 
     def follow(self) -> bool:
         """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
@@ -398,7 +399,7 @@ class Interface(Told):
 
     def commit(self) -> None:
         """Make the trial state the committed one; to be followed by ``project``."""
-        if self.discretisation.far:
+        if self.far:
             return
         if self.friction is not None:
             if self.kinematics.idle:

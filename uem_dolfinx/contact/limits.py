@@ -19,8 +19,8 @@ class Limits:
     """Limits of friction of the contactors of one interface.
 
     Args:
-        areas: of the contactors' reference surface towards what they touch ``(n,)``, asked for by laws that need them; before
-            contactors have been placed, for None, all of it (collective).
+        areas: of the contactors' reference surface towards what they touch ``(n,)``, of normals ``(n, gdim)``, asked for by laws that
+            need them; before contactors have been placed, for None, all of it (collective).
         duration: length of the present step, a time; None in statics.
 
     Attributes:
@@ -33,15 +33,15 @@ class Limits:
     law: FrictionLaw
     value: Array
 
-    def __init__(self, areas: Callable[[Kinematics | None], Array], duration: Callable[[], float] | None):
-        self._areas_of, self._duration = areas, duration
+    def __init__(self, areas: Callable[[Array | None], Array], duration: Callable[[], float] | None):
+        self.areas_of, self.duration = areas, duration
         #: Forces along the normal that limits stay with while these change ``(n,)``.
         self._held: Array | None = None
 
     def set(self, law: FrictionLaw, value: Array) -> Array:
         """Take a law, and the values of its parameter ``(n,)``: the slopes of the cones of contactors that do not press (collective)."""
         self.law = law
-        self.area = self._areas_of(None) if law.per_area else np.zeros(len(value))
+        self.area = self.areas_of(None) if law.per_area else np.zeros(len(value))
         self.speed = np.zeros(len(value))
         return self.change(value)
 
@@ -53,11 +53,11 @@ class Limits:
     def grow(self, kinematics: Kinematics) -> None:
         """Take the areas where contactors are now (collective)."""
         if self.law.per_area:
-            self.area = kinematics.areas(self._areas_of(kinematics), False)
+            self.area = kinematics.areas(self.areas_of(kinematics.projection.normal), False)
 
     def see(self, way: Array) -> None:
         """Take how far contactors have slipped in the present step ``(n,)``."""
-        dt = 0.0 if self._duration is None else self._duration()
+        dt = 0.0 if self.duration is None else self.duration()
         if of_rate(self.law) and dt > 0.0:
             self.speed = way / dt
 
@@ -82,7 +82,7 @@ class Limits:
         if slides_otherwise(self.law):
             sliding = self.law.sliding(self.value, lam, self.area, self.speed)
             limit, slope, rate = (np.where(slips, new, old) for new, old in zip(sliding, (limit, slope, rate)))
-            dt = 0.0 if self._duration is None else self._duration()
+            dt = 0.0 if self.duration is None else self.duration()
             rate = rate / dt if dt > 0.0 else np.zeros_like(rate)
         return limit, slope if self._held is None else np.zeros_like(slope), rate
 

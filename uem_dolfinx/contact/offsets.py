@@ -25,19 +25,20 @@ class Offsets:
         name: of its contact, for messages.
 
     Attributes:
+        pair: likewise.
         adjusted: heights of contactors that are taken to touch ``(n,)``.
         worn: depths that have been worn off ``(n,)``.
     """
 
     def __init__(self, pair: Interface, name: str):
-        self._pair, self._name = pair, name
+        self.pair, self._name = pair, name
         self._given: Array = np.zeros(len(pair.nodes))
         self.adjusted: Array = np.zeros(len(pair.nodes))
         self.worn: Array = np.zeros(len(pair.nodes))
 
     def set(self, offset: Field) -> None:
         """Take an offset, besides what has been adjusted and worn; contactors are to be placed again (collective)."""
-        config, nodes, words = self._pair.config, self._pair.nodes, f"contact '{self._name}': offset"
+        config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
         self._given = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
         self._hand_over()
 
@@ -48,8 +49,8 @@ class Offsets:
 
     def _hand_over(self) -> None:
         total = self._given + self.adjusted - self.worn
-        some = reduced(self._pair.config.comm, bool(total.any()), op=MPI.LOR)
-        self._pair.discretisation.set_offset(total if some else None)
+        some = reduced(self.pair.config.comm, bool(total.any()), op=MPI.LOR)
+        self.pair.set_offset(total if some else None)
 
     def adjust(self, reach: float | bool) -> None:
         """Take contactors to touch that are no farther from the target, or above it, than ``reach`` (collective).
@@ -57,7 +58,7 @@ class Offsets:
         Args:
             reach: a length; True is a side of a target's facet, or on a rigid surface the bound on the initial penetration.
         """
-        pair = self._pair
+        pair = self.pair
         pair.project()
         p, height = pair.projection, pair.kinematics.heights()
         most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach

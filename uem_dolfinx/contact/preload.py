@@ -152,10 +152,10 @@ class Preload(Contact):
             self.config, nodes, discretisation, axis=self._axis, free=self._free[nodes], means=means, reach=None, **of
         )
 
-    def begin(self) -> None:
-        """As of ``Contact``; faces that are drawn past each other are inside the other part (collective)."""
-        super().begin()
-        self._corners = None
+    @property
+    def sees_corners(self) -> bool:
+        """No: faces that are drawn past each other are inside the other part."""
+        return False
 
     def take_load(self, at: float, known: bool = False) -> None:
         """As of ``Contact``, and the force (collective)."""

@@ -16,7 +16,6 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.kinematics import Kinematics
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import Areas
@@ -124,16 +123,16 @@ class ContactResults:
     def measured_areas(self) -> Array:
         """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
         current = self.measure == "current"
-        return self.pair.areas(self.areas_facing(self.nodes, self.pair.kinematics, current), current, self._areas)
+        return self.pair.areas(self.areas_facing(self.nodes, self.pair.projection.normal, current), current, self._areas)
 
-    def areas_facing(self, nodes: Indices, kinematics: Kinematics | None, current: bool) -> Array:
+    def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
         """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over what faces the target (collective).
 
-        They are those over the whole surface with mortar, whose segments tell what faces the target, and before any placement.
+        ``normal (n, gdim)`` are normals of the target. They are those over the whole surface with mortar, whose segments tell what faces the target, and before any placement.
         """
-        if self.coupling == "mortar" or kinematics is None:
+        if self.coupling == "mortar" or normal is None:
             return (self.surface.current if current else self.surface.reference)[nodes]
-        return self.surface.facing(nodes, kinematics.projection.normal, current)
+        return self.surface.facing(nodes, normal, current)
 
     def pressing(self) -> tuple[Array, Array]:
         """Forces across ``(n_contactors,)`` and along ``(n_contactors, gdim)`` the target that these are divided into (collective)."""

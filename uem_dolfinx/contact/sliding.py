@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -56,6 +56,9 @@ class Sliding:
 
     frame: Frame
 
+    #: Makes what tells where slip begins, for another linearised problem.
+    front: Any = Front
+
     def __init__(
         self,
         config: Configuration,
@@ -69,10 +72,8 @@ class Sliding:
         keeps_feet: bool,
         value_now: Callable[[Kinematics], Array | None],
     ):
-        self.config, self.nodes, self.discretisation = config, nodes, discretisation
-        self.free, self.keeps_feet = free, keeps_feet
-        n, g = len(nodes), config.gdim
-        self.limits, self._value_now = limits, value_now
+        self.config, self.nodes, self.discretisation, self.free, self.keeps_feet = config, nodes, discretisation, free, keeps_feet
+        n, g, self.limits, self._value_now = len(nodes), config.gdim, limits, value_now
         self.wear: Wear | None = None
         self.set(law, value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
@@ -80,7 +81,7 @@ class Sliding:
         self._anchors: Array = np.zeros((n, g))
         self._held_by: tuple[Ints, Ints, Array] | None = None
         self._last: LastStep | None = None
-        self.pivot = Pivot.begin(Front(config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+        self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Take a law, and the values of its parameter ``(n,)``."""
@@ -139,11 +140,11 @@ class Sliding:
         """Directions of slip, which turn with the surface ``(n, gdim)``; zero for contactors that do not slip."""
         return self.frame.directions(_of(state).direction)
 
-    def largest_distance(self, state: PairState, redundant: Bools) -> float:
-        """Largest distance from the anchor that a contactor sticks to, on this rank, a length."""
+    def distances(self, state: PairState, redundant: Bools) -> Array:
+        """Distances from the anchors that contactors stick to, zero for all others, lengths ``(n,)``."""
         held = np.where(self.left_out[:, :, None], 0.0, self.frame.free_tangents)
-        away = friction.along(held, self.frame.away)[self.active(state) & _of(state).stick & ~redundant]
-        return float(np.linalg.norm(away, axis=1).max(initial=0.0))
+        away = np.linalg.norm(friction.along(held, self.frame.away), axis=1)
+        return np.where(self.active(state) & _of(state).stick & ~redundant, away, 0.0)
 
     def return_vectors(self, state: PairState) -> Array:
         """Displacements along the target that put contactors that stick back to their anchors ``(n, gdim)``."""
@@ -268,12 +269,11 @@ class Sliding:
         return state, ahead and bool(reduced(self.config.comm, pivot.taken.any(), op=MPI.LOR))
 
     def _next_in_line(
-        self, violated: friction.FrictionViolations, state: PairState, points: Array, tau: Array
+        self, violated: friction.FrictionViolations, state: PairState, at: Array, tau: Array
     ) -> tuple[Bools, Array]:
         """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
         stick, begin = self.active(state) & _of(state).stick, violated.slide & ~violated.driven
-        back = bool((self.pivot.taken & stick).any())
-        near, force = self.pivot.front.move(points[begin], tau[begin], back, points)
+        near, force = self.pivot.front.along(begin, self.pivot.taken & stick, tau, at)
         near &= stick & ~begin & ~violated.release
         return near, np.where(near[:, None], self.frame.tangential(force), tau)
 
@@ -287,7 +287,7 @@ class Sliding:
         """
         frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
         if self.config.gdim == 2:
-            self.pivot = Pivot.begin(Front(self.config.comm), np.zeros(len(none)), none, none)
+            self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(len(none)), none, none)
             return state
         k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
         c = friction.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
@@ -297,7 +297,7 @@ class Sliding:
         goes = frame.forced(frame.away, self._lost) > GAP_ROUNDING * self.config.size
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], friction.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
-        self.pivot = Pivot.begin(Front(self.config.comm), c, q, tau)
+        self.pivot = Pivot.begin(self.front(self.config.comm), c, q, tau)
         return replace(state, friction=friction.turned(_of(state), self.slipping(state), q))
 
     # -- equations and forces --------------------------------------------------------------------------------------------

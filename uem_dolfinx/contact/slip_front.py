@@ -30,6 +30,10 @@ class Front:
         self._last: Array | None = None
         self._reach = 0.0
 
+    def along(self, begin: Bools, back: Bools, force: Array, points: Array) -> tuple[Bools, Array]:
+        """Which contactors go along with those that ``begin (n,)``, if some ``back (n,)`` are held again, as ``move`` (collective)."""
+        return self.move(points[begin], force[begin], bool(back.any()), points)
+
     def move(self, here: Array, force: Array, too_far: bool, points: Array) -> tuple[Bools, Array]:
         """Which contactors go along, at first as far ahead as slip has come, and the forces they take over (collective).
 

@@ -6,19 +6,22 @@ this place, is force that the contact lacks; beside the contact force it tells h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.active_set import TIED
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets, nodes_of_facets
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
+from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.search import MeshTarget, nearest_of
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
@@ -59,65 +62,97 @@ class CornerInside:
 
 
 class TargetCorners:
-    """The convex corners of a pair's target, and the contactors' surface that they may enter (collective).
+    """The convex corners of targets of contacts, and the contactors' surfaces that they may enter (collective).
 
     Args:
-        pair: with equations at nodes.
-        tag: of the contactors' facets.
+        pairs: with equations at nodes, which are treated together.
+        tags: of the contactors' facets of each.
     """
 
-    def __init__(self, pair: Interface, tag: Tag):
-        self.pair, self._tag, config = pair, tag, pair.config
-        self._largest = 0.0
-        #: Owned nodes of the target at corners and ends ``(k,)``, and whether any rank has one.
-        self.nodes = corner_nodes(config, pair.target.facets) if isinstance(pair.target, MeshTarget) else np.zeros(0, np.int32)
-        self.some = isinstance(pair.target, MeshTarget) and bool(reduced(config.comm, len(self.nodes)))
-        if not self.some:
-            return
-        x = config.x[nodes_of_facets(config, tag).dofs]
-        sides = np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
-        #: Sizes of the largest and of the smallest facet, lengths.
-        self.reach: float = reduced(config.comm, float(np.ptp(x, axis=1).max(initial=0.0)), op=MPI.MAX)
-        self.smallest: float = reduced(config.comm, float(sides.min(initial=np.inf)), op=MPI.MIN)
+    def __init__(self, pairs: Sequence[Interface], tags: Sequence[Tag]):
+        self.pairs, self.whole = pairs, pairs[0].whole
+        config = self._config = self.whole.config
+        known: dict[Any, Indices] = {}
+        for pair in pairs:
+            if isinstance(pair.target, MeshTarget) and id(pair.target.facets) not in known:
+                known[id(pair.target.facets)] = corner_nodes(config, pair.target.facets)
+        own = [known[id(p.target.facets)] if isinstance(p.target, MeshTarget) else np.zeros(0, np.int32) for p in pairs]
+        #: Owned nodes of the targets at corners and ends ``(k,)`` with their contacts, and which contacts have one on any rank.
+        self.nodes = np.concatenate(own)
+        self.label: Ints = np.repeat(np.arange(len(pairs)), [len(nodes) for nodes in own])
+        self.some: Bools = np.asarray(reduced(config.comm, np.bincount(self.label, minlength=len(pairs))) > 0)
+        n = len(pairs)
+        #: The largest contact force so far, and sizes of the largest and of the smallest facet of each contact, lengths ``(n_pairs,)``.
+        self.largest, self.reach, self.smallest = np.zeros(n), np.zeros(n), np.full(n, np.inf)
+        self._tags = tags
+        sizes: dict[Any, tuple[float, float]] = {}
+        for k, tag in enumerate(tags):
+            if self.some[k] and id(tag) not in sizes:
+                x = config.x[nodes_of_facets(config, tag).dofs]
+                sides = np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+                sizes[id(tag)] = np.ptp(x, axis=1).max(initial=0.0), sides.min(initial=np.inf)
+            if self.some[k]:
+                self.reach[k], self.smallest[k] = sizes[id(tag)]
+        extremes = np.concatenate([self.reach, -self.smallest])
+        config.comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
+        self.reach, self.smallest = extremes[:n], -extremes[n:]
 
     @cached_property
-    def surface(self) -> MeshTarget | None:
-        """The contactors' surface; None inside a body, which has no outside that a corner could come from (first time: collective)."""
-        try:
-            return MeshTarget(TargetFacets(self.pair.config, self._tag, "contactor"))
-        except OrientationError:
-            return None
+    def surface(self) -> tuple[JoinedTarget | None, Ints]:
+        """Surfaces of the contactors, and which of these each contact has ``(n_pairs,)``; -1 inside a body (first time: collective).
+
+        That has no outside which a corner could come from.
+        """
+        found: dict[Any, TargetFacets | None] = {}
+        for tag in (tag for tag, some in zip(self._tags, self.some) if some and id(tag) not in found):
+            try:
+                found[id(tag)] = facets_of(self._config, tag, "contactor")
+            except OrientationError:
+                found[id(tag)] = None
+        place = {key: k for k, key in enumerate(key for key, facets in found.items() if facets is not None)}
+        of_contact = np.array([place.get(id(tag), -1) for tag in self._tags])
+        surfaces = [facets for facets in found.values() if facets is not None]
+        return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact) if surfaces else None, of_contact
 
     @timed("corners of the target")
-    def find(self, stiffness: Array) -> CornerInside | None:
-        """The corners that are inside where the bodies are now; None if they do not matter (collective).
+    def find(self, stiffness: Array, asked: Bools) -> dict[int, CornerInside]:
+        """The corners that are inside where the bodies are now, of contacts in which they matter, by their numbers (collective).
 
         Args:
             stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
+            asked: contacts that are looked at ``(n_pairs,)``.
         """
-        pair, config, comm = self.pair, self.pair.config, self.pair.config.comm
-        if not self.some or pair.mutual:
-            return None
-        near = self._near()
-        some, force = reduced(comm, np.array([len(near), pair.trial.lam.sum()]))
+        whole, config, comm, n = self.whole, self._config, self._config.comm, len(self.pairs)
+        asked = asked & self.some & ~np.array([pair.mutual for pair in self.pairs])
+        if not asked.any():
+            return {}
+        near, label = self._near(asked)
+        pressing = np.bincount(whole.label, weights=whole.trial.lam, minlength=n)
+        some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
         # bodies that part press hardly any more
-        self._largest = force = max(force, self._largest)
-        if not some:
-            return None
+        self.largest[asked] = np.maximum(force, self.largest)[asked]
+        if not some.any():
+            return {}
         # beside a contactor none is deeper than it is away from there
-        points, least = pair.points, ON_FACET * self.smallest
-        distance, _ = nearest_of(comm, config.x[near], points, least, np.zeros((len(points), 1)))
-        near = near[distance > least]
-        if not reduced(comm, len(near)) or self.surface is None:
-            return None
-        points = config.x[near]
-        p = self.surface.project(points)
+        least = ON_FACET * float(self.smallest[asked].min())
+        away = 4.0 * config.size * np.arange(1, n + 1)
+        places, points = (np.column_stack([x, away[k]]) for x, k in ((config.x[near], label), (whole.points, whole.label)))
+        distance, _ = nearest_of(comm, places, points, least, np.zeros((len(points), 1)))
+        near, label = near[distance > least], label[distance > least]
+        if not reduced(comm, len(near)):
+            return {}
+        surface, of_contact = self.surface
+        outside = of_contact[label] >= 0
+        near, label = near[outside], label[outside]
+        if surface is None or not reduced(comm, len(near)):
+            return {}
+        p = surface.project_onto(config.x[near], of_contact[label])
         depth, part = -p.gap, -p.gap / p.facet_size
         inside = (part > ON_FACET) & (p.from_end > 0.0) & (p.beyond == 0.0).all(axis=1)
         # deeper than the cell behind the facet it may as well be behind the body
-        inside &= depth < self.surface.of_facets(p.facet, self.surface.facets.depth)
+        inside &= depth < surface.of_facets(p.facet, surface.facets.depth)
         if not reduced(comm, int(inside.sum())):
-            return None
+            return {}
         stiffness = np.abs(stiffness)
         of_facet = config.ask_owners(p.nodes.ravel(), stiffness).reshape(*p.nodes.shape, config.gdim)
         theirs, own = (
@@ -125,25 +160,29 @@ class TargetCorners:
             np.einsum("ng,ng->n", stiffness[near], p.normal**2),
         )
         both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
-        lacking = reduced(comm, float(both @ depth))
-        if not lacking > LACKING * force:
-            return None
-        found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in np.flatnonzero(inside)]
-        everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
-        # of equals the one that no rounding and no partition chooses
-        deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
-        part, place, deep = next(one for one in everywhere if one[1] == deepest)
-        return CornerInside(place, deep, part, lacking / force if force > 0.0 else np.inf)
+        lacking = reduced(comm, np.bincount(label, weights=both * depth, minlength=n))
+        told = {}
+        for k in np.flatnonzero(lacking > LACKING * self.largest):
+            which = np.flatnonzero(inside & (label == k))
+            found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
+            everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
+            # of equals the one that no rounding and no partition chooses
+            deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
+            size, place, deep = next(one for one in everywhere if one[1] == deepest)
+            told[int(k)] = CornerInside(place, deep, size, lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf)
+        return told
 
-    def _near(self) -> Indices:
-        """Corners in the box of the contactors that are no farther from the target than a facet is large (collective)."""
-        pair, config = self.pair, self.pair.config
-        points = pair.points
-        points = points[np.linalg.norm(points - pair.projection.foot, axis=1) <= self.reach]
-        bounds = np.concatenate([np.max(sign * points, axis=0, initial=-np.inf) for sign in (-1.0, 1.0)])
+    def _near(self, asked: Bools) -> tuple[Indices, Ints]:
+        """Corners in the box of the contactors that are no farther from the target than a facet is large, and contacts (collective)."""
+        whole, config, g = self.whole, self._config, self._config.gdim
+        points, label = whole.points, whole.label
+        near = asked[label] & (np.linalg.norm(points - whole.projection.foot, axis=1) <= self.reach[label])
+        bounds = np.full((len(self.pairs), 2 * g), -np.inf)
+        np.maximum.at(bounds, label[near], np.column_stack([-points, points])[near])
         config.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
-        x, g = config.x[self.nodes], config.gdim
-        return self.nodes[((x >= -bounds[:g] - self.reach) & (x <= bounds[g:] + self.reach)).all(axis=1)]
+        x, reach, bounds = config.x[self.nodes], self.reach[self.label, None], bounds[self.label]
+        inside = asked[self.label] & ((x >= -bounds[:, :g] - reach) & (x <= bounds[:, g:] + reach)).all(axis=1)
+        return self.nodes[inside], self.label[inside]
 
 
 def corner_nodes(config: Configuration, facets: TargetFacets) -> Indices:

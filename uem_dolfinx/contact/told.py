@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -18,6 +19,7 @@ from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.law import FrictionLaw
     from uem_dolfinx.contact.sliding import Sliding
     from uem_dolfinx.contact.tie import Tie
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 class Told:
     """What results, checks and checkpoints ask; attributes as those of ``Interface``."""
 
+    name: str
     config: Configuration
     nodes: Indices
     trial: PairState
@@ -46,6 +49,56 @@ class Told:
     def acting(self) -> Sliding | None:
         """Friction, where it can act: None also where no contactor of any rank has anything near."""
         return None if self.kinematics.idle else self.friction
+
+    @property
+    def members(self) -> Sequence[Any]:
+        """Interfaces of single contacts that it consists of: itself, unless several are treated together."""
+        return [self]
+
+    @property
+    def whole(self) -> Any:
+        """What it is treated with: itself, unless it is one of several."""
+        return self
+
+    @property
+    def label(self) -> Ints:
+        """Number of the contact of each contactor among ``members`` ``(n,)``."""
+        return np.zeros(len(self.nodes), np.int64)
+
+    def turns(self) -> Sequence[Any]:
+        """Rows of contactors that are returned to the target together, each node once, in turn (collective)."""
+        return [slice(None)]
+
+    def name_at(self, i: int) -> str:
+        """Name of the contact of a contactor."""
+        return self.name
+
+    @property
+    def far(self) -> bool:
+        """Whether it is not looked at, since the surfaces are far apart."""
+        return self.discretisation.far
+
+    @far.setter
+    def far(self, far: bool) -> None:
+        self.discretisation.far = far
+
+    @property
+    def far_of(self) -> Bools:
+        """Which of the ``members`` are not looked at ``(n_members,)``."""
+        return np.array([self.far])
+
+    @far_of.setter
+    def far_of(self, far: Bools) -> None:
+        self.far = bool(far[0])
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again (collective)."""
+        self.discretisation.set_offset(offset)
+
+    def know_friction(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law of friction, and values of its parameter ``(n,)``, with which the committed state has been reached (collective)."""
+        assert self.friction is not None
+        self.friction.set(law, value)
 
     @property
     def target(self) -> Target:
@@ -102,7 +155,7 @@ class Told:
         """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
         if self.acting is not None:
-            here = max(here, self.acting.largest_distance(self.trial, self.redundant))
+            here = max(here, float(self.acting.distances(self.trial, self.redundant).max(initial=0.0)))
         return here if self.tie is None else max(here, self.tie.largest_gap_here())
 
     def largest_gap(self) -> float:

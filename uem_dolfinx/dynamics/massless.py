@@ -100,9 +100,10 @@ def _followed(config: Configuration, contact: Contact) -> Bools:
 def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:
     """Of ``contactors (n,)`` from the targets, the nearest one that each of them may touch ``(n,)`` (collective)."""
     found = np.full(len(contactors), np.inf)
+    for whole in {id(contact.pair.whole): contact.pair.whole for contact in contacts}.values():
+        whole.project()
     for contact in contacts:
         pair = contact.pair
-        pair.project()
         # the foot on a rigid surface is the contactor itself
         away = np.maximum(np.linalg.norm(pair.points - pair.projection.foot, axis=1), np.abs(pair.projection.gap))
         np.minimum.at(found, np.searchsorted(contactors, pair.nodes), away)

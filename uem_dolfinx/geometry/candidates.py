@@ -17,12 +17,15 @@ ALL_PAIRS = 2**15
 
 
 @timed("search")
-def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, Ints]:
+def candidate_pairs(
+    shape: FacetShape, x: Array, points: Array, asked: Ints | None = None, surface: Ints | None = None
+) -> tuple[Ints, Ints]:
     """Indices ``(k,)`` of points and of facets that can be closest, of many from trees over the facets' middles, one per size class.
 
     A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
     into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
-    ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``.
+    ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``. With numbers of surfaces those of
+    each point's surface, ``asked (n,)``, are candidates alone, ``surface (m,)``; every point's has some.
     """
     if len(points) == 0 or len(x) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -32,15 +35,20 @@ def candidate_pairs(shape: FacetShape, x: Array, points: Array) -> tuple[Ints, I
     radius = shape.lebesgue * np.linalg.norm(arm, axis=2).max(axis=1)
     normal = unit_normals(tab, x)
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
-    if len(points) * len(x) <= ALL_PAIRS:
-        distance = np.sqrt(sum((points[:, None, k] - middle[:, k]) ** 2 for k in range(points.shape[1])))
+    places, middles = points, middle
+    if asked is not None and surface is not None:
+        # a further axis, along which surfaces are farther from each other than all that is near
+        far = 4.0 * float(np.ptp(np.concatenate([points, middle]), axis=0).sum() + radius.max())
+        places, middles = np.column_stack([points, far * asked]), np.column_stack([middle, far * surface])
+    if len(places) * len(middles) <= ALL_PAIRS:
+        distance = np.sqrt(sum((places[:, None, k] - middles[:, k]) ** 2 for k in range(places.shape[1])))
         bound = distance.min(axis=1) * (1 + EQUALLY_NEAR)
         i, f = np.nonzero(distance <= bound[:, None] + radius)
     else:
         from scipy.spatial import cKDTree
 
-        bound = cKDTree(middle).query(points)[0] * (1 + EQUALLY_NEAR)
-        i, f = balls_that_meet(points, bound, middle, radius)
+        bound = cKDTree(middles).query(places)[0] * (1 + EQUALLY_NEAR)
+        i, f = balls_that_meet(places, bound, middles, radius)
     # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))

@@ -228,6 +228,15 @@ def _shape_of(config: Configuration) -> FacetShape:
     return facet_shape(FACET_OF[compat.cell_name(config.mesh)], config.degree)
 
 
+def facets_of(config: Configuration, tag: Tag, role: str = "target") -> TargetFacets:
+    """Facets of a surface, which all that name it share; arguments as of ``TargetFacets`` (collective)."""
+    known = config.surfaces
+    if id(tag) not in known:
+        # the tag is kept, so that no other gets its number
+        known[id(tag)] = tag, TargetFacets(config, tag, role)
+    return known[id(tag)][1]
+
+
 def heights(points: Array, facet: Ints, planes: tuple[Array, Array]) -> Array:
     """How high ``points (k, gdim)`` are over some of the ``planes`` through facets, as of ``TargetFacets.middles`` ``(k,)``."""
     middle, normal = planes

@@ -139,8 +139,8 @@ def read_checkpoint(path: str | Path, state: State) -> None:
     state.numbers.update(content["numbers"])
     state.steps = content["steps"]
     state.move(content["motions"])
-    for contact in state.contacts:
-        contact.pair.project()
+    for pair in {id(contact.pair.whole): contact.pair.whole for contact in state.contacts}.values():
+        pair.project()
     for hook in state.restore:
         ask_together(comm, "a function in State.restore", hook)
 

@@ -240,14 +240,17 @@ class Exchanges:
         return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
 
     def _first(self, violated: Sequence[Violations]) -> list[Violations]:
-        """The first of the wrong contactors alone, with those at the same place of the same pair."""
+        """The first of the wrong contactors alone, with those at the same place of the same contact."""
         config = self._pairs[0].config
         along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
-        least = np.array([np.where(w.which, a, np.inf).min(initial=np.inf) for w, a in zip(violated, along)])
+        first = np.cumsum([0, *(len(pair.members) for pair in self._pairs)])
+        label, least = [k + pair.label for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
+        for which, w, a in zip(label, violated, along):
+            np.minimum.at(least, which, np.where(w.which, a, np.inf))
         config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
         k = int(np.argmax(np.isfinite(least)))
         at = least[k] + TOUCHING * config.size
-        return [w.among((a <= at) & (i == k)) for i, (w, a) in enumerate(zip(violated, along))]
+        return [w.among((a <= at) & (which == k)) for which, w, a in zip(label, violated, along)]
 
     def visit(self, norm: float) -> bool:
         """Note the state in which the bodies are, which is no equilibrium.
@@ -300,9 +303,9 @@ class Exchanges:
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
         """The error that names contactors ``(n,)`` of every pair."""
         own = [
-            (tuple(pair.config.X[i]), pair.name, pair.config.describe(int(i)))
+            (tuple(pair.config.X[pair.nodes[i]]), pair.name_at(int(i)), pair.config.describe(int(pair.nodes[i])))
             for pair, c in zip(self._pairs, changed)
-            for i in pair.nodes[c]
+            for i in np.flatnonzero(c)
         ]
         found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
         names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])

@@ -64,11 +64,17 @@ class FarApart:
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface]):
         self._config = config
-        some = [pair for pair in pairs if _may_be_far(pair)]
+        some = [one for pair in pairs if _may_be_far(pair) for one in pair.members]
         targets = [pair.target for pair in some if isinstance(pair.target, MeshTarget)]
         self._rigid: list[Any] = [pair.target for pair in some if not pair.target.n_nodes]
         self._pairs = sorted(some, key=lambda pair: not pair.target.n_nodes)
-        sides = [pair.nodes for pair in self._pairs] + [np.unique(target.dofs) for target in targets]
+        surfaces = {id(target.facets): target.dofs for target in targets}
+        unique = {key: np.unique(dofs) for key, dofs in surfaces.items()}
+        number = {id(pair): k for k, pair in enumerate(self._pairs)}
+        #: What they are treated as, and places of its members among them.
+        self._wholes = [pair for pair in pairs if _may_be_far(pair)]
+        self._places: list[Ints] = [np.array([number[id(one)] for one in pair.members]) for pair in self._wholes]
+        sides = [pair.nodes for pair in self._pairs] + [unique[id(target.facets)] for target in targets]
         lengths = np.array([len(side) for side in sides], np.int64)
         #: Nodes of all surfaces, those that have any on this rank, and where theirs begin.
         self._nodes: Ints = np.concatenate([np.zeros(0, np.int64), *sides])
@@ -78,8 +84,8 @@ class FarApart:
         # facets of higher degree may leave the box around their nodes
         self._out = np.array([0.5 * (target.shape.lebesgue - 1) for target in targets])
         longest = np.zeros(len(self._pairs))
-        for k, target in enumerate(targets):
-            longest[k] = np.linalg.norm(np.ptp(config.X[target.dofs], axis=1), axis=1).max(initial=0.0)
+        size = {key: np.linalg.norm(np.ptp(config.X[dofs], axis=1), axis=1).max(initial=0.0) for key, dofs in surfaces.items()}
+        longest[: len(targets)] = [size[id(target.facets)] for target in targets]
         if some:
             config.comm.Allreduce(MPI.IN_PLACE, longest, op=MPI.MAX)
         #: What is near, and with offsets ``(n_pairs,)``; boxes where the bodies were when last asked.
@@ -95,17 +101,18 @@ class FarApart:
         if not self._pairs:
             return
         offsets = [pair.discretisation.offset for pair in self._pairs]
-        more = [[0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]]
+        more = np.zeros((2, len(self._pairs)))
+        more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
         # what touches, or has slid past an end, is looked at
-        more.append([(p.trial.active | p.trial.passed | p.barred).any() for p in self._pairs])
-        self._boxes, (offset, used) = self._look(self._config.x, np.array(more, float))
+        for place, p in zip(self._places, self._wholes):
+            used = p.trial.active | p.trial.passed | p.barred
+            more[1, place[p.label[used]]] = 1.0
+        self._boxes, (offset, used) = self._look(self._config.x, more)
         self._near = self._reach + offset
         far = (used == 0.0) & (self._boxes.apart > self._near)
         far[len(far) - len(self._rigid) :] &= not falls
-        for pair, apart in zip(self._pairs, far):
-            if pair.discretisation.far != apart:
-                pair.discretisation.far = bool(apart)
-                pair.project()
+        for pair in self._set(far):
+            pair.project()
 
     def place(self) -> None:
         """Look at those that are near where the bodies are now, from the next placement on (collective)."""
@@ -128,7 +135,7 @@ class FarApart:
 
     @property
     def _any_far(self) -> bool:
-        return any(pair.discretisation.far for pair in self._pairs)
+        return bool(self._far.any())
 
     def _look(self, x: Array, more: Array | None = None) -> tuple[Boxes, Array]:
         """Boxes with the local nodes at ``x (n_local, gdim)``, and the largest over all ranks of ``more (k, n_pairs)`` (collective)."""
@@ -150,12 +157,24 @@ class FarApart:
         distance = np.array([target.distance_of(at[None])[0] for target, at in zip(self._rigid, middle)])
         return Boxes(between, middle, radius, distance), most
 
+    @property
+    def _far(self) -> Bools:
+        """Which contacts are not looked at ``(n_pairs,)``."""
+        far = np.zeros(len(self._pairs), dtype=bool)
+        for place, pair in zip(self._places, self._wholes):
+            far[place] = pair.far_of
+        return far
+
+    def _set(self, far: Bools) -> list[Interface]:
+        """Look at contacts or not ``(n_pairs,)``; those are returned of which that is new, as they are treated."""
+        found = [(place, p) for place, p in zip(self._places, self._wholes) if (far[place] != p.far_of).any()]
+        for place, pair in found:
+            pair.far_of = far[place]
+        return [pair for _, pair in found]
+
     def _look_at(self, near: Bools) -> list[Interface]:
-        """Look at those of the contacts ``near (n_pairs,)`` that have not been looked at, which are returned."""
-        found = [pair for pair, now in zip(self._pairs, near) if now and pair.discretisation.far]
-        for pair in found:
-            pair.discretisation.far = False
-        return found
+        """Look at those of the contacts ``near (n_pairs,)`` that have not been looked at, which are returned as they are treated."""
+        return self._set(self._far & ~near)
 
 
 def _may_be_far(pair: Interface) -> bool:

@@ -96,6 +96,10 @@ class FloatingBodies:
         #: Likewise with those that friction alone resists, where all contactors slip.
         self._sliding: Array = np.zeros((0, 0))
 
+    def take(self, pairs: Sequence[Interface], far_apart: FarApart) -> None:
+        """Take the same contacts as they are treated from now on, and which of them are looked at."""
+        self._pairs, self._far_apart = pairs, far_apart
+
     @cached_property
     def _has_springs(self) -> bool:
         """Whether bodies may be held beside conditions: by springs at nodes, or by a form of displacements themselves."""
@@ -280,7 +284,7 @@ class FloatingBodies:
 
     def _looked_at(self) -> list[Interface]:
         """Pairs that are not far apart."""
-        return [pair for pair in self._pairs if not pair.discretisation.far]
+        return [pair for pair in self._pairs if not pair.far]
 
     def _held(self) -> _Held:
         """What contacts and equations of users hold where the bodies are now (collective)."""

@@ -152,6 +152,10 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             )
         if problem.linear is not None or problem.bodies.points is not None:
             raise InputError("gradients do not know equations, forces and springs of nodes: expected a problem without them")
+    from uem_dolfinx.solve.parted import part_contacts
+
+    # derivatives are known of each contact
+    part_contacts(problem)
 
 
 def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:

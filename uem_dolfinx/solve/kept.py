@@ -61,7 +61,7 @@ def state_of(problem: Any) -> State:
     def restore() -> None:
         if config.unknowns.mixed:
             problem.u.x.array[:] = config.values_of(own)
-            for pair in problem.pairs:
+            for pair in problem.interfaces:
                 # they have been projected where the bodies were before
                 pair.remember(pair.memory())
                 pair.project()

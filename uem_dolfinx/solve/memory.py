@@ -40,7 +40,7 @@ class Memory:
             displacement=problem.committed,
             largest_forces=problem.largest_forces,
             motions=problem.motions,
-            pairs=[pair.memory() for pair in problem.pairs],
+            pairs=[pair.memory() for pair in problem.interfaces],
             histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
             dynamics=None if problem.dynamics is None else problem.dynamics.memory(),
         )
@@ -54,14 +54,14 @@ class Memory:
                 material.history[name].x.array[:] = values
         if problem.dynamics is not None:
             problem.dynamics.remember(self.dynamics)
-        for pair, own in zip(problem.pairs, self.pairs):
+        for pair, own in zip(problem.interfaces, self.pairs):
             pair.remember(own)
         problem.restore()
 
 
 def move_targets(problem: Any, motions: list[Motion | None]) -> None:
     """Put the pairs' rigid targets where these motions take them."""
-    for pair, motion in zip(problem.pairs, motions):
+    for pair, motion in zip(problem.interfaces, motions):
         if pair.target.motion is not motion:
             pair.target.motion = motion
 

@@ -74,6 +74,9 @@ def refuse_passages(
         longest = all_ways[:, k, :2].max(axis=0).sum()
         if longest <= pair.target.stride:
             continue
+        if len(pair.members) > 1:
+            refuse_passages(config, pair.members, start, [motion] * len(pair.members), moving)
+            continue
         if isinstance(pair.target, MeshTarget):
             total = all_ways[:, k, 2:].sum(axis=0)
             depth = _through_mesh(pair, pair.target, start, du - total[:-1] / max(total[-1], 1.0), moving)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,8 @@ from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.watched import name_corner
+from uem_dolfinx.contact.joining import join_alike
+from uem_dolfinx.contact.watched import Watch
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.forms import in_all_cells
@@ -206,7 +206,10 @@ class UnitedProblem:
         self.solver = solver_of(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
-        pairs = [contact.attach(self.config, free, **clock) for contact in self.contacts]
+        for contact in self.contacts:
+            contact.attach(self.config, free, **clock)
+        if method is BodySystem:
+            join_alike(self.contacts)
         if dynamics is not None:
             from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 
@@ -223,7 +226,7 @@ class UnitedProblem:
             options["linear"] = self.linear
         #: The ``solve.stages.Stage`` that the problem is in; None outside of those.
         self.stage: Any = None
-        self.system = method(self.bodies, pairs, self.solver, **options)
+        self.system = method(self.bodies, self.interfaces, self.solver, **options)
         #: Length of time steps, and what is known of those before.
         self.step_control = StepControl()
         #: How far the problem is, in steps and in load.
@@ -243,6 +246,8 @@ class UnitedProblem:
         self.history: Any = None
         for contact in self.contacts:
             contact.begin()
+        #: What is warned of while steps are taken.
+        self.watch = Watch(self.contacts)
         from uem_dolfinx.solve.settings import Settings
 
         #: What the run is made with, for checkpoints.
@@ -321,7 +326,7 @@ class UnitedProblem:
             ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
             TunnellingError, UserFunctionError: after the committed state has been restored.
         """
-        for pair in self.pairs:
+        for pair in self.interfaces:
             check_moved(pair)
         self.led = start, fraction, along is not None
         with agreed(self.comm):
@@ -348,13 +353,13 @@ class UnitedProblem:
                 check_signals=lambda: self.progress.check_signals(self.comm),
             )
             self.system.end_step()
-            on = [contact.on for contact in self.contacts]
-            pairs, motions = [*compress(self.pairs, on)], [*compress(self.motions, on)]
+            on = {id(contact.pair.whole) for contact in self.contacts if contact.on}
+            pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on)) if on else ((), ())
             refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
         except UEMError as error:
             self.restore()
             if isinstance(error, MENDABLE):
-                name_corner(self.contacts, self.bodies.stiffness, error)
+                self.watch.name_corner(self.bodies.stiffness, error)
             raise
         return history
 
@@ -378,13 +383,12 @@ class UnitedProblem:
             self.dynamics.commit()
             if self.linear is not None:
                 self.linear.settle(self.dynamics)
-        before = [pair.committed for pair in self.pairs]
-        for pair in self.pairs:
+        before = {id(pair): pair.committed for pair in self.interfaces}
+        for pair in self.interfaces:
             pair.commit()
             pair.project()
         self.motions = self.rigid_motions()
-        for contact, state in zip(self.contacts, before):
-            contact.look_at(state, self.bodies.stiffness)
+        self.watch.look(before, self.bodies.stiffness)
 
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
@@ -393,7 +397,7 @@ class UnitedProblem:
             material.update()
         if self.dynamics is not None:
             self.dynamics.restore()
-        for pair in self.pairs:
+        for pair in self.interfaces:
             pair.restore()
             pair.project()
 
@@ -425,9 +429,14 @@ class UnitedProblem:
         """Contactors and targets of the contacts."""
         return [contact.pair for contact in self.contacts]
 
+    @property
+    def interfaces(self) -> list[Interface]:
+        """The same as they are treated, contacts that are alike together."""
+        return list({id(pair.whole): pair.whole for pair in self.pairs}.values())
+
     def rigid_motions(self) -> list[Motion | None]:
-        """Where the rigid targets are now; None for those that have not moved, and for meshes."""
-        return [pair.target.motion for pair in self.pairs]
+        """Where the rigid targets of all ``interfaces`` are now; None for those that have not moved, and for meshes."""
+        return [pair.target.motion for pair in self.interfaces]
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:

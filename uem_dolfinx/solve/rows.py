@@ -15,7 +15,7 @@ from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Constraints, Traction
 from uem_dolfinx.errors import ConflictError, FrictionError
@@ -40,15 +40,22 @@ class OverConstraints:
 
     Attributes:
         shared: whether a node is a contactor of several pairs.
-        mutual: pairs whose surfaces are contactor and target of each other (two-pass) ``(n_pairs,)``.
         stacked: whether a node that is followed may itself be eliminated.
         contestable: whether equations can conflict that follow each other in no ring.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._unknowns = config.unknowns
-        follows = [followed_nodes(config, pair.discretisation.followed) for pair in pairs]
-        meets = np.array([[f[pair.nodes].any() for f in follows] for pair in pairs], dtype=bool).reshape(len(pairs), len(pairs))
+        # contacts that are treated together meet each other one by one
+        surfaces, which = _surfaces([one for pair in pairs for one in pair.members])
+        follows = [followed_nodes(config, dofs) for dofs in surfaces]
+        whole, pairs = pairs, [one for pair in pairs for one in pair.members]
+        table: Bools = np.zeros((len(follows), config.n_local), dtype=bool)
+        for k, own in enumerate(follows):
+            table[k] = own
+        meets: Bools = np.zeros((len(pairs), len(pairs)), dtype=bool)
+        for k, pair in enumerate(pairs):
+            meets[k] = np.asarray(table[:, pair.nodes].any(axis=1))[which]
         contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
         shared = len(np.unique(contactors)) < len(contactors)
         found = np.append(meets.ravel(), shared)
@@ -59,19 +66,18 @@ class OverConstraints:
         ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
         one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
         both_ways = meets & meets.T & ~one_order
-        self.mutual: Bools = both_ways.any(axis=1)
         # what is tied as a whole never touches: its surfaces meet others beside it alone
         tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
         refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
-        for pair, mutual, wrong in zip(pairs, self.mutual, refused):
+        for pair, mutual, wrong in zip(pairs, both_ways.any(axis=1), refused):
             pair.mutual = bool(mutual)
             if wrong and not pair.discretisation.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
-        self.stacked = bool(meets.any()) or any(pair.chained for pair in pairs)
-        self.contestable = self.shared or any(pair.discretisation.prescribed for pair in pairs)
+        self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
+        self.contestable = self.shared or any(pair.discretisation.prescribed for pair in whole)
         if any(_unites_heat(pair) for pair in pairs):
             # temperatures of both sides stand in the same rows, and may be prescribed
             self.stacked = self.contestable = True
@@ -244,6 +250,13 @@ def make_rows(
     )
 
 
+def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
+    """Nodes of all targets, those of one surface once, and which of these each pair has ``(n_pairs,)``."""
+    keys = [id(getattr(pair.target, "facets", pair)) if len(pair.whole.members) > 1 else id(pair) for pair in pairs]
+    first = {key: pair.discretisation.followed for key, pair in reversed(list(zip(keys, pairs)))}
+    return list(first.values()), np.array([list(first).index(key) for key in keys], dtype=np.int64)
+
+
 def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int) -> UnitingEquations:
     """Equations and others after them."""
     return UnitingEquations.join([equations, *more], block) if more else equations
@@ -305,7 +318,7 @@ def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: B
     bad, error = np.flatnonzero(wedged), None
     if len(bad):
         node = int(test.node[bad[0]])
-        names = ", ".join(pair.name for pair in pairs if node in pair.nodes)
+        names = ", ".join(one.name for pair in pairs for one in pair.members if node in one.nodes)
         error = FrictionError(
             f"{names}: friction leaves more than one answer about the contactor at {pairs[0].config.describe(node)}, where several uniting "
             "equations meet and it wedges: take less friction there, or drop one of the contacts"

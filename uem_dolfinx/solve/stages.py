@@ -31,6 +31,7 @@ from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import check_conditions
 from uem_dolfinx.solve.kept import take_multipliers
 from uem_dolfinx.solve.memory import move_targets
+from uem_dolfinx.solve.parted import part_contacts
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.reactions import owned_displacement, reactions
 from uem_dolfinx.solve.step import Step
@@ -136,7 +137,7 @@ class Stage:
         else:
             problem.set_load(progress.factor if progress.ahead == 0 else end, known=True)
             move_targets(problem, problem.motions)
-            for pair in problem.pairs:
+            for pair in problem.interfaces:
                 settle(pair)
 
     def _share(self, at: float) -> float:
@@ -148,6 +149,9 @@ class Stage:
     def _switch(self, fresh: bool) -> None:
         """Take the step's conditions and contacts, and the forces of what it releases (collective)."""
         problem, step = self._problem, self.step
+        if step.contacts:
+            # some of those that are alike go on without the others
+            part_contacts(problem)
         bodies, held = problem.bodies, problem.bodies.held
         parts = [(part, on) for one, on in step.contacts.items() for part in ([one] if isinstance(one, Contact) else one.parts)]
         left, come = ([part for part, on in parts if on is not part.on and on is which] for which in (False, True))
@@ -158,7 +162,7 @@ class Stage:
         other = bool(reduced(problem.comm, bool(changed.any()), op=MPI.LOR))
         if fresh:
             problem.progress.carried = self._carried(acting, held & changed, left)
-        for pair in problem.pairs if other else ():
+        for pair in problem.interfaces if other else ():
             hold(pair, bodies.free[: problem.config.n_owned], None if not fresh else problem.config.of(changed).any(axis=1))
         for part, on in parts:
             part.switch(on)
@@ -172,7 +176,8 @@ class Stage:
             problem.unite(step.loads, 0.0)
             if problem.linear is not None and problem.progress.ahead == 0:
                 take_multipliers(problem)
-            problem.system.take([contact.pair for contact in problem.contacts if contact.on], problem.linear)
+            left_on = {id(contact.pair.whole) for contact in problem.contacts if contact.on}
+            problem.system.take([pair for pair in problem.interfaces if id(pair) in left_on], problem.linear)
 
     # -- what is released ------------------------------------------------------------------------------------------------
 

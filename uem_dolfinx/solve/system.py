@@ -119,22 +119,22 @@ class BodySystem:
 
     def return_to_targets(self, bound: float) -> bool:
         """Normal return [UEM, 4.2]: put active contactors back onto the moved targets (collective); see ``ContactMethod``."""
-        # surfaces that follow each other would both make up for the same gap
-        pairs = [pair for pair, mutual in zip(self.pairs, self.over_constraints.mutual) if not mutual]
-        if not pairs:
+        if not self.pairs:
             return False
         assert self.bodies.stiffness is not None
-        ways = [pair.return_vectors() for pair in pairs]
-        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(pairs, ways)]
+        ways = [pair.return_vectors() for pair in self.pairs]
+        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(self.pairs, ways)]
         disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
         if not 0.0 < disturbance <= bound:
             return False
-        for k, (pair, way) in enumerate(zip(pairs, ways)):
-            if self.over_constraints.shared and k > 0:
-                # what another pair has returned is returned
-                pair.project()
-                way = pair.return_vectors()
-            self.config.shift(pair.nodes, way)
+        shared = self.over_constraints.shared
+        for k, (pair, way) in enumerate(zip(self.pairs, ways)):
+            for j, rows in enumerate(pair.turns() if shared else [slice(None)]):
+                if shared and j + k > 0:
+                    # what another pair has returned is returned
+                    pair.project()
+                    way = pair.return_vectors()
+                self.config.shift(pair.nodes[rows], way[rows])
         self.bodies.u.x.scatter_forward()
         self.place()
         return True
@@ -424,7 +424,7 @@ class BodySystem:
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
-        if near is None and (self.floating.neutral or any(pair.discretisation.far for pair in self.pairs)):
+        if near is None and (self.floating.neutral or any(pair.far for pair in self.pairs)):
             dq = self.solver.complete(dq)
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 

@@ -1,0 +1,68 @@
+"""Which contacts of a problem are treated together: those that are alike but for surfaces and values."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.contact.laws.thermal import OfTemperature
+from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.sliding import Sliding
+from uem_dolfinx.geometry.search import MeshTarget
+
+
+def join_alike(contacts: Sequence[Contact]) -> None:
+    """Treat contacts together that are alike, in a problem that is being made (collective).
+
+    They are contacts of nodes at finite sliding with meshes, at degree 1, with the same normals and thickness of the target's body,
+    without friction or with Coulomb's; without ties, wear and heat.
+    """
+    groups: dict[Hashable, list[Contact]] = {}
+    for contact in contacts:
+        kind = _kind(contact)
+        if kind is not None:
+            groups.setdefault(kind, []).append(contact)
+    for alike in groups.values():
+        if len(alike) > 1:
+            from uem_dolfinx.contact.joined import JoinedInterface
+
+            whole = JoinedInterface([contact.pair for contact in alike])
+            for contact, member in zip(alike, whole.members):
+                contact.take_pair(member)
+
+
+def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]:
+    """Give contacts that are treated together interfaces of their own again (collective).
+
+    Returns:
+        What they were parts of, with these interfaces.
+    """
+    wholes = {id(contact.pair.whole): contact.pair.whole for contact in contacts}
+    parted = [(whole, whole.part()) for whole in wholes.values() if len(whole.members) > 1]
+    own = {id(member): pair for whole, pairs in parted for member, pair in zip(whole.members, pairs)}
+    for contact in contacts:
+        if id(contact.pair) in own:
+            contact.take_pair(own[id(contact.pair)])
+    for _, pairs in parted:
+        for pair in pairs:
+            pair.project()
+    return parted
+
+
+def _kind(contact: Contact) -> Hashable:
+    """What contacts that are treated together have in common; None for those that are not."""
+    pair = contact.pair
+    nodal = type(contact) is Contact and type(pair.discretisation) is NodeToSurface and type(pair.target) is MeshTarget
+    if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heat is not None:
+        return None
+    if pair.friction is not None and not _joins(pair.friction):
+        return None
+    return pair.frictional, pair.target.averaged, pair.thickness
+
+
+def _joins(friction: Sliding) -> bool:
+    """Whether friction is Coulomb's with values that do not follow a temperature, and wears nothing."""
+    law = friction.limits.law
+    return type(law) is Coulomb and not isinstance(law.field, OfTemperature) and friction.wear is None

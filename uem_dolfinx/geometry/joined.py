@@ -1,0 +1,173 @@
+"""Surfaces of many targets as one: each point sees the facets of its own surface alone, and one search finds all closest points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import ON_SIDE, Feet, MeshTarget
+from uem_dolfinx.parallel import Exchange
+
+
+class JoinedFacets(TargetFacets):
+    """Facets of several surfaces, one surface after the other on each rank (collective).
+
+    A facet of two surfaces stands here twice. Normals at nodes are means over facets of one surface.
+
+    Args:
+        config: configuration of the displacement.
+        surfaces: that are joined, S of them.
+
+    Attributes:
+        surface: number of the surface of each facet ``(m,)``.
+    """
+
+    def __init__(self, config: Configuration, surfaces: Sequence[TargetFacets]):
+        self.config, self.role, self.tag, self.shape = config, "target", surfaces[0].tag, surfaces[0].shape
+        self.cells, self.sides = (np.concatenate([getattr(s, name) for s in surfaces]) for name in ("cells", "sides"))
+        self.dofs, self.nodes = (np.concatenate([getattr(s, name) for s in surfaces]) for name in ("dofs", "nodes"))
+        self.entities, self.sign, self.depth = (
+            np.concatenate([getattr(s, name) for s in surfaces]) for name in ("entities", "sign", "depth")
+        )
+        self.open_sides = np.concatenate([s.open_sides for s in surfaces])
+        self.open_nodes = np.concatenate([s.open_nodes for s in surfaces])
+        sizes = np.array([len(s.dofs) for s in surfaces])
+        self.surface: Ints = np.repeat(np.arange(len(surfaces)), sizes)
+        every = np.empty((config.comm.size, len(surfaces)), dtype=sizes.dtype)
+        config.comm.Allgather(sizes, every)
+        #: First facet of every surface among those of every rank, and numbers over all ranks as each surface alone has them.
+        self._begin = np.cumsum(every, axis=1) - every
+        self._alone = np.concatenate([np.zeros((1, len(surfaces)), int), np.cumsum(every, axis=0)])
+        self._apart = self._without_common_nodes(len(surfaces))
+
+    def _without_common_nodes(self, n: int) -> list[Bools]:
+        """Facets in classes of surfaces that have no node in common, on any rank ``(m,)`` each (collective)."""
+        rows = np.unique(np.column_stack([self.nodes.ravel(), np.repeat(self.surface, self.nodes.shape[1])]), axis=0)
+        node, surface = Exchange.to(self.config.comm, self.config.owner_of(rows[:, 0])).send(*rows.T)
+        meet = np.zeros((n, n), dtype=bool)
+        order = np.lexsort((surface, node))
+        node, surface = node[order], surface[order]
+        for step in range(1, n):
+            # nodes of few surfaces have few rows
+            same = node[step:] == node[:-step]
+            if not same.any():
+                break
+            meet[surface[step:][same], surface[:-step][same]] = True
+        self.config.comm.Allreduce(MPI.IN_PLACE, meet, op=MPI.LOR)
+        meet = (meet | meet.T) & ~np.eye(n, dtype=bool)
+        number = np.zeros(n, dtype=int)
+        for k in range(1, n):
+            number[k] = np.setdiff1d(np.arange(n), number[:k][meet[k, :k]])[0]
+        return [number[self.surface] == c for c in range(number.max(initial=0) + 1)]
+
+    def _summed(self, vectors: Array) -> Array:
+        """See ``TargetFacets``, over facets of one surface (collective)."""
+        field, found = self._normal_field, np.empty(vectors.shape)
+        nodal = field.x.array.reshape(-1, self.config.gdim)
+        for own in self._apart:
+            dofs = self.dofs[own, : vectors.shape[1]]
+            nodal[:] = sums_of_rows(dofs.ravel().astype(np.int64), vectors[own].reshape(-1, self.config.gdim), len(nodal))
+            forms.sum_ghosts(field)
+            found[own] = nodal[dofs]
+        return found
+
+    def spread(self) -> Array:
+        """See ``TargetFacets``, of facets of one surface (collective)."""
+        parts, found = self._areas_beside(), np.empty(self.dofs.shape)
+        for own in self._apart:
+            rows, dofs = parts[own].reshape(-1, self.config.gdim + 1), self.dofs[own]
+            found[own] = spread_of(np.column_stack([self.config.to_owners(dofs.ravel(), part) for part in rows.T])[dofs])
+        return found
+
+    def alone(self, facet: Ints, surface: int) -> Ints:
+        """Numbers among the facets of one surface alone of its facets numbered here ``facet (...)``, -1 for -1."""
+        return _renumbered(facet, self.first, self._begin[:, surface], self._alone[:, surface], 0 * self._begin[:, surface])
+
+    def here(self, facet: Ints, surface: int) -> Ints:
+        """The other way round."""
+        return _renumbered(facet, self._alone[:, surface], 0 * self._begin[:, surface], self.first, self._begin[:, surface])
+
+
+def _renumbered(facet: Ints, first: Ints, begin: Ints, other_first: Ints, other_begin: Ints) -> Ints:
+    """Numbers that begin on each rank at ``first + begin`` as they are if they begin at ``other_first + other_begin``."""
+    rank = np.searchsorted(first, facet, side="right") - 1
+    there = np.maximum(rank, 0)
+    return np.asarray(np.where(facet < 0, -1, facet - first[there] - begin[there] + other_first[there] + other_begin[there]))
+
+
+class JoinedTarget(MeshTarget):
+    """Targets of many contacts: each contactor is projected onto its own (collective).
+
+    Args:
+        facets: of all of them.
+        averaged: as of ``MeshTarget``.
+        surface: number of the surface that each contactor may touch ``(n,)``.
+
+    Attributes:
+        asked: contactors that are looked at ``(n,)``; the others have nothing near.
+    """
+
+    facets: JoinedFacets
+
+    def __init__(self, facets: JoinedFacets, averaged: bool, surface: Ints):
+        super().__init__(facets, averaged)
+        self._surface, self.asked = surface, np.ones(len(surface), dtype=bool)
+
+    def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
+        """Closest points of contactors on their own targets; far away where they are not looked at (collective)."""
+        asked = self.asked if which is None else self.asked[which]
+        surface = (self._surface if which is None else self._surface[which])[asked]
+        nearest = self.project_onto(points[asked], surface)
+        if asked.all():
+            return nearest
+        return self.nowhere(points).with_those(np.flatnonzero(asked), nearest)
+
+    def project_onto(self, points: Array, surface: Ints) -> FacetProjection:
+        """Closest points of ``points (k, gdim)`` each on the surface numbered ``surface (k,)`` (collective)."""
+        data, size = self.facets.current(corners=True), self.comm.size
+        if size == 1:
+            return self._evaluate(points, self._nearest_here(points, surface, data))
+        near, far = self._bounds(points, surface, data.x)
+        first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
+        exchange = Exchange.to(self.comm, first)
+        found = self._answers(exchange, points, surface, data)
+        nearest, feet = self._nearest_foot(points, exchange.rows, found)
+        bound = np.linalg.norm(points - nearest.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
+        others = (near <= bound) & (first != np.arange(size)[:, None])
+        exchange = Exchange(self.comm, [np.flatnonzero(o) for o in others])
+        more = self._answers(exchange, points, surface, data)
+        rows = np.append(exchange.rows, np.arange(len(points)))
+        return self._nearest_foot(points, rows, Feet._make(map(np.concatenate, zip(more, feet))))[0]
+
+    def _answers(self, exchange: Exchange, points: Array, surface: Ints, data: FacetData) -> Feet:
+        """Feet that the ranks of an exchange find on their facets, in the order of its rows (collective)."""
+        p, asked = exchange.send(points, surface)
+        return Feet._make(exchange.back(*self._nearest_here(p, asked, data)))
+
+    def _nearest_here(self, points: Array, surface: Ints, data: FacetData) -> Feet:
+        """Feet on this rank's facets of each point's surface."""
+        return self._on_nearest(points, data, *candidate_pairs(self.shape, data.x, points, surface, self.facets.surface))
+
+    def _bounds(self, points: Array, surface: Ints, x: Array) -> tuple[Array, Array]:
+        """Bounds on the distance of each point from each rank's facets of its surface ``(size, n)``, as ``box_distances`` (collective)."""
+        g, n = points.shape[1], self.facets._begin.shape[1]
+        box = np.full((n, 2, g), -np.inf)
+        np.maximum.at(box[:, 0], self.facets.surface, -x.min(axis=1))
+        np.maximum.at(box[:, 1], self.facets.surface, x.max(axis=1))
+        boxes = np.empty((self.comm.size, *box.shape))
+        self.comm.Allgather(box, boxes)
+        low, high = -boxes[:, :, 0], boxes[:, :, 1]
+        out = 0.5 * (self.shape.lebesgue - 1) * np.where(low <= high, high - low, 0.0)
+        low, high, some = (low - out)[:, surface], (high + out)[:, surface], (low[:, :, 0] <= high[:, :, 0])[:, surface]
+        near = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=2)
+        far = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=2)
+        return np.where(some, near, np.inf), np.where(some, far, np.inf)
