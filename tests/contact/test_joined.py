@@ -5,7 +5,9 @@ Two tests to read first: ``test_blocks_in_a_grid`` and ``test_exchanges_of_many_
 
 from __future__ import annotations
 
+import gc
 import sys
+import weakref
 from collections import Counter
 
 import numpy as np
@@ -264,3 +266,18 @@ def test_facets_keep_their_numbers():
         pair.project()
         again = pair.to_checkpoint()
         assert all(np.array_equal(kept[name], again[name]) for name in kept)
+
+
+def test_no_references_in_circles():
+    """Contacts that are treated as one, and their problem, are gone at once when they are let go of."""
+    contacts, problem = stacks(3)
+    problem.solve()
+    of = problem.system, problem.bodies, problem.config, contacts[0].pair, contacts[0].pair.whole
+    known = [weakref.ref(one) for one in of]
+    gc.disable()
+    try:
+        problem.__dict__.clear()
+        del problem, contacts, of
+        assert [one() for one in known] == [None] * len(known)
+    finally:
+        gc.enable()

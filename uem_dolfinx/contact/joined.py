@@ -5,6 +5,7 @@ What users see of one of the contacts is its ``Member``.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -50,7 +51,7 @@ class JoinedInterface(Interface):
         self.mutual_of = np.zeros(len(own), dtype=bool)
         ends = np.cumsum([0, *(len(pair.nodes) for pair in own)])
         self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
-        self._members = [Member(self, k, pair) for k, pair in enumerate(own)]
+        self._members: list[weakref.ref[Member]] = []
         facets, surface = nodal.target.facets, nodal.surface_of
         parts = [renumbered(p.committed, lambda f, s=s: facets.here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
         self.trial = self.committed = joined(parts)
@@ -61,7 +62,13 @@ class JoinedInterface(Interface):
     @property
     def members(self) -> Sequence[Interface]:
         """Its contacts."""
-        return self._members
+        return [one for member in self._members if (one := member()) is not None]
+
+    def make_members(self) -> list[Member]:
+        """What the contacts are seen as; who asks keeps them, and they keep this."""
+        members = [Member(self, k, pair) for k, pair in enumerate(self.own)]
+        self._members = list(map(weakref.ref, members))
+        return members
 
     @property
     def label(self) -> Ints:
@@ -112,7 +119,7 @@ class JoinedInterface(Interface):
 
     def part(self) -> list[Interface]:
         """The contacts with interfaces of their own again, in their committed states; to be followed by ``project`` (collective)."""
-        for k, (pair, member) in enumerate(zip(self.own, self._members)):
+        for k, (pair, member) in enumerate(zip(self.own, self.members)):
             if pair.friction is not None:
                 pair.friction.free = self.discretisation.free[self.rows_of[k]]
             pair.initial_overlap, pair.mutual = member.initial_overlap, member.mutual

@@ -29,7 +29,7 @@ def join_alike(contacts: Sequence[Contact]) -> None:
             from uem_dolfinx.contact.joined import JoinedInterface
 
             whole = JoinedInterface([contact.pair for contact in alike])
-            for contact, member in zip(alike, whole.members):
+            for contact, member in zip(alike, whole.make_members()):
                 contact.take_pair(member)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
+from weakref import WeakValueDictionary
 
 from mpi4py import MPI
 
@@ -58,8 +59,8 @@ class Configuration(Nodes):
         if degree > 2:
             raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
         super().__init__(V)
-        #: Facets of surfaces that several share, by ``id`` of their tags; see ``facets.facets_of``.
-        self.surfaces: dict[int, tuple[Any, Any]] = {}
+        #: Facets of surfaces that several share while they have them, by ``id`` of their tags; see ``facets.facets_of``.
+        self.surfaces: WeakValueDictionary[int, Any] = WeakValueDictionary()
         #: Whether the coordinates are radius and height, and nodes stand for circles.
         self.axisymmetric: bool = is_axisymmetric(V.mesh)
 

@@ -230,11 +230,11 @@ def _shape_of(config: Configuration) -> FacetShape:
 
 def facets_of(config: Configuration, tag: Tag, role: str = "target") -> TargetFacets:
     """Facets of a surface, which all that name it share; arguments as of ``TargetFacets`` (collective)."""
-    known = config.surfaces
-    if id(tag) not in known:
-        # the tag is kept, so that no other gets its number
-        known[id(tag)] = tag, TargetFacets(config, tag, role)
-    return known[id(tag)][1]
+    # facets keep their tag, so that no other gets its number meanwhile
+    found: TargetFacets | None = config.surfaces.get(id(tag))
+    if found is None:
+        config.surfaces[id(tag)] = found = TargetFacets(config, tag, role)
+    return found
 
 
 def heights(points: Array, facet: Ints, planes: tuple[Array, Array]) -> Array:
