@@ -22,6 +22,7 @@ from uem_dolfinx.contact.sliding import Sliding
 from uem_dolfinx.contact.slip_front import Front
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
+from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.parallel import reduced
 
 
@@ -73,6 +74,11 @@ class JoinedNodes(NodeToSurface):
         self.far_of, self._projected = far, None
         if hasattr(self, "target"):
             self.target.asked = ~far[self.label]
+
+    def across(self, found: FacetProjection, points: Array) -> FacetProjection:
+        """See ``OnTarget``, of contacts that have offsets alone."""
+        i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
+        return found.with_those(i, found.take(i).across_edges(points[i]))
 
     def look_farther(self) -> bool:
         """Look at contacts that are far apart, from the next placement on: whether any were."""

@@ -81,10 +81,14 @@ class OnTarget:
         if last is None or not reduced(self.config.comm, same, op=MPI.LAND):
             found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
             if anchor is None and self.offset is not None and isinstance(found, FacetProjection):
-                found = found.across_edges(points)
+                found = self.across(found, points)
             raised = self.raised(found)
             self._projected = last = points, x, anchor, raised
         return last[3]
+
+    def across(self, found: FacetProjection, points: Array) -> FacetProjection:
+        """The projection of contactors that stay at a height, with normals along the way from convex edges."""
+        return found.across_edges(points)
 
     def take_feet(self, points: Array) -> Projection:
         """The contactors on the nearest places of the target, whose feet are kept from now on (collective)."""
