@@ -128,7 +128,8 @@ class ContactResults:
     def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
         """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over what faces the target (collective).
 
-        ``normal (n, gdim)`` are normals of the target. They are those over the whole surface with mortar, whose segments tell what faces the target, and before any placement.
+        ``normal (n, gdim)`` are normals of the target. They are those over the whole surface with mortar, whose segments tell what faces
+        the target, and before any placement.
         """
         if self.coupling == "mortar" or normal is None:
             return (self.surface.current if current else self.surface.reference)[nodes]

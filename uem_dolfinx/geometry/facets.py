@@ -59,6 +59,9 @@ class TargetFacets:
         OrientationError: if a facet lies between two cells, so that outward has no meaning.
     """
 
+    #: The facets where they were when they were asked for last; None before.
+    _placed: FacetData | None = None
+
     def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
         self.config, self.tag, self.role = config, tag, role
         cell_dofs, of = compat.cell_dofs(config.V), nodes_of_facets(config, tag)
@@ -71,8 +74,6 @@ class TargetFacets:
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
         self.open_nodes = self._open_nodes()
-        #: The facets where they were when they were asked for last; None before.
-        self._placed: FacetData | None = None
 
     @cached_property
     def keys(self) -> Ints:
