@@ -9,6 +9,7 @@ import gc
 import sys
 import weakref
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from dolfinx import fem
 from helpers import box, clamp, highest, linear, modulus
 
 import uem_dolfinx as uem
+from uem_dolfinx.contact import joining
+from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.member import Member
 from uem_dolfinx.solve import problem as problems
 
@@ -283,3 +286,13 @@ def test_no_references_in_circles():
         assert [one() for one in known] == [None] * len(known)
     finally:
         gc.enable()
+
+
+def test_friction_that_follows_a_temperature_is_not_joined():
+    """Its values are asked for at each placement, by each contact; Coulomb's that only differ in values are joined."""
+
+    def joins(friction):
+        return joining._joins(SimpleNamespace(limits=SimpleNamespace(law=as_law(friction)), wear=None))
+
+    assert joins(0.3) and joins(lambda x, t: t * x[0]) and joins(uem.Coulomb(0.2, limit=3.0))
+    assert not joins(uem.OfTemperature(lambda x, t, T: 0.1 * T, field=1)) and not joins(uem.Tresca(1.0))
