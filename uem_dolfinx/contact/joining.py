@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import TYPE_CHECKING
 
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.thermal import OfTemperature
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
-from uem_dolfinx.contact.sliding import Sliding
-from uem_dolfinx.geometry.search import MeshTarget
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.sliding import Sliding
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:
@@ -53,6 +54,9 @@ def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]
 
 def _kind(contact: Contact) -> Hashable:
     """What contacts that are treated together have in common; None for those that are not."""
+    from uem_dolfinx.contact.node_to_surface import NodeToSurface
+    from uem_dolfinx.geometry.search import MeshTarget
+
     pair = contact.pair
     nodal = type(contact) is Contact and type(pair.discretisation) is NodeToSurface and type(pair.target) is MeshTarget
     if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heat is not None:

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.active_set import TIED
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.errors import OrientationError
@@ -127,7 +127,7 @@ class TargetCorners:
         if not asked.any():
             return {}
         near, label = self._near(asked)
-        pressing = np.bincount(whole.label, weights=whole.trial.lam, minlength=n)
+        pressing = sums_of_rows(whole.label, whole.trial.lam[:, None], n)[:, 0]
         some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
         # bodies that part press hardly any more
         self.largest[asked] = np.maximum(force, self.largest)[asked]
@@ -160,7 +160,7 @@ class TargetCorners:
             np.einsum("ng,ng->n", stiffness[near], p.normal**2),
         )
         both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
-        lacking = reduced(comm, np.bincount(label, weights=both * depth, minlength=n))
+        lacking = reduced(comm, sums_of_rows(label, (both * depth)[:, None], n)[:, 0])
         told = {}
         for k in np.flatnonzero(lacking > LACKING * self.largest):
             which = np.flatnonzero(inside & (label == k))

@@ -204,7 +204,8 @@ class Unknowns(Nodes):
 
     def norms_of(self, values: Array) -> Array:
         """Likewise of the owned components ``(n_owned * block,)`` (collective)."""
-        squares = np.bincount(self.field + 1, values**2, self.n_fields + 1)[1:]
+        # of no components they would be integers
+        squares = np.bincount(self.field + 1, values**2, self.n_fields + 1)[1:].astype(float)
         return np.sqrt(np.asarray(reduced(self.comm, squares)))
 
     def work(self, q: PETSc.Vec, F: PETSc.Vec) -> float:
