@@ -15,6 +15,7 @@ first that with C at rest, others under the same are dense problems alone, as lo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix
 from uem_dolfinx.algebra.entries import SYMMETRIC, stiffen
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
@@ -257,9 +258,11 @@ class Condensed:
         self._known = (du.copy(), forces.copy()) if exact else None
         return forces
 
-    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
-        """Unknowns dq of the last solve, those of I as well (collective)."""
+    def complete(self, dq: PETSc.Vec, asked: Sequence[Indices] | None = None) -> PETSc.Vec:
+        """Unknowns dq of the last solve, those of I as well; if owned nodes are ``asked`` for, only where one is not in C (collective)."""
         if self.whole:
+            return dq
+        if asked is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in asked))):
             return dq
         assert self._known is not None
         (P, _, K, _), at = self.made_of, self._at

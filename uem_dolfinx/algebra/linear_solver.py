@@ -433,9 +433,9 @@ class UnitedSolver:
         """Take what the increment is without the unknowns that are solved for next, to be completed, and what norm of forces is none."""
         self._condensed.begin_at(c, rounding)
 
-    def complete(self, dq: PETSc.Vec) -> PETSc.Vec:
-        """The unknowns of the last solve, all of them (collective)."""
-        return self._condensed.complete(dq) if self._on_condensed else dq
+    def complete(self, dq: PETSc.Vec, asked: Any = None) -> PETSc.Vec:
+        """The unknowns of the last solve, all of them, or only where it lacks one of the nodes ``asked`` for (collective)."""
+        return self._condensed.complete(dq, asked) if self._on_condensed else dq
 
     def _keep_pace(self, iterations: int) -> None:
         """Note how many iterations a digit has taken."""

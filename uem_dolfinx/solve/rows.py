@@ -341,6 +341,14 @@ def unbalanced(
     return left, every
 
 
+def not_held() -> FrictionError:
+    """For bodies that friction does not hold."""
+    return FrictionError(
+        "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
+        "Dirichlet condition, give it inertia, or take less load"
+    )
+
+
 def several_answers() -> FrictionError:
     """The refusal of an equilibrium between which and that without friction the united matrix was singular."""
     return FrictionError(

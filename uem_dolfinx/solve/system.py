@@ -22,7 +22,6 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.checks import check_initial, check_prescribed
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Traction
-from uem_dolfinx.errors import FrictionError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
@@ -31,7 +30,7 @@ from uem_dolfinx.solve.first_touch import touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
-from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, read_forces, several_answers, unbalanced
+from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, not_held, read_forces, several_answers, unbalanced
 from uem_dolfinx.solve.tangent import added_mass, curvature_of, known_forces, slip_terms, together
 
 if TYPE_CHECKING:
@@ -296,10 +295,7 @@ class BodySystem:
             else:
                 chosen = self.exchanges.choose(violated, predicted, self.curvature is not None, way)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
-                raise FrictionError(
-                    "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
-                    "Dirichlet condition, give it inertia, or take less load"
-                )
+                raise not_held()
             if chosen is None or self._adrift:
                 negative, either = self.solver.negative, self.unknowns.mixed and self.solver.tells_sign
                 self._not_unique = (state, negative) if negative or either else None
@@ -419,13 +415,14 @@ class BodySystem:
         )
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Unknowns dq, and ``du = P dq + c``, first of all nodes where neutral motions or far contacts ask for them (collective)."""
+        """Unknowns dq, and ``du = P dq + c``, first of all nodes where motions or contactors untouched so far ask (collective)."""
         # held limits follow what a solve predicts: it is as good as a direct one
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
-        if near is None and (self.floating.neutral or any(pair.far for pair in self.pairs)):
-            dq = self.solver.complete(dq)
+        if near is None:
+            some = None if self.floating.neutral or any(pair.far for pair in self.pairs) else [pair.nodes for pair in self.pairs]
+            dq = self.solver.complete(dq, some)
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
