@@ -107,8 +107,6 @@ from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlan
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
-from uem_dolfinx.materials.von_mises import VonMises
-from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
@@ -129,10 +127,12 @@ if _TYPE_CHECKING:
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
+    from uem_dolfinx.materials.von_mises import VonMises
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene, plot_setup
+    from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
     from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
     from uem_dolfinx.solve.history import History, recording
@@ -147,7 +147,8 @@ _LATER = {
     "Equation": "conditions.equation", "periodic": "conditions.equation",
     "RigidCoupling": "conditions.rigid_coupling",
     "Preload": "contact.preload",
-    "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening",
+    "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening", "VonMises": "materials.von_mises",
+    "HistoryWriter": "output.results", "ResultsWriter": "output.results",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",
