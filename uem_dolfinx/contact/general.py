@@ -170,7 +170,7 @@ class GeneralContact:
                 tied = [False] * (len(pairs) - len(others)) + [c.tied is True for c in others]
                 apart = [_with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
             among = self._mortar if self.coupling == "mortar" else self._nodes
-            heat = {} if self.heat is None else {"heat": self.heat.beside(None)}
+            heat = {} if self.heat is None else {"heat": self.heat.without_temperature()}
             parts += among(nodes, place, itself, apart, bound, options | heat)
         if self.heat is not None and self.heat.temperature is not None:
             options["heat"] = self.heat

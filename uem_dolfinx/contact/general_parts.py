@@ -95,6 +95,8 @@ class AmongContact(BodiesContact):
     def pressing(self) -> tuple[Array, Array]:
         """With forces by which nodes at sharp edges are followed by what they follow: these press on the same areas (collective)."""
         (across, along), pair = super().pressing(), self.pair
+        if pair.kinematics.idle:
+            return across, along
         received, normal, spread = self._received(), pair.projection.normal, pair.discretisation.spread
         pressing = np.einsum("ng,ng->n", received, normal)
         sliding = received - pressing[:, None] * normal
@@ -113,8 +115,7 @@ class AmongContact(BodiesContact):
             ``(n, gdim)`` (collective).
         """
         skin, config, told = self._skin, self.config, []
-        for one in self._together:
-            pair = one.pair
+        for pair in (one.pair for one in self._together if not one.pair.kinematics.idle):
             row, node, weight = pair.kinematics.means()[1]
             own = np.flatnonzero(pair.trial.active[row])
             row, i = row[own], pair.nodes[row[own]]

@@ -172,7 +172,7 @@ class Heat:
     def equations(self) -> HeatEquations:
         """Of the temperatures of contactors that touch, and of those that may, which only keep their place (collective)."""
         pair, at, g = self._pair, self.passage, self._pair.config.gdim
-        which = np.flatnonzero((pair.united | pair.reserved) & self.passage.leads)
+        which = np.flatnonzero((pair.united | pair.reserved) & at.leads)
         place = np.full(len(pair.nodes), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         known: Any = at.halo.take(self.field.terms)
@@ -205,7 +205,8 @@ class Heat:
         """Largest jump of temperatures that are united, over the largest temperature there (collective)."""
         if not self.law.perfect:
             return 0.0
-        at, united = self.passage, self._pair.united & self.passage.leads & ~self._held
+        at = self.passage
+        united = self._pair.united & at.leads & ~self._held
         hot = at.means(at.own, np.abs(self.field.values)) + at.means(at.theirs, np.abs(self.field.values))
         both = np.array([np.abs(self.jump()[united]).max(initial=0.0), hot[united].max(initial=0.0)])
         jump, size = reduced(self._pair.config.comm, both, op=MPI.MAX)

@@ -18,6 +18,18 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.projection import FacetProjection
 
 
+def _rows_of(name: str) -> Any:
+    """A member's rows of an array of the whole, to be asked for and to be set."""
+
+    def get(member: Member) -> Any:
+        return getattr(member.joined, name)[member._rows]
+
+    def put(member: Member, value: Any) -> None:
+        member._set(name, value)
+
+    return property(get, put)
+
+
 class Member(Interface):
     """A part of a ``JoinedInterface`` as an interface of its own: states are the whole's rows, facets are numbered as by its target alone.
 
@@ -64,32 +76,10 @@ class Member(Interface):
         every[self._rows] = value
         setattr(self.joined, name, every)
 
-    @property
-    def reserved(self) -> Bools:  # type: ignore[override]
-        """Contactors that have rows in the sparsity of P ``(n,)``."""
-        return self.joined.reserved[self._rows]
-
-    @reserved.setter
-    def reserved(self, value: Bools) -> None:
-        self._set("reserved", value)
-
-    @property
-    def redundant(self) -> Bools:  # type: ignore[override]
-        """Active contactors whose equations depend on others and were left out ``(n,)``."""
-        return self.joined.redundant[self._rows]
-
-    @redundant.setter
-    def redundant(self, value: Bools) -> None:
-        self._set("redundant", value)
-
-    @property
-    def barred(self) -> Bools:  # type: ignore[override]
-        """Contactors that came back into the target from past its end with a blow ``(n,)``."""
-        return self.joined.barred[self._rows]
-
-    @barred.setter
-    def barred(self, value: Bools) -> None:
-        self._set("barred", value)
+    #: As of ``Interface``, each its rows of the whole's ``(n,)``.
+    reserved = _rows_of("reserved")
+    redundant = _rows_of("redundant")
+    barred = _rows_of("barred")
 
     @property
     def mutual(self) -> bool:  # type: ignore[override]

@@ -17,7 +17,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import OrientationError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, pairs_of_equals
+from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, facets_of, pairs_of_equals
 from uem_dolfinx.geometry.shapes import integrals
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, agree, reduced
@@ -90,7 +90,7 @@ class Areas:
         """
         config, comm = self._config, self._config.comm
         try:
-            facets = self._made or TargetFacets(config, self._tag, "contactor")
+            facets = self._made or facets_of(config, self._tag, "contactor")
         except OrientationError:
             # inside a body there is no outside to face
             return None

@@ -61,10 +61,10 @@ class Conductance:
         """Whether temperatures are the same where surfaces touch."""
         return self.h == np.inf
 
-    def beside(self, temperature: float | fem.Constant | None) -> Conductance:
-        """The same with another temperature of the target."""
+    def without_temperature(self) -> Conductance:
+        """The same for a target that has a temperature of its own."""
         other = copy(self)
-        other.temperature = temperature
+        other.temperature = None
         return other
 
     @property
