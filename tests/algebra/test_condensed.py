@@ -165,6 +165,20 @@ def test_one_factorisation_of_linear_bodies():
     assert len(back) > 2 and calls[FACTORISATION] <= 1
 
 
+@pytest.mark.parametrize("wide, factorisations", [(True, 1), (False, 2)])
+def test_feet_that_move_to_the_next_facets(wide, factorisations):
+    """They find its nodes among those that are left out of the factorisation from the start."""
+    _, contact, problem = pressed(way=0.04)
+    assert problem.system.solver.condensed.beside is not None
+    if not wide:
+        problem.system.solver.condensed.beside = None
+    before = contact.pair.projection.facet
+    with counted() as calls:
+        problem.solve()
+    moved = (contact.pair.projection.facet != before)[contact.pair.trial.active].any()
+    assert any(problem.comm.allgather(bool(moved))) and calls[FACTORISATION] == factorisations
+
+
 def test_one_factorisation_of_every_tangent():
     """Where bodies are strained, exchanges and contactors that begin to slip have none of their own."""
     _, _, problem = pressed(st_venant, friction=0.1)

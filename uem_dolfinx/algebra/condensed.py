@@ -15,7 +15,7 @@ first that with C at rest, others under the same are dense problems alone, as lo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,8 @@ class Condensed:
 
     #: What solves with K_II.
     _pc: Any = None
+    #: Owned nodes ``(n_owned,)`` that may be followed next to those that are, by ``(n_owned,)`` of them (collective); None for none.
+    beside: Callable[[Bools], Bools] | None = None
 
     def drop(self) -> None:
         """Forget K (collective)."""
@@ -66,6 +68,8 @@ class Condensed:
         #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S' there, and whether K_II has a
         #: negative determinant, and negative eigenvalues.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
+        #: Whether C had those beside the followed nodes when it was made.
+        self._wide = False
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._pc = None
@@ -89,23 +93,34 @@ class Condensed:
         """Whether this K is factorised, and C has all that P, Q and G touch (collective)."""
         lacks = True
         if self._is_of(K):
-            touched = self._touched(P, Q, G, holding=not self._begins)
+            touched = self._touched(P, Q, G, holding=not self._begins, wide=self._begins and self._wide)
             lacks = bool((touched & ~self._nodes).any() or (self._begins and (self._nodes & ~touched).any()))
         return not reduced(self.space.comm, int(lacks))
 
     def _is_of(self, K: PETSc.Mat) -> bool:
         return self._made_for is not None and self._made_for[0] == K and self._made_for[1] == K.stateGet()
 
-    def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, holding: bool) -> Bools:
-        """Nodes that C needs: those of equations, only of ``holding`` ones or of all, those in G, and those held otherwise than before."""
+    def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, holding: bool, wide: bool) -> Bools:
+        """Nodes that C needs: those of equations, those in G, and those held otherwise than before ``(n_owned,)`` (collective).
+
+        Args:
+            P: of a united matrix.
+            Q: of the same.
+            G: the curvature.
+            holding: whether only equations count that hold.
+            wide: whether nodes beside the followed ones are added.
+        """
         g, n, first = self.space.block, self.space.n_owned, self.space.first
         touched = np.zeros(n, dtype=bool)
         for R in (P,) if P is Q else (P, Q):
-            touched[R.united if holding else R.nodes] = True
             followed = R.followed(R.equations.active if holding else np.ones_like(R.equations.active))
             own = (followed >= first) & (followed < first + n)
             touched[followed[own] - first] = True
             touched[self.space.gather_owned(followed[~own])] = True
+        if wide and self.beside is not None:
+            touched |= self.beside(touched)
+        for R in (P,) if P is Q else (P, Q):
+            touched[R.united if holding else R.nodes] = True
         if G is not None:
             # a node with a row of it is coupled with itself
             touched |= np.diff(G.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
@@ -124,13 +139,16 @@ class Condensed:
             pc: for MUMPS, without a matrix.
             symmetric: whether K is.
         """
-        space, nodes = self.space, self._touched(P, Q, G, holding=False)
-        if self._is_of(K) and not self._begins:
-            nodes |= self._nodes
+        space, known = self.space, self._nodes if self._is_of(K) and not self._begins else False
+        # feet that move to facets beside theirs find them there
+        for wide in (True, False) if self.beside is not None else (False,):
+            nodes = known | self._touched(P, Q, G, holding=False, wide=wide)
+            if cheaper := self._is_cheaper(reduced(space.comm, space.block * int(nodes.sum())), K, pc):
+                break
         self.drop()
-        if not self._is_cheaper(reduced(space.comm, space.block * int(nodes.sum())), K, pc):
+        if not cheaper:
             return False
-        self._nodes = nodes
+        self._nodes, self._wide = nodes, wide
         self._at = (space.block * np.flatnonzero(nodes)[:, None] + np.arange(space.block)).ravel()
         counts = space.comm.gather(len(self._at))
         self._counts = None if counts is None else np.array(counts)

@@ -65,7 +65,7 @@ class UnitedSolver:
         self._kept = KeptFactor(space)
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
         #: K without the contact, and whether the present united matrix is made of it.
-        self._condensed, self._on_condensed = Condensed(space), False
+        self.condensed, self._on_condensed = Condensed(space), False
         #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
@@ -111,7 +111,7 @@ class UnitedSolver:
         """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
         self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = None
         self._kept.drop()
-        self._condensed.drop()
+        self.condensed.drop()
         self._use(self._first)
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
@@ -119,7 +119,7 @@ class UnitedSolver:
         """Let what the united matrix has places for, and how it is solved, depend on this step alone."""
         self._begins, self._of = True, None
         self._kept.drop()
-        for part in (self._condensed, self._united, self._unsymmetric):
+        for part in (self.condensed, self._united, self._unsymmetric):
             part.begin_step()
 
     @contextmanager
@@ -156,7 +156,7 @@ class UnitedSolver:
         The matrix is the same, ``roughly``, where all but coefficients in P, Q and G is.
         """
         test = test or restriction
-        self._condensed.begin_at(None)
+        self.condensed.begin_at(None)
         before, self._made_of = self._made_of, made_of(restriction, test, K, G, roughly)
         same = before is not None and before == self._made_of
         # a step that begins is solved as if it were the first
@@ -219,7 +219,7 @@ class UnitedSolver:
         """The united matrix, of the whole (collective)."""
         if not self._on_condensed:
             return self._A
-        P, Q, K, G = self._condensed.made_of
+        P, Q, K, G = self.condensed.made_of
         return (self._united if P is Q else self._unsymmetric).update(P, Q, K, G)
 
     def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
@@ -231,14 +231,14 @@ class UnitedSolver:
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
         pays = not (self.iterative or self.space.mixed) and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
         pays = pays and (self.lasting or self._petrov_galerkin or again)
-        serves = pays and self._condensed.serves(P, Q, K, G)
+        serves = pays and self.condensed.serves(P, Q, K, G)
         if not (serves or self.lasting or self._petrov_galerkin) and self._kept.serves(P, K):
             self._served = P, K, G
             return False
         if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
             return False
         if not (serves and same):
-            self._condensed.unite(P, Q, G)
+            self.condensed.unite(P, Q, G)
         return True
 
     def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
@@ -247,7 +247,7 @@ class UnitedSolver:
         pc.setOptionsPrefix(self._prefix)
         pc.setType((self.pc.getType() if self._symmetric else self._types[1]) if symmetric else "lu")
         with timed("factorisation or preconditioner set-up"), self._in_database(**options):
-            if self._condensed.factorise(P, Q, K, G, pc, symmetric):
+            if self.condensed.factorise(P, Q, K, G, pc, symmetric):
                 return True
         if more := mumps.more_workspace(pc):
             logger.debug("MUMPS lacked workspace, and gets more: %s", more)
@@ -321,20 +321,20 @@ class UnitedSolver:
     def negative(self) -> bool:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
         if self._on_condensed:
-            return self._petrov_galerkin and self._condensed.negative
+            return self._petrov_galerkin and self.condensed.negative
         return self.tells_sign and mumps.is_negative(self.pc)
 
     @property
     def indefinite(self) -> bool:
         """Whether the symmetric matrix factorised last has negative eigenvalues, beside multipliers', if MUMPS tells (collective)."""
-        return self._condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc, self.space))
+        return self.condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc, self.space))
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
         """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
         self._kept.drop()
         self.set_operator(restriction, K, curvature)
         if self._on_condensed:
-            return self._condensed.negative
+            return self.condensed.negative
         self._set_up(**mumps.TELLS_SIGN)
         return mumps.is_negative(self.pc)
 
@@ -371,12 +371,12 @@ class UnitedSolver:
             LinearSolveError: with PETSc's reason.
         """
         if self._on_condensed:
-            dq = self._condensed.solve(rhs, near is not None, accuracy)
+            dq = self.condensed.solve(rhs, near is not None, accuracy)
             self._tell_unused()
             if np.isfinite(dq.norm()):
                 return dq, 1
             raise LinearSolveError("the united problem is singular: hold bodies that are free or slip by Dirichlet conditions")
-        self._condensed.whole = True
+        self.condensed.whole = True
         if self._served is not None:
             if accuracy > 0 and (found := self._kept.solve(*self._served, rhs, accuracy)) is not None:
                 return found
@@ -427,15 +427,15 @@ class UnitedSolver:
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
         """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
-        return forms.product(K, du) if self.iterative else self._condensed.forces(K, du, self.exact)
+        return forms.product(K, du) if self.iterative else self.condensed.forces(K, du, self.exact)
 
     def begin_at(self, c: PETSc.Vec, rounding: float = 0.0) -> None:
         """Take what the increment is without the unknowns that are solved for next, to be completed, and what norm of forces is none."""
-        self._condensed.begin_at(c, rounding)
+        self.condensed.begin_at(c, rounding)
 
     def complete(self, dq: PETSc.Vec, asked: Any = None) -> PETSc.Vec:
         """The unknowns of the last solve, all of them, or only where it lacks one of the nodes ``asked`` for (collective)."""
-        return self._condensed.complete(dq, asked) if self._on_condensed else dq
+        return self.condensed.complete(dq, asked) if self._on_condensed else dq
 
     def _keep_pace(self, iterations: int) -> None:
         """Note how many iterations a digit has taken."""

@@ -1,4 +1,4 @@
-"""Which contactors touch first: told by how bodies would move if they followed their Dirichlet conditions rigidly."""
+"""What is touched first, told by how bodies would move if they followed their Dirichlet conditions rigidly, and what may be next."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
@@ -73,3 +74,22 @@ def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequ
     span = float(np.linalg.norm(reach[:g] + reach[g : 2 * g])) / config.size
     depth = active_set.deep_enough(span, g) * float(reach[-1])
     return [w.on_first_touch(gap, depth) for w, gap in zip(violated, gaps)]
+
+
+def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
+    """What tells the owned nodes of all target facets that have one of some nodes, each ``(n_owned,)``; None where no feet move.
+
+    Args:
+        config: configuration of the displacement.
+        pairs: of all contacts.
+    """
+    moving = [pair.target for pair in pairs if pair.sliding == "finite" and pair.target.n_nodes and pair.tie is None]
+    facets = list({id(target.dofs): target.dofs for target in moving}.values())
+    every = np.arange(config.n_local)
+
+    def beside(nodes: Bools) -> Bools:
+        on = config.from_owners(every[: config.n_owned], nodes[:, None].astype(float), every)[:, 0] > 0.0
+        found = np.concatenate([dofs[on[dofs].any(axis=1)].ravel() for dofs in facets])
+        return np.asarray(config.to_owners(found, np.ones(len(found)))[: config.n_owned] > 0.0)
+
+    return beside if facets else None

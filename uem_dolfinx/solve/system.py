@@ -26,7 +26,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.exchanges import Exchanges, count
-from uem_dolfinx.solve.first_touch import touch_ahead
+from uem_dolfinx.solve.first_touch import nodes_beside, touch_ahead
 from uem_dolfinx.solve.floating import FloatingBodies
 from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.norms import first
@@ -100,6 +100,7 @@ class BodySystem:
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
         self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
+        self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
