@@ -156,5 +156,5 @@ def test_preconditioner_is_kept(changes, slower, kept):
     )
     solver = UnitedSolver(triangles(1), "thresholds_", ITERATIVE)
     solver._made_with, solver._first_pace, solver._pace = made, 1.0, slower
-    solver._keep_preconditioner(now)
+    solver._keep_preconditioner(now, *solver._changes(now))
     assert solver._new != kept

@@ -25,6 +25,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
@@ -88,6 +89,16 @@ class Deflation:
         self.W.multAdd(moved, y, y)
 
 
+def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.PC:
+    """A preconditioner of A with multigrid ``pc`` inside, which does not see nodes ``pressed (n_owned,)`` by stiff bodies (collective)."""
+    with timed("deflation"):
+        pc.setOperators(without(space, A, P, pressed))
+        deflation = Deflation(pc)
+        deflation.update(A, deflated(space, A, P, pressed))
+        return PETSc.PC().createPython(deflation, comm=space.comm)
+
+
+@timed("deflation")
 def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
     """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)``."""
     followed = np.zeros(space.n_owned, dtype=bool)

@@ -113,7 +113,12 @@ def stiffen(A: PETSc.Mat, K: PETSc.Mat, idle: Bools) -> None:
 
 
 def is_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
-    """Whether A is symmetric but for rounding: entries are compared across all at once, in a random combination (collective).
+    """Whether A, which acts on ``space``, is symmetric but for rounding (collective)."""
+    return bool(reduced(A.comm.tompi4py(), rows_are_symmetric(A, space), op=MPI.LAND))
+
+
+def rows_are_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
+    """Whether owned rows of A agree with its columns: entries are compared all at once, in a random combination (collective).
 
     ``space`` is what it acts on. Unknowns of other fields may have no diagonal: their largest entry then takes its place, over the root
     of the largest diagonal.
@@ -132,5 +137,4 @@ def is_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
         A.mult(size, one)
         A.multTranspose(size, other)
         # a diagonal that is zero leaves what is no number
-        alike = bool((np.abs(one.array_r - other.array_r) <= SYMMETRIC * root).all() and root.all())
-    return bool(reduced(A.comm.tompi4py(), alike, op=MPI.LAND))
+        return bool((np.abs(one.array_r - other.array_r) <= SYMMETRIC * root).all() and root.all())

@@ -12,8 +12,8 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.condensed import Condensed
-from uem_dolfinx.algebra.deflation import MULTIGRID, Deflation, deflated, near_null_space, pressed_hard, without
-from uem_dolfinx.algebra.entries import is_symmetric, stiffen
+from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_space, pressed_hard
+from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, default_options, last_words, tell_unused
@@ -200,16 +200,21 @@ class UnitedSolver:
                 stiffen(self._A, K, ~restriction.used.ravel())
         else:
             self._A = self._united.update(restriction, restriction, K, G)
-        if not (symmetric := is_symmetric(self._A, self.space)) and self._instead and self.iterative:
+        pressed = pressed_hard(self.space, self._A, K, restriction) if self._deflates else np.zeros(0, dtype=bool)
+        here = [not rows_are_symmetric(self._A, self.space), pressed.any(), *self._changes(restriction.equations)]
+        unsymmetric, hard, *changes = reduced(self.space.comm, np.array(here, dtype=np.int64))
+        if unsymmetric and self._instead and self.iterative:
             self._use(self._instead)
+        symmetric = not unsymmetric
         self._adapt(symmetric)
-        self._keep_preconditioner(restriction.equations)
+        self._keep_preconditioner(restriction.equations, *changes)
         self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
             self._A.setBlockSize(self.space.block)
             self._A.setNearNullSpace(near_null_space(self.space, self._A, restriction))
         self.pc.setOperators(self._A)
-        self._deflate(restriction, K)
+        if self._deflates:
+            self.ksp.setPC(in_deflation(self.pc, self.space, self._A, restriction, pressed) if hard else self.pc)
         self.ksp.setOperators(self._A)
         if symmetric and not self.iterative and self.pc.getType() in mumps.FACTORISATIONS:
             self._factor_of = restriction, K
@@ -254,19 +259,10 @@ class UnitedSolver:
             return self._factorise_inside(P, Q, K, G, **options | more)
         return False
 
-    def _deflate(self, restriction: Restriction, K: PETSc.Mat) -> None:
-        """Put multigrid into a deflation where contactors are much stiffer than what they press on (collective)."""
-        if self.pc.getType() not in MULTIGRID or self.space.mixed:
-            return
-        with timed("deflation"):
-            pressed = pressed_hard(self.space, self._A, K, restriction)
-            if not reduced(self.space.comm, int(pressed.any())):
-                self.ksp.setPC(self.pc)
-                return
-            self.pc.setOperators(without(self.space, self._A, restriction, pressed))
-            deflation = Deflation(self.pc)
-            deflation.update(self._A, deflated(self.space, self._A, restriction, pressed))
-            self.ksp.setPC(PETSc.PC().createPython(deflation, comm=self.space.comm))
+    @property
+    def _deflates(self) -> bool:
+        """Whether contactors much stiffer than what they press on are more than the preconditioner can do with."""
+        return self.pc.getType() in MULTIGRID and not self.space.mixed
 
     def _adapt(self, symmetric: bool) -> None:
         """Take the KSP and PC of the options, or ones for unsymmetric matrices in place of those for symmetric ones."""
@@ -299,14 +295,18 @@ class UnitedSolver:
             self.pc.setReusePreconditioner(False)
         self.ksp.setOperators(A, self._A)
 
-    def _keep_preconditioner(self, equations: UnitingEquations) -> None:
-        """Decide whether the preconditioner serves the present matrix as well (collective)."""
-        keep = False
-        if self.iterative and (before := self._made_with) is not None:
-            same = np.array_equal(equations.node, before.node)
-            changed = (equations.active != before.active).sum() if same else len(before) + 1
-            changed, present = reduced(self.space.comm, np.array([changed, before.active.sum()]))
-            keep = changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
+    def _changes(self, equations: UnitingEquations) -> tuple[int, int]:
+        """How many of the owned equations hold that did not, or the other way, since the preconditioner was made, and how many held."""
+        if not self.iterative or (before := self._made_with) is None:
+            return 0, 0
+        same = np.array_equal(equations.node, before.node)
+        changed = (equations.active != before.active).sum() if same else len(before) + 1
+        return int(changed), int(before.active.sum())
+
+    def _keep_preconditioner(self, equations: UnitingEquations, changed: int, present: int) -> None:
+        """Decide whether the preconditioner serves the present matrix as well, after ``_changes`` on all ranks."""
+        known = self.iterative and self._made_with is not None
+        keep = known and changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
             self._made_with, self._first_pace = equations, 0.0
         self._new = not keep

@@ -256,8 +256,8 @@ class UnitedMatrix:
             self._filled = wanted
         else:
             both = np.union1d(wanted, self._filled)
-            few = reduced(comm, len(both)) <= KEPT_PLACES * reduced(comm, len(wanted))
-            self._filled = both if few else wanted
+            every, needed = reduced(comm, np.array([len(both), len(wanted)]))
+            self._filled = both if every <= KEPT_PLACES * needed else wanted
         self._create()
 
     def _missing(self, blocks: Blocks, there: Bools | None = None) -> Ints:

@@ -144,7 +144,7 @@ class TargetCorners:
         surface, of_contact = self.surface
         outside = of_contact[label] >= 0
         near, label = near[outside], label[outside]
-        if surface is None or not reduced(comm, len(near)):
+        if surface is None:
             return {}
         p = surface.project_onto(config.x[near], of_contact[label])
         depth, part = -p.gap, -p.gap / p.facet_size

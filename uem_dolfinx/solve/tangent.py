@@ -158,7 +158,10 @@ def curvature_of(
         convex: whether what could make the tangent indefinite is left out.
         linear: equations of users; None for none.
     """
-    parts = [part for pair in pairs if pair.sliding == "finite" for part in pair.curvature()]
+    moving = [pair for pair in pairs if pair.sliding == "finite"]
+    if not moving and linear is None:
+        return None
+    parts = [part for pair in moving for part in pair.curvature()]
     parts += [] if linear is None else linear.curvature()
     for i, (nodes, blocks) in enumerate(parts):
         # one after the other takes the place of what it was made of
