@@ -19,7 +19,7 @@ Options:
 # Four measurements, of which no time hangs on another run:
 #
 # 1. A half sphere on a block, linear elastic, small sliding, one load step, CG with multigrid: seconds from the making of the problem to
-#    its solution, without reading the mesh and compiling forms.
+#    its solution, without reading the mesh and compiling forms, in the quickest run, since the first one imports parts of SciPy.
 # 2. Two plates, one cell thick, that touch all over: bytes that a rank receives from others while all contactors are projected,
 #    against its share of the surfaces, its own contactors and facets. Nothing is timed: there may be more ranks than cores.
 # 3. The time of that search on one rank against the number of contactors.
@@ -53,7 +53,7 @@ args = common.arguments(
     where=("apart", "here"),
     dofs=500_000,
     ranks="1,2",
-    runs=1,
+    runs=3,
     plates="60,120",
     plate_ranks="1,2,4,8",
     searches="40,80,160,320",

@@ -59,3 +59,12 @@ def test_workspace_has_an_end(comm, workspace, gets, monkeypatch):
     pc = problem.system.solver.pc
     pc.getFactorMatrix().setMumpsIcntl(14, workspace)
     assert mumps.more_workspace(pc) == gets
+
+
+def test_ordering_in_the_plane(comm):
+    """Unknowns are ordered by minimum fill, where MUMPS by itself would take nested dissection: so many unknowns."""
+    b = blocks(comm, "triangle", 72, 72)
+    bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -1e-3])]
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs)
+    problem.solve()
+    assert problem.config.n_global * 2 > 10_000 and problem.system.solver.pc.getFactorMatrix().getMumpsInfog(7) == 2

@@ -1,10 +1,10 @@
 """What is asked of MUMPS beside solving: whether it needs more workspace, the sign of the determinant, and what a factorisation takes.
 
 Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the workspace beyond what the analysis estimates,
-INFOG(12) the number of negative pivots of a symmetric one, ICNTL(33) whether the determinant is told, RINFOG(12) its mantissa; RINFOG(1)
-and INFOG(20) the operations and entries that the analysis expects of it, the latter in millions where it is negative. With a
-Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are solves. petsc4py has neither Schur complements
-nor analyses alone: PETSc's own library is called.
+INFOG(12) the number of negative pivots of a symmetric one, ICNTL(7) and INFOG(7) how unknowns are and were ordered, ICNTL(33) whether the
+determinant is told, RINFOG(12) its mantissa; RINFOG(1) and INFOG(20) the operations and entries that the analysis expects of it, the
+latter in millions where it is negative. With a Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are
+solves. petsc4py has neither Schur complements nor analyses alone: PETSc's own library is called.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ MOST_WORKSPACE = 2000
 SHORT_OF_WORKSPACE = (-8, -9, -17, -20)
 #: The option by which the determinant is told.
 TELLS_SIGN = {"mat_mumps_icntl_33": 1}
+#: The option by which unknowns are ordered by approximate minimum fill.
+MINIMUM_FILL = {"mat_mumps_icntl_7": 2}
 
 
 def solves(pc: PETSc.PC) -> bool:
