@@ -14,6 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.geometry.bodies import rotations
+from uem_dolfinx.geometry.candidates import balls_that_meet
 from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.parallel import Exchange
 
@@ -191,27 +192,15 @@ def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float, boxes: bool)
 
     Balls hold those as well whose ways meet as seen from a simplex that turns by a right angle or less.
     """
-    none = np.zeros(0, np.int64)
     if not len(p0) or not len(x0):
-        return none, none
-    from scipy.spatial import cKDTree
-
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     low, high = _boxes(x0, x1)
-    radius = 0.5 * np.linalg.norm(high - low, axis=1)
-    found = []
-    # a graded mesh does not pay for its largest facet everywhere
-    size_class = np.floor(np.log2(radius / radius.max()))
-    for c in np.unique(size_class):
-        members = np.flatnonzero(size_class == c)
-        arm = 0.5 * np.linalg.norm(p1 - p0, axis=1) + reach + radius[members].max()
-        hits = cKDTree(0.5 * (low + high)[members]).query_ball_point(0.5 * (p0 + p1), arm, return_sorted=False)
-        for i, hit in enumerate(hits):
-            f = members[np.asarray(hit, dtype=np.int64)]
-            if boxes:
-                meets = (np.minimum(p0[i], p1[i]) - reach <= high[f]) & (np.maximum(p0[i], p1[i]) + reach >= low[f])
-                f = f[meets.all(axis=1)]
-            found.append((np.full(len(f), i), f))
-    return np.concatenate([i for i, _ in found]), np.concatenate([f for _, f in found])
+    within, radius = 0.5 * np.linalg.norm(p1 - p0, axis=1) + reach, 0.5 * np.linalg.norm(high - low, axis=1)
+    i, f = balls_that_meet(0.5 * (p0 + p1), within, 0.5 * (low + high), radius)
+    if not boxes:
+        return i, f
+    meets = ((np.minimum(p0, p1)[i] - reach <= high[f]) & (np.maximum(p0, p1)[i] + reach >= low[f])).all(axis=1)
+    return i[meets], f[meets]
 
 
 def _normals(x: Array, as_long: bool = False) -> Array:
