@@ -93,37 +93,43 @@ class Condensed:
         """Whether this K is factorised, and C has all that P, Q and G touch (collective)."""
         lacks = True
         if self._is_of(K):
-            touched = self._touched(P, Q, G, holding=not self._begins, wide=self._begins and self._wide)
+            followed = self._followed(P, Q, holding=not self._begins)
+            touched = self._touched(P, Q, G, followed, holding=not self._begins)
+            if self._begins and self._wide and self.beside is not None:
+                touched |= self.beside(followed)
             lacks = bool((touched & ~self._nodes).any() or (self._begins and (self._nodes & ~touched).any()))
         return not reduced(self.space.comm, int(lacks))
 
     def _is_of(self, K: PETSc.Mat) -> bool:
         return self._made_for is not None and self._made_for[0] == K and self._made_for[1] == K.stateGet()
 
-    def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, holding: bool, wide: bool) -> Bools:
-        """Nodes that C needs: those of equations, those in G, and those held otherwise than before ``(n_owned,)`` (collective).
+    def _followed(self, P: Restriction, Q: Restriction, holding: bool) -> Bools:
+        """Owned nodes that equations of any rank follow, only ``holding`` ones or all ``(n_owned,)`` (collective)."""
+        n, first = self.space.n_owned, self.space.first
+        marked = np.zeros(n, dtype=bool)
+        for R in (P,) if P is Q else (P, Q):
+            followed = R.followed(R.equations.active if holding else np.ones_like(R.equations.active))
+            own = (followed >= first) & (followed < first + n)
+            marked[followed[own] - first] = True
+            marked[self.space.gather_owned(followed[~own])] = True
+        return marked
+
+    def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, followed: Bools, holding: bool) -> Bools:
+        """Nodes that C needs: those of equations, those in G, and those held otherwise than before ``(n_owned,)``.
 
         Args:
             P: of a united matrix.
             Q: of the same.
             G: the curvature.
+            followed: nodes that the equations follow ``(n_owned,)``.
             holding: whether only equations count that hold.
-            wide: whether nodes beside the followed ones are added.
         """
-        g, n, first = self.space.block, self.space.n_owned, self.space.first
-        touched = np.zeros(n, dtype=bool)
-        for R in (P,) if P is Q else (P, Q):
-            followed = R.followed(R.equations.active if holding else np.ones_like(R.equations.active))
-            own = (followed >= first) & (followed < first + n)
-            touched[followed[own] - first] = True
-            touched[self.space.gather_owned(followed[~own])] = True
-        if wide and self.beside is not None:
-            touched |= self.beside(touched)
+        touched = followed.copy()
         for R in (P,) if P is Q else (P, Q):
             touched[R.united if holding else R.nodes] = True
         if G is not None:
             # a node with a row of it is coupled with itself
-            touched |= np.diff(G.getDiagonalBlock().getRowIJ()[0]).reshape(n, g).any(axis=1)
+            touched |= np.diff(G.getDiagonalBlock().getRowIJ()[0]).reshape(-1, self.space.block).any(axis=1)
         if self._made_for is not None:
             touched |= (P.free != self._made_for[2]).any(axis=1)
         return touched
@@ -139,16 +145,19 @@ class Condensed:
             pc: for MUMPS, without a matrix.
             symmetric: whether K is.
         """
-        space, known = self.space, self._nodes if self._is_of(K) and not self._begins else False
-        # feet that move to facets beside theirs find them there
-        for wide in (True, False) if self.beside is not None else (False,):
-            nodes = known | self._touched(P, Q, G, holding=False, wide=wide)
-            if cheaper := self._is_cheaper(reduced(space.comm, space.block * int(nodes.sum())), K, pc):
-                break
+        space, followed = self.space, self._followed(P, Q, holding=False)
+        nodes = self._touched(P, Q, G, followed, holding=False)
+        if self._is_of(K) and not self._begins:
+            nodes |= self._nodes
         self.drop()
-        if not cheaper:
+        if not self._is_cheaper(nodes, K, pc):
             return False
-        self._nodes, self._wide = nodes, wide
+        if self.beside is not None:
+            # feet that move to facets beside theirs find them there
+            wide = nodes | self.beside(followed)
+            self._wide = self._is_cheaper(wide, K, pc)
+            nodes = wide if self._wide else nodes
+        self._nodes = nodes
         self._at = (space.block * np.flatnonzero(nodes)[:, None] + np.arange(space.block)).ravel()
         counts = space.comm.gather(len(self._at))
         self._counts = None if counts is None else np.array(counts)
@@ -177,12 +186,13 @@ class Condensed:
         self._St = np.ascontiguousarray(S.T)
         return True
 
-    def _is_cheaper(self, size: int, K: PETSc.Mat, pc: PETSc.PC) -> bool:
-        """Whether dense algebra of ``size`` components costs no more than factorising the whole, in counts alike on all ranks (collective).
+    def _is_cheaper(self, nodes: Bools, K: PETSc.Mat, pc: PETSc.PC) -> bool:
+        """Whether dense algebra of owned ``nodes (n_owned,)`` costs no more than factorising the whole, alike on all ranks (collective).
 
         ``size^3 / 3`` operations stand against those that MUMPS counts in its analysis of K, which is made once and where it decides.
         Then S has no more entries than these factors, either.
         """
+        size = reduced(self.space.comm, self.space.block * int(nodes.sum()))
         dense, beside = size**3 / 3 * (1 if pc.getType() == "cholesky" else 2), FOR_EACH_UNKNOWN * K.getSize()[0]
         if dense <= beside:
             return True

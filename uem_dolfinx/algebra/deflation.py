@@ -89,13 +89,13 @@ class Deflation:
         self.W.multAdd(moved, y, y)
 
 
+@timed("deflation")
 def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.PC:
     """A preconditioner of A with multigrid ``pc`` inside, which does not see nodes ``pressed (n_owned,)`` by stiff bodies (collective)."""
-    with timed("deflation"):
-        pc.setOperators(without(space, A, P, pressed))
-        deflation = Deflation(pc)
-        deflation.update(A, deflated(space, A, P, pressed))
-        return PETSc.PC().createPython(deflation, comm=space.comm)
+    pc.setOperators(without(space, A, P, pressed))
+    deflation = Deflation(pc)
+    deflation.update(A, deflated(space, A, P, pressed))
+    return PETSc.PC().createPython(deflation, comm=space.comm)
 
 
 @timed("deflation")

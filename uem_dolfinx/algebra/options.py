@@ -49,10 +49,9 @@ def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str
     approximate minimum fill: PORD and METIS take four times as long to order, which is half of a factorisation's time or more, for
     factors that take 10 to 20 % less. A ``mixed`` problem may be a saddle, which neither CG nor AMG is for: MUMPS at any size.
     """
-    direct: dict[str, Any] = {"ksp_type": "preonly"}
-    direct |= {"pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"} if has_mumps() else {"pc_type": "lu"}
-    if gdim == 2 and has_mumps():
-        direct |= MINIMUM_FILL
+    direct: dict[str, Any] = {"ksp_type": "preonly", "pc_type": "lu"}
+    if has_mumps():
+        direct |= {"pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"} | (MINIMUM_FILL if gdim == 2 else {})
     if mixed:
         return direct, {}
     if size > DIRECT_UP_TO[gdim]:

@@ -13,6 +13,7 @@ from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.active_set import Violations
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
 from uem_dolfinx.solve.rigid_motions import OPEN, RigidMotions
@@ -90,6 +91,6 @@ def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[
     def beside(nodes: Bools) -> Bools:
         on = config.from_owners(every[: config.n_owned], nodes[:, None].astype(float), every)[:, 0] > 0.0
         found = np.concatenate([dofs[on[dofs].any(axis=1)].ravel() for dofs in facets])
-        return np.asarray(config.to_owners(found, np.ones(len(found)))[: config.n_owned] > 0.0)
+        return followed_nodes(config, found)[: config.n_owned]
 
     return beside if facets else None
