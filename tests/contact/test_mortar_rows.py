@@ -75,7 +75,7 @@ def test_rows_do_not_depend_on_who_is_active(cell):
     every = np.arange(len(pair.nodes))
     first = pair.kinematics.approach(every)
     for _ in range(3):
-        pair.take(replace(pair.trial, active=rng.random(len(every)) < 0.5))
+        pair.trial = replace(pair.trial, active=rng.random(len(every)) < 0.5)
         made = pair.kinematics.equations(pair.trial, every).trial
         assert (made.active == pair.trial.active).all()
         for name in ("node", "direction", "gap", "row", "followed", "coefficients"):

@@ -171,8 +171,7 @@ def test_limits_are_held_until_they_settle():
         by = Seen(np.full(n, lam), np.zeros((n, 2)), zero, np.zeros((n, 2)), zero)
         return [FrictionViolations(none, none, zero + slide, none | slide, none, none, by)]
 
-    pair.trial, pair.taken = PairState.initial(n, 2), []
-    pair.take = pair.taken.append
+    pair.trial = PairState.initial(n, 2)
     pair.friction = SimpleNamespace(pivot="before", hold_limits=hold_limits)
     exchanges = Exchanges([pair])
     start = pair.trial
@@ -183,7 +182,7 @@ def test_limits_are_held_until_they_settle():
     # without curvature, so that the problem is convex
     assert exchanges.held and exchanges.straight and exchanges.convex
     assert exchanges.again and pair.friction.pivot == "before" and not chosen[0].which.any()
-    assert np.array_equal(pair.taken[0].changes, start.changes) and np.array_equal(held[-1], np.ones(n))
+    assert np.array_equal(pair.trial.changes, start.changes) and np.array_equal(held[-1], np.ones(n))
     for lam, last in ((2.0, False), (2.1, True)):
         exchanges.choose(seen(lam), (), False, 1.0)
         assert exchanges.again and (held[-1] is None) == last

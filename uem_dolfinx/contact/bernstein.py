@@ -27,7 +27,6 @@ from uem_dolfinx.contact.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
-from uem_dolfinx.parallel import reduced
 
 #: Nodes on the same side of a target share a quadratic gap if it rises no steeper than this from one to the other.
 #: [convention; slope; test_bernstein.py::test_pressed_on_an_arch]
@@ -57,13 +56,12 @@ class Family:
     weight: Array
     of_facet: Bools
 
-    def control_gaps(self, projection: Projection, usable: Bools, active: Bools) -> ControlGaps:
+    def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
         """Terms that count where the contactors are (collective).
 
         Args:
             projection: of the contactors.
-            usable: whose gap counts: those over the target that no corner holds ``(n,)``.
-            active: active contactors ``(n,)``.
+            usable: contactors over the target that no corner holds ``(n,)``; only their gaps count.
         """
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
         rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
@@ -76,25 +74,23 @@ class Family:
         alone = np.zeros(len(self.nodes), dtype=bool)
         alone[i[~smooth]] = True
         targets, weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
-        none = np.zeros(len(i), dtype=bool)
-        return ControlGaps(self, ~alone[i], none, gap, normal, targets, weights).with_active(active)
+        return ControlGaps(self, ~alone[i], gap, normal, targets, weights)
 
     def spread(self, values: Array) -> Array:
         """Integrals of Bernstein's basis times what ``values (n,)`` are integrals of with the shape functions (collective)."""
         k, g = len(self.child), self.config.gdim
-        none: Bools = np.zeros(k, dtype=bool)
-        all_shared = ControlGaps(self, ~none, none, np.zeros(k), np.zeros((k, g)), np.zeros((k, 0), np.int64), np.zeros((k, 0)))
+        every: Bools = np.ones(k, dtype=bool)
+        all_shared = ControlGaps(self, every, np.zeros(k), np.zeros((k, g)), np.zeros((k, 0), np.int64), np.zeros((k, 0)))
         return all_shared.areas(values)
 
 
 @dataclass(frozen=True)
 class ControlGaps:
-    """The terms of a family at one displacement and active set.
+    """The terms of a family at one displacement.
 
     Attributes:
         family: whose terms they are.
         shared: whether the gap is quadratic from the child to all its parents ``(k,)``.
-        closed: terms whose parent's own equation makes its gap vanish ``(k,)``.
         gap: of the parents ``(k,)``.
         normal: of the parents ``(k, gdim)``.
         targets: global nodes that the parents follow ``(k, nn)``.
@@ -103,40 +99,20 @@ class ControlGaps:
 
     family: Family
     shared: Bools
-    closed: Bools
     gap: Array
     normal: Array
     targets: Ints
     weights: Array
 
-    def with_active(self, active: Bools) -> ControlGaps:
-        """The same terms with another active set ``(n,)`` (collective)."""
-        f = self.family
-        at_parent = f.config.from_owners(f.nodes, active[:, None].astype(float), f.parent)[:, 0] > 0
-        open_child = np.zeros(len(f.nodes), dtype=bool)
-        open_child[f.child[self.shared & ~at_parent]] = True
-        closes = active & ~open_child
-        return replace(self, closed=f.config.from_owners(f.nodes, closes[:, None].astype(float), f.parent)[:, 0] > 0)
-
-    @property
-    def kept(self) -> Bools:
-        """Terms that matter, because the parent stays open ``(k,)``."""
-        return self.shared & ~self.closed
-
     def of(self, gap: Array) -> Array:
         """Control gaps from nodal gaps ``(n,)``."""
-        k, f = self.kept, self.family
+        k, f = self.shared, self.family
         return gap - np.bincount(f.child[k], f.weight[k] * self.gap[k], minlength=len(gap))
 
     def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
-        dropped, of_facet = self.shared & self.closed, self.family.of_facet
-        # from the middle of a facet to edges, then from both to vertices
-        control = control + active * self.handed_on(control, dropped & of_facet)
-        control = control + active * self.handed_on(control, dropped & ~of_facet)
-        nodal = control - self.handed_on(control, self.shared)
-        return self.scale * control, nodal
+        return self.scale * control, control - self.handed_on(control, self.shared)
 
     @property
     def scale(self) -> Array:
@@ -148,7 +124,7 @@ class ControlGaps:
         return scale
 
     def extend(self, equations: UnitingEquations, united: Ints, active: Bools) -> UnitingEquations:
-        """Add the terms of the parents whose gaps stay open.
+        """Add the terms of the parents.
 
         Args:
             equations: of some contactors.
@@ -158,7 +134,7 @@ class ControlGaps:
         f = self.family
         place = np.full(len(f.nodes), -1, dtype=np.int64)
         place[united] = np.arange(len(united))
-        k = np.flatnonzero(self.kept & active[f.child])
+        k = np.flatnonzero(self.shared & active[f.child])
         own = f.weight[k, None] * self.normal[k]
         a, b = np.nonzero(self.targets[k] >= 0)
         row = place[f.child[k]]
@@ -175,11 +151,8 @@ class ControlGaps:
         return self.scale * (areas + self.handed_on(areas, self.shared & ~self.family.of_facet))
 
     def forces_back(self, weights: Array, active: Bools) -> Array:
-        """The transpose of the map from multipliers to control forces, for weights of these ``(n,)`` (collective)."""
-        dropped, of_facet = self.shared & self.closed, self.family.of_facet
-        weights = self.scale * weights
-        weights = weights + self._handed_back(active * weights, dropped & ~of_facet)
-        return np.where(active, weights + self._handed_back(active * weights, dropped & of_facet), 0.0)
+        """The transpose of the map from multipliers to control forces, for weights of these ``(n,)``."""
+        return np.where(active, self.scale * weights, 0.0)
 
     def areas_back(self, weights: Array) -> Array:
         """The transpose of ``areas`` (collective)."""
@@ -203,18 +176,13 @@ class ControlGaps:
 class Bernstein(NodeToSurface):
     """Implements ``Discretisation`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
 
+    #: A contactor in the middle of an edge or a facet follows contactors around it.
+    chained = True
     pointwise = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.family = Family(config, nodes, *_family(config, nodes))
-        # one in the middle of a facet follows those in the middles of edges
-        self.chained = bool(reduced(config.comm, int(self.family.of_facet.sum())))
-
-    def with_friction(self, mu: Array) -> None:
-        """Keep all terms: with friction the gap of a parent matters whether it has closed or not."""
-        super().with_friction(mu)
-        self.chained = True
 
     def spread(self, values: Array) -> Array:
         """Integrals with Bernstein's basis (collective)."""
@@ -224,7 +192,7 @@ class Bernstein(NodeToSurface):
         """The kinematics with control gaps (collective)."""
         k, gap = kinematics, kinematics.projection.gap
         usable = ~k.off(state) & ~state.in_corner
-        control = self.family.control_gaps(k.projection, usable, state.active & (not self.frictional))
+        control = self.family.control_gaps(k.projection, usable)
         plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left)
         return ControlKinematics(*plain, control=control)
 
@@ -260,11 +228,6 @@ class ControlKinematics(NodalKinematics):
         """Control gaps after an increment (collective)."""
         gap, f = super().predicted(du), self.control.family
         return replace(self.control, gap=f.config.from_owners(f.nodes, gap[:, None], f.parent)[:, 0]).of(gap)
-
-    def with_active(self, state: PairState) -> ControlKinematics:
-        """The gap of a parent that has closed no longer counts (collective)."""
-        control = self.control.with_active(state.active & (not self.of.frictional))
-        return replace(self, control=control, gap=control.of(self.projection.gap))
 
     def _normal_rows(self, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
         return self.control.extend(super()._normal_rows(state, which, weights), which, state.active)

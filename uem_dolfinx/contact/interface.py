@@ -153,15 +153,8 @@ class Interface(Told):
         self.trial = self.committed = self.friction.other_law(self.committed, law, value)
 
     def _set_active(self, state: PairState) -> None:
-        """Take over a state of which only the active set is another (collective)."""
-        if self.friction is not None:
-            state = self.friction.come_and_go(state, self.trial.active)
-        self.take(state)
-
-    def take(self, state: PairState) -> None:
-        """Take a trial state that belongs to where the contactors are now (collective)."""
-        self.trial = state
-        self._replace(self.kinematics.with_active(state))
+        """Take over a state with another active set."""
+        self.trial = state if self.friction is None else self.friction.come_and_go(state, self.trial.active)
 
     def activate_touching(self) -> None:
         """Start with the contactors that touch without force as active, where they stick (collective)."""

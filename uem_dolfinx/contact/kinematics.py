@@ -145,9 +145,6 @@ class Kinematics(Protocol):
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def with_active(self, state: PairState) -> Kinematics:
-        """In a state of which only the active set is another (collective)."""
-
     def placed_again(self, state: PairState) -> Kinematics:
         """At the same points in another state (collective)."""
 

@@ -202,10 +202,6 @@ class NodalKinematics:
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def with_active(self, state: PairState) -> NodalKinematics:
-        """Nodal gaps do not depend on the active set."""
-        return self
-
     def placed_again(self, state: PairState) -> NodalKinematics:
         """Put contactors that have entered or left a corner where they now belong (collective)."""
         if self.of.concave_edges is None:

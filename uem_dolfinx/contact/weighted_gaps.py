@@ -159,10 +159,6 @@ class MortarKinematics:
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def with_active(self, state: PairState) -> MortarKinematics:
-        """Weighted gaps do not depend on the active set."""
-        return self
-
     def placed_again(self, state: PairState) -> MortarKinematics:
         """No equation depends on the state."""
         return self

@@ -215,7 +215,7 @@ class Exchanges:
         for pair, known in zip(self._pairs, self._known or ()):
             if pair.friction is not None and known is not None:
                 state, pair.friction.pivot = known
-                pair.take(state)
+                pair.trial = state
                 pair.friction.hold_limits(state.lam)
         self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
