@@ -123,21 +123,12 @@ class ControlGaps:
         scale[f.child[self.shared & f.of_facet]] = 0.25
         return scale
 
-    def extend(self, equations: UnitingEquations, united: Ints, active: Bools) -> UnitingEquations:
-        """Add the terms of the parents.
-
-        Args:
-            equations: of some contactors.
-            united: their places ``(m,)``.
-            active: active contactors ``(n,)``.
-        """
-        f = self.family
-        place = np.full(len(f.nodes), -1, dtype=np.int64)
-        place[united] = np.arange(len(united))
-        k = np.flatnonzero(self.shared & active[f.child])
+    def extend(self, equations: UnitingEquations) -> UnitingEquations:
+        """Add the terms of the parents to the equations of all contactors."""
+        f, k = self.family, np.flatnonzero(self.shared)
         own = f.weight[k, None] * self.normal[k]
         a, b = np.nonzero(self.targets[k] >= 0)
-        row = place[f.child[k]]
+        row = f.child[k]
         return replace(
             equations,
             row=np.concatenate([equations.row, row, row[a]]),
@@ -224,13 +215,8 @@ class ControlKinematics(NodalKinematics):
         """Bernstein's basis functions over those that belong to the scaled gaps."""
         return self.control.scale
 
-    def predicted(self, du: Array) -> Array:
-        """Control gaps after an increment (collective)."""
-        gap, f = super().predicted(du), self.control.family
-        return replace(self.control, gap=f.config.from_owners(f.nodes, gap[:, None], f.parent)[:, 0]).of(gap)
-
-    def _normal_rows(self, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
-        return self.control.extend(super()._normal_rows(state, which, weights), which, state.active)
+    def _normal_rows(self, weights: Array) -> UnitingEquations:
+        return self.control.extend(super()._normal_rows(weights))
 
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         return self.control.forces(multipliers, state.active)

@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact import active_set
 from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.on_target import near_target
 from uem_dolfinx.contact.state import FrictionState, PairState
 from uem_dolfinx.contact.told import Told
 from uem_dolfinx.errors import NotFiniteError
@@ -138,7 +139,9 @@ class Interface(Told):
 
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
-        correction = self.kinematics.return_vectors(self.trial)
+        correction = np.zeros(self.points.shape)
+        if self.discretisation.at_feet and not self.kinematics.idle:
+            correction = self.kinematics.gap_rows.normal_return(self.trial.active)
         if self.acting is not None:
             correction = correction + self.acting.return_vectors(self.trial)
         # surfaces that follow each other would both make up for the same gap
@@ -191,8 +194,8 @@ class Interface(Told):
         return gone or moved
 
     def predicted(self, du: Array) -> Array:
-        """Gaps that decide on contact, to first order in an increment; see ``Kinematics.predicted`` (collective)."""
-        return self.kinematics.predicted(du)
+        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+        return self.gap if self.kinematics.idle else self.kinematics.gap_rows.gaps(du)
 
     def violated(
         self,
@@ -280,13 +283,14 @@ class Interface(Told):
 
     @property
     def approach(self) -> UnitingEquations:
-        """The equations that all contactors in front of the target would have, of those that are not active."""
-        return self.kinematics.approach(self._ahead)
+        """The equations that inactive contactors in front of the target would have if they were active."""
+        rows = self.kinematics.gap_rows.select(self._ahead, np.ones(len(self.nodes), bool))
+        return rows.test.select(rows.kind == NORMAL)
 
     def activate_closing(self, closing: Bools) -> bool:
         """Activate the contactors among those of ``approach`` that close and touch (collective): whether there are any."""
         i = self._ahead
-        now = i[closing & (self.projection.gap[i] <= active_set.TOUCHING * self.config.size)]
+        now = i[closing & (self.gap[i] <= active_set.TOUCHING * self.config.size)]
         active = self.trial.active.copy()
         active[now] = True
         self._set_active(replace(self.trial, active=active))
@@ -308,8 +312,9 @@ class Interface(Told):
         if not self.kinematics.idle:
             lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
             if lacks:
-                self.reserved = self.kinematics.near(self.trial) & ~self.tied if known else self.trial.active.copy()
-        own = self.kinematics.equations(self.trial, np.flatnonzero(self.reserved))
+                near = near_target(self.projection, self.trial, self.kinematics.off(self.trial))
+                self.reserved = near & ~self.tied if known else self.trial.active.copy()
+        own = self.kinematics.gap_rows.select(np.flatnonzero(self.reserved), self.trial.active)
         if self.acting is not None:
             own = self.acting.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)

@@ -7,14 +7,17 @@ integrals over segments differ in nothing else. A law decides on gaps and forces
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import Projection, Target
 
 if TYPE_CHECKING:
@@ -96,6 +99,73 @@ class Constraints:
         return len(self.contactor)
 
 
+@dataclass(frozen=True)
+class GapRows:
+    """Gaps that decide on contact to first order: ``gap_i + scale_i (direction_i . du_i - sum_j C_ij . du_j)`` for every contactor.
+
+    Rows along the contact normals come first, one for each contactor in their order; those of further axes of corners follow.
+
+    Attributes:
+        config: configuration of the displacement.
+        equations: the uniting equations, ``gap / scale`` among them, with no row active ``(m,)``.
+        scale: of the deciding gaps over those of the equations ``(n,)``.
+        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+        contactor: of each row ``(m,)``.
+        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
+        moved: rows of P where their weights differ from those of the gaps; None where they are the same.
+    """
+
+    config: Configuration
+    equations: UnitingEquations
+    scale: Array
+    free: Bools
+    contactor: Ints
+    kind: Ints
+    moved: UnitingEquations | None = None
+
+    @classmethod
+    def along_normals(cls, config: Configuration, equations: UnitingEquations, scale: Array, free: Bools) -> GapRows:
+        """One row for each contactor."""
+        n = len(equations)
+        return cls(config, equations, scale, free, np.arange(n), np.full(n, NORMAL))
+
+    @cached_property
+    def _halo(self) -> Halo:
+        """The followed nodes (first time: collective)."""
+        return Halo(self.config, self.equations.followed)
+
+    def along(self, values: Array) -> Array:
+        """Left sides of the equations along the normals for ``values (n_owned, gdim)`` of the owned nodes: ``(n,)`` (collective)."""
+        eq, n = self.equations, len(self.scale)
+        theirs = np.einsum("kg,kg->k", eq.coefficients, self._halo.take(values.__getitem__))
+        own = np.einsum("ng,ng->n", eq.direction[:n], values[eq.node[:n]])
+        return np.asarray(own - np.bincount(eq.row, theirs, minlength=len(eq))[:n])
+
+    def gaps(self, du: Array) -> Array:
+        """Deciding gaps ``(n,)`` after an increment of the owned nodes ``(n_owned, gdim)``, to first order (collective)."""
+        return np.asarray(self.scale * (self.equations.gap[: len(self.scale)] + self.along(du)))
+
+    def select(self, which: Ints, active: Bools) -> Constraints:
+        """Rows of the contactors ``which (k,)``, those of ``active (n,)`` contactors active."""
+        chosen = np.zeros(len(self.scale), dtype=bool)
+        chosen[which] = True
+        rows = chosen[self.contactor]
+        contactor = self.contactor[rows]
+        test = replace(self.equations.select(rows), active=active[contactor])
+        trial = test if self.moved is None else replace(self.moved.select(rows), active=test.active)
+        return Constraints.without_friction(trial, test, contactor, self.kind[rows])
+
+    def normal_return(self, active: Bools) -> Array:
+        """Displacements of free components ``(n, gdim)`` that close the gaps of ``active (n,)`` contactors along their rows [UEM, 4.2]."""
+        rows, found = np.flatnonzero(active[self.contactor]), np.zeros(self.free.shape)
+        contactor = self.contactor[rows]
+        normal = self.equations.direction[rows] * self.free[contactor]
+        square = np.einsum("kg,kg->k", normal, normal)
+        way = -self.equations.gap[rows] / np.where(square > MOSTLY_PRESCRIBED**2, square, np.inf)
+        np.add.at(found, contactor, normal * way[:, None])
+        return found
+
+
 class Kinematics(Protocol):
     """Where contactors stand relative to their target, in one state and at one displacement: a value."""
 
@@ -153,28 +223,17 @@ class Kinematics(Protocol):
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def predicted(self, du: Array) -> Array:
-        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
-
     def off(self, state: PairState) -> Bools:
         """Contactors that have slid past an end of the target ``(n,)``."""
 
     def at_end(self, state: PairState) -> Bools:
         """Contactors that an end of the target holds in the next step ``(n,)``."""
 
-    def near(self, state: PairState) -> Bools:
-        """Contactors so near that a row in the sparsity of P pays ``(n,)``."""
-
-    def return_vectors(self, state: PairState) -> Array:
-        """Displacements that put the active contactors back onto the target [UEM, 4.2], zero for others ``(n, gdim)``."""
-
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def approach(self, which: Ints) -> UnitingEquations:
-        """The equations that the contactors ``which (k,)`` would have if they were active."""
-
-    def equations(self, state: PairState, which: Ints) -> Constraints:
-        """Equations across the target of the contactors ``which (k,)``; those of inactive ones only keep their place."""
+    @property
+    def gap_rows(self) -> GapRows:
+        """Of all contactors; made once."""
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """Contact forces across the target from the multipliers of equations ``(m,)`` (collective)."""

@@ -20,6 +20,7 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.concave_edges import MOST_CHANGES, with_averaged_normals
 from uem_dolfinx.contact.duals import HARDLY_COVERED, Covered, dual_functions
+from uem_dolfinx.contact.kinematics import GapRows
 from uem_dolfinx.contact.mortar_rows import Pieces, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_tangent import SegmentPoints
 from uem_dolfinx.contact.segment_motions import slopes
@@ -121,7 +122,7 @@ class Mortar(Contactors):
         """The same rows where contactors and target are now (collective)."""
         eq, n = rows.equations, self.config.n_owned
         if self.target.n_nodes:
-            gap = self.along(eq, self.config.x[:n])
+            gap = self._along(eq, self.config.x[:n])
         else:
             assert self.anchor is not None
             eq = self._turned(eq)
@@ -129,11 +130,15 @@ class Mortar(Contactors):
             lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
             way = np.zeros((n, self.config.gdim))
             way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
-            gap = eq.gap + self.along(eq, way)
+            gap = eq.gap + self._along(eq, way)
         if self.offset is not None:
             gap = gap - self._weighted_offset(rows)
         moved = replace(eq, gap=gap)
         return replace(rows, equations=moved, plain=moved, normal=eq.direction)
+
+    def _along(self, equations: UnitingEquations, values: Array) -> Array:
+        """Left sides of equations for the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
+        return GapRows.along_normals(self.config, equations, np.ones(len(equations)), self.free).along(values)
 
     def _turned(self, equations: UnitingEquations) -> UnitingEquations:
         """Kept rows, which turn with a rigid target."""

@@ -16,12 +16,11 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
-from uem_dolfinx.contact.on_target import END_HOLDS, OnTarget, near_target, past_end
+from uem_dolfinx.contact.kinematics import NORMAL, Constraints, GapRows, Traction
+from uem_dolfinx.contact.on_target import END_HOLDS, OnTarget, past_end
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import reduced
@@ -172,11 +171,6 @@ class NodalKinematics:
         of = self.of
         return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, of.at_feet)
 
-    @cached_property
-    def halo(self) -> Halo:
-        """The nodes of the facets at the feet, the first in place of those that there are not (first time: collective)."""
-        return Halo(self.of.config, np.maximum(self.projection.nodes, 0).ravel())
-
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Places of contactors, global nodes that they follow and weights, ``(k,)`` each."""
         p = self.projection
@@ -221,14 +215,6 @@ class NodalKinematics:
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def predicted(self, du: Array) -> Array:
-        """Nodal gaps after an increment (collective)."""
-        p, move = self.projection, du[self.of.nodes]
-        if p.nodes.shape[1]:
-            followed = self.halo.take(du.__getitem__).reshape(*p.nodes.shape, du.shape[1])
-            move = move - np.einsum("na,nag->ng", np.where(p.nodes >= 0, p.weights, 0.0), followed)
-        return np.asarray(p.gap + np.einsum("ng,ng->n", p.normal, move))
-
     def off(self, state: PairState) -> Bools:
         """Past an open end of the target in a direction in which contactors can move, or round it behind a thin target."""
         return past_end(self.projection, state, self.of.thickness)
@@ -241,59 +227,39 @@ class NodalKinematics:
         near = (self.projection.from_end <= END_HOLDS) & ~self.off(state) & self.of.ends_hold
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
-    def near(self, state: PairState) -> Bools:
-        """Contactors about a facet from the target; a rigid surface has no facets to measure by, and takes all."""
-        return near_target(self.projection, state, self.off(state))
-
-    def return_vectors(self, state: PairState) -> Array:
-        """Displacements along the normal, and along the axes of a corner, that close the gaps of active contactors."""
-        p, c, free = self.projection, self.corners, self.of.free
-        correction = np.zeros(self.points.shape)
-        i = np.flatnonzero(state.active)
-        correction[i] = _closing(p.normal[i], self.gap[i], free[i])
-        if c is not None:
-            gaps = c.gaps(self.points[c.which])
-            for r in range(1, self.of.config.gdim):
-                here = state.active[c.which] & (r < c.count)
-                correction[c.which] += here[:, None] * _closing(c.axes[:, r], gaps[:, r], free[c.which])
-        return correction
-
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def approach(self, which: Ints) -> UnitingEquations:
-        """The equations that the contactors ``which (k,)`` would have if they were active."""
-        p = self.projection
-        return self._along_normals(which, p.weights[which], p.gap[which], np.ones(len(which), bool))
-
-    def _along_normals(self, which: Ints, weights: Array, gap: Array, active: Bools) -> UnitingEquations:
-        p = self.projection
-        return UnitingEquations.along(self.of.nodes[which], p.normal[which], p.nodes[which], weights, gap, active)
-
-    def equations(self, state: PairState, which: Ints) -> Constraints:
-        """One equation along the normal for each contactor, and one along each further axis of a corner that holds it."""
-        p, c, active = self.projection, self.corners, state.active
-        test = trial = self._normal_rows(state, which, p.weights[which])
-        if self.of.chords:
-            plain = ~state.in_corner[which]
-            chords = np.where(plain[:, None], self.of.target.chords(p)[which], p.weights[which])
-            trial = self._normal_rows(state, which, chords)
-        contactor, kind = which, np.full(len(which), NORMAL)
+    @cached_property
+    def gap_rows(self) -> GapRows:
+        """One row along the normal for each contactor, then one along each further axis of a corner that holds it."""
+        p, c, of = self.projection, self.corners, self.of
+        found = GapRows.along_normals(of.config, self._normal_rows(p.weights), np.ones(len(self.points)), of.free)
+        if of.chords:
+            weights = np.array(of.target.chords(p))
+            if c is not None:
+                weights[c.which] = p.weights[c.which]
+            found = replace(found, moved=self._normal_rows(weights))
         if c is None:
-            return Constraints.without_friction(trial, test, contactor, kind)
-        contactors, kinds, more, gaps = [contactor], [kind], [], c.gaps(self.points[c.which])
-        for r in range(1, self.of.config.gdim):
+            return found
+        gaps, more, contactors, kinds = c.gaps(self.points[c.which]), [], [found.contactor], [found.kind]
+        for r in range(1, of.config.gdim):
             j = np.flatnonzero(r < c.count)
-            w = c.which[j]
-            more.append(UnitingEquations.along(self.of.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], active[w]))
+            w, none = c.which[j], np.zeros(len(j), bool)
+            more.append(UnitingEquations.along(of.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], none))
             contactors.append(w)
             kinds.append(np.full(len(w), r))
-        joined = UnitingEquations.join([test, *more], self.of.config.gdim)
-        moves = joined if trial is test else UnitingEquations.join([trial, *more], self.of.config.gdim)
-        return Constraints.without_friction(moves, joined, np.concatenate(contactors), np.concatenate(kinds))
+        lists = (
+            None if rows is None else UnitingEquations.join([rows, *more], of.config.gdim)
+            for rows in (found.equations, found.moved)
+        )
+        equations, moved = lists
+        assert equations is not None
+        return GapRows(of.config, equations, found.scale, of.free, np.concatenate(contactors), np.concatenate(kinds), moved)
 
-    def _normal_rows(self, state: PairState, which: Ints, weights: Array) -> UnitingEquations:
-        """Equations along the normals with these weights of the target's nodes ``(k, nn)``."""
-        return self._along_normals(which, weights, self.gap[which], state.active[which])
+    def _normal_rows(self, weights: Array) -> UnitingEquations:
+        """Equations of all contactors along the normals, with these weights of the target's nodes ``(n, nn)``."""
+        p, none = self.projection, np.zeros(len(self.points), bool)
+        return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """Contact forces along the normals, of all facets of a corner together (collective)."""
@@ -404,10 +370,6 @@ class NothingNear(NodalKinematics):
         """They stay where they are."""
         return self
 
-    def predicted(self, du: Array) -> Array:
-        """The gap to nothing, as large as the model ``(n,)``."""
-        return self.gap
-
     def off(self, state: PairState) -> Bools:
         """None is past an end ``(n,)``."""
         return np.zeros(len(self.gap), bool)
@@ -415,10 +377,6 @@ class NothingNear(NodalKinematics):
     def at_end(self, state: PairState) -> Bools:
         """None is held by an end ``(n,)``."""
         return np.zeros(len(self.gap), bool)
-
-    def return_vectors(self, state: PairState) -> Array:
-        """None is moved ``(n, gdim)``."""
-        return np.zeros(self.points.shape)
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """There are none."""
@@ -428,10 +386,3 @@ class NothingNear(NodalKinematics):
     def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
         """Nothing turns."""
         return []
-
-
-def _closing(normal: Array, gap: Array, free: Bools) -> Array:
-    """Displacement of the free components that closes a gap, zero where a condition holds the normal one ``(k, gdim)``."""
-    n = normal * free
-    nn = np.einsum("kg,kg->k", n, n)
-    return n * (-gap / np.where(nn > MOSTLY_PRESCRIBED**2, nn, np.inf))[:, None]

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, cross_products
 from uem_dolfinx.contact.duals import Basis, basis_of
-from uem_dolfinx.contact.kinematics import NORMAL, Constraints, Traction
+from uem_dolfinx.contact.kinematics import Constraints, GapRows, Traction
 from uem_dolfinx.contact.mortar_ends import curvature
 from uem_dolfinx.contact.mortar_rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar_turning import Frictional, turning
-from uem_dolfinx.contact.on_target import OnTarget, near_target, past_end
+from uem_dolfinx.contact.on_target import OnTarget, past_end
 from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.ties import Ties
 from uem_dolfinx.geometry.configuration import Configuration
@@ -52,13 +51,6 @@ class Contactors(OnTarget):
     def begin_step(self) -> None:
         """Forget which facets have faced each other."""
         self.faced: Ints = np.zeros((0, 2), np.int64)
-
-    def along(self, equations: UnitingEquations, values: Array) -> Array:
-        """What the left sides of the equations make of the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
-        nodes, place = np.unique(equations.followed, return_inverse=True)
-        theirs = self.config.ask_owners(nodes, values)[place]
-        own = np.einsum("ng,ng->n", equations.direction, values[equations.node])
-        return own - np.bincount(equations.row, np.einsum("kg,kg->k", equations.coefficients, theirs), minlength=len(equations))
 
     def sizes(self, x: Array) -> Array:
         """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
@@ -187,10 +179,6 @@ class MortarKinematics:
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def predicted(self, du: Array) -> Array:
-        """Weighted gaps after an increment (collective)."""
-        return np.asarray(self.rows.length * (self.rows.equations.gap + self.of.along(self.rows.equations, du)))
-
     def off(self, state: PairState) -> Bools:
         """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
 
@@ -206,30 +194,12 @@ class MortarKinematics:
         """No end holds contactors: what is covered of them fades away."""
         return np.zeros(len(self.points), dtype=bool)
 
-    def near(self, state: PairState) -> Bools:
-        """Contactors about a facet from the target; a rigid surface has no facets to measure by, and takes all."""
-        return near_target(self.projection, state, self.off(state))
-
-    def return_vectors(self, state: PairState) -> Array:
-        """Weighted gaps are closed by the linear solve."""
-        return np.zeros(self.points.shape)
-
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def approach(self, which: Ints) -> UnitingEquations:
-        """The equations that the contactors ``which (k,)`` would have if they were active."""
-        part = self._select(which)
-        return replace(part, active=np.ones(len(part), dtype=bool))
-
-    def equations(self, state: PairState, which: Ints) -> Constraints:
-        """One equation for each contactor."""
-        rows = replace(self._select(which), active=state.active[which])
-        return Constraints.without_friction(rows, rows, which, np.full(len(which), NORMAL))
-
-    def _select(self, which: Ints) -> UnitingEquations:
-        chosen = np.zeros(len(self.points), dtype=bool)
-        chosen[which] = True
-        return self.rows.equations.select(chosen)
+    @cached_property
+    def gap_rows(self) -> GapRows:
+        """One row for each contactor, divided by the length of the weighted gap's derivative."""
+        return GapRows.along_normals(self.of.config, self.rows.equations, self.rows.length, self.of.free)
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """Pressures times areas, and the contactors' forces (collective)."""
