@@ -44,6 +44,7 @@ def test_patch(coupling, n, cell, degree):
         assert highest(COMM, np.abs(s.U - exact)) < 1e-11 * p / E
         assert highest(COMM, np.abs(contact.pressures / p - 1)) < 1e-11
         assert contact.resultant().force == pytest.approx([0.0, p * np.pi * R**2], rel=1e-11)
+        assert contact.resultant().normal == pytest.approx(p * np.pi * R**2, rel=1e-11)
         assert uem.integrate(contact.pressure * uem.ds(s.side(1, 0.0, 1))) == pytest.approx(p * np.pi * R**2, rel=1e-11)
         lawful(contact, force=p)
 

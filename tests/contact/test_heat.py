@@ -6,6 +6,7 @@ Read first: ``test_bars_in_series``.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,26 @@ def test_conductance_that_grows_with_the_pressure():
     flux = (HOT - COLD) / (1.25 / K + 1 / (0.3 * p))
     assert highest(COMM, np.abs(bars.flux / flux - 1.0)) < 1e-7
     assert 2 < step.newton_iterations < 9
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_conductances_are_functions_of_no_negative_pressure(coupling):
+    """Contactors pull before they are let go of, and the law is given no negative pressure; what enters a body goes through the contact."""
+    least = []
+
+    def h(p, g):
+        least.append(p.min(initial=0.0))
+        return 0.3 * p
+
+    bars = Bars(h, alpha=1e-4, press=0.02, coupling=coupling)
+    run(bars.problem)
+    pair = bars.contact.pair
+    assert min(least) >= 0.0
+    assert bars.contact.heat_power == pytest.approx(bars.ends()[1], rel=1e-7)
+    state = pair.trial
+    pair.trial = replace(state, lam=-state.lam)
+    assert highest(COMM, pair.heat.conductances()) == 0.0 == min(least)
+    pair.trial = state
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,8 @@ class Heat:
         closed = self._pair.united
         p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self._pair.projection.gap, 0.0))
         if callable(self.law.h):
-            p = np.where(closed, self._contact.pressing()[0] * self._per_area(), 0.0)
+            # while contact is not settled, and where ties pull, forces may be negative
+            p = np.where(closed, np.maximum(self._contact.pressing()[0], 0.0) * self._per_area(), 0.0)
         return p, g
 
     def _per_area(self) -> Array:

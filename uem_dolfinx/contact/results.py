@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -25,10 +25,15 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Resultant:
-    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; of axisymmetric bodies the force along the axis."""
+    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; of axisymmetric bodies the force along the axis.
+
+    ``normal`` is the sum of the forces across the target, positive where surfaces press: of bodies of
+    revolution those on whole circles, so that a press fit has pressure times ``2 pi r`` times length.
+    """
 
     force: Array
     moment: Array
+    normal: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -239,6 +244,11 @@ class ContactResults:
         """
         return self._field("heat_flux", 0.0 if self.pair.heat is None else self.pair.heat.flux())
 
+    @property
+    def heat_power(self) -> float:
+        """Power that goes from the contactor to the target, the heat of friction aside; 0 without ``heat`` (collective)."""
+        return float(reduced(self.config.comm, 0.0 if self.pair.heat is None else float(self.pair.heat.power().sum())))
+
     def opposite(self, f: fem.Function) -> fem.Function:
         """A field of the target at the contactors: what each faces there, as a scalar field on the contactor (collective).
 
@@ -283,7 +293,8 @@ class ContactResults:
     def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies (collective).
 
-        Of axisymmetric bodies it is that on the whole body, which lies on the axis: radial forces cancel around it.
+        Of axisymmetric bodies it is that on the whole body, which lies on the axis: radial forces cancel around it, and ``normal`` adds
+        up the forces across the target on whole circles.
 
         Args:
             about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
@@ -302,7 +313,8 @@ class ContactResults:
             # a gap that a tie keeps is part of the target
             x, f = np.where(self.pair.tied[:, None], x, p.foot), -f
             centre = target.reference(g) if about is None else centre
-        return sum_up(self.config.comm, self.config.of_circles(x) - centre, self.config.of_circles(f))
+        normal = float(reduced(self.config.comm, float(self.pair.pressing()[0].sum())))
+        return replace(sum_up(self.config.comm, self.config.of_circles(x) - centre, self.config.of_circles(f)), normal=normal)
 
     def balance(self) -> Balance | None:
         """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).

@@ -30,7 +30,7 @@ class Conductance:
     Args:
         h: conductance, a power per area and difference of temperatures. A number counts where surfaces touch, and open gaps conduct
             nothing; infinity unites temperatures where surfaces touch. A function ``h(p, g)`` is given the contact pressures and gaps
-            of all contactors, ``(n,)`` each, one of them 0, and returns ``(n,)`` numbers.
+            of all contactors, ``(n,)`` each, both 0 or positive and one of them 0, and returns ``(n,)`` numbers.
         field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
         temperature: of a rigid target, a number or a Constant; None for a meshed target, which has its own.
         friction_share: part of the heat of friction that enters the contactor; the rest enters the target. None leaves this heat out.
