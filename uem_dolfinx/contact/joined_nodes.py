@@ -78,7 +78,8 @@ class JoinedNodes(NodeToSurface):
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """See ``OnTarget``, of contacts that have offsets alone."""
         i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
-        return found.with_those(i, found.take(i).across_edges(points[i]))
+        assert self.offset is not None
+        return found.with_those(i, found.take(i).across_edges(points[i], self.offset[i]))
 
     def look_farther(self) -> bool:
         """Look at contacts that are far apart, from the next placement on: whether any were."""

@@ -88,7 +88,8 @@ class OnTarget:
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """The projection of contactors that stay at a height, with normals along the way from convex edges."""
-        return found.across_edges(points)
+        assert self.offset is not None
+        return found.across_edges(points, self.offset)
 
     def take_feet(self, points: Array) -> Projection:
         """The contactors on the nearest places of the target, whose feet are kept from now on (collective)."""

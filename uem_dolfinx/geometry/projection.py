@@ -9,11 +9,21 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 
 #: A way from the foot that leans from the facet's normal by less, in the cosine of the angle, leans by rounding.
 #: [bound; cosine; -]
 ALONG_NORMAL = 1e-12
+#: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.
+#: [heuristic; length of the facet; test_offset_edges.py::test_what_rounds_an_edge]
+ROUNDS_AN_EDGE = 1e-2
+
+#: A normal that leans along its facet by more, in the cosine of the angle, is no facet's own.
+#: [bound; cosine; test_offset_edges.py::test_hessian_of_the_way_from_an_edge]
+FROM_EDGE = 1e-9
+#: A foot whose weights leave less than this to other nodes is at a vertex.
+#: [bound; shape functions; test_offset_edges.py::test_hessian_of_the_way_from_an_edge]
+AT_VERTEX = 1e-9
 
 
 class Projection(Protocol):
@@ -182,14 +192,14 @@ class FacetProjection:
         """Copy with the points ``which (k,)`` where another projection, of k points, has them."""
         return self.with_rows(which, {f.name: v for f in fields(self) if (v := getattr(other, f.name)) is not None})
 
-    def across_edges(self, points: Array) -> FacetProjection:
-        """Of ``points (n, gdim)`` that stay at a height, those in front of a convex edge with the normal along the way from it."""
+    def across_edges(self, points: Array, offset: Array) -> FacetProjection:
+        """Of ``points (n, gdim)`` at ``offset (n,)``, those in front of an edge that it rounds, with the normal along the way from it."""
         away = points - self.foot
         length, lean = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.normal)
-        beside = (
-            (np.abs(lean) < (1.0 - ALONG_NORMAL) * length) & ~self.beyond.any(axis=1) & (length > ALONG_NORMAL * self.facet_size)
-        )
+        beside = (np.abs(lean) < (1.0 - ALONG_NORMAL) * length) & ~self.beyond.any(axis=1)
         side = np.where(lean < 0.0, -1.0, 1.0)
+        # an arc about the edge with the offset as its radius, and as far again on both sides
+        beside &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
         n = side[:, None] * away / np.where(length > 0.0, length, 1.0)[:, None]
         return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
 
@@ -204,7 +214,18 @@ class FacetProjection:
         slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
         on a straight 2D facet this is the formula of the method's description.
         """
-        return gap_hessians(*self._at(which))
+        H = gap_hessians(*self._at(which))
+        if len(i := np.flatnonzero(self._from_edge[which])):
+            H[i] = _hessians_at_edges(*self._at(np.asarray(which)[i])[:-1])
+        return H
+
+    @cached_property
+    def _from_edge(self) -> Bools:
+        """Whether the normal is the way from a convex edge, neither the facet's nor an averaged one ``(n,)``; see ``across_edges``."""
+        t = np.einsum("naf,nag->nfg", self.dN, self.x)
+        leans = np.abs(np.einsum("nfg,ng->nf", t, self.normal)) > FROM_EDGE * np.linalg.norm(t, axis=2)
+        own = (self.normal != self.averaged).any(axis=1) & (self.facet >= 0) & ~self.beyond.any(axis=1)
+        return np.asarray(own & leans.any(axis=1))
 
     def turnings(self, which: Ints, s: Array) -> Array:
         """Derivative of the rows ``(s, -N_a s)`` along tangents ``s (k, gdim)``, which turn with the normal as the foot moves.
@@ -237,6 +258,31 @@ def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, 
     H = -np.einsum("kfi,kfj->kij", D, N)
     H = H + H.transpose(0, 2, 1) - np.einsum("kfe,kfi,kej->kij", b, D, D)
     return H + g[:, None, None] * np.einsum("kfi,kfj->kij", L, np.linalg.solve(m, L))
+
+
+def _hessians_at_edges(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array) -> Array:
+    """Second derivatives of the distance from a vertex, or from an edge that the foot slides along; arguments as of ``gap_hessians``."""
+    (k, nn, _), gdim = dN.shape, n.shape[1]
+    size = (1 + nn) * gdim
+    relative = np.concatenate([np.ones((k, 1)), -w], axis=1)
+    across = np.eye(gdim) - n[:, :, None] * n[:, None]
+    H = np.einsum("ka,kb,kgh->kagbh", relative, relative, across / g[:, None, None]).reshape(k, size, size)
+    i = np.flatnonzero(w.max(axis=1) < 1.0 - AT_VERTEX)
+    if gdim == 2 or not len(i):
+        return H
+    n, g, w, dN, ddN, x, relative = (v[i] for v in (n, g, w, dN, ddN, x, relative))
+    t = np.einsum("kaf,kag->kfg", dN, x)
+    # the edge is the direction in the facet that is square to the normal
+    lean = np.einsum("kfg,kg->kf", t, n)
+    edge = np.stack([-lean[:, 1], lean[:, 0]], axis=1)
+    edge /= np.linalg.norm(edge, axis=1)[:, None]
+    dN, ddN = np.einsum("kaf,kf->ka", dN, edge)[..., None], np.einsum("kafe,kf,ke->ka", ddN, edge, edge)[..., None, None]
+    H[i] = gap_hessians(n, g, w, dN, ddN, x, np.zeros((len(i), 1, gdim)))
+    along = np.einsum("kaf,kag->kg", dN, x)
+    square = np.cross(n, along / np.linalg.norm(along, axis=1)[:, None])
+    rows = np.einsum("ka,kg->kag", relative, square).reshape(len(i), size)
+    H[i] += np.einsum("ki,kj->kij", rows, rows) / g[:, None, None]
+    return H
 
 
 def foot_slopes(p: FacetProjection, which: Ints) -> tuple[Array, Array]:
