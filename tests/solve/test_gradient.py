@@ -224,3 +224,38 @@ def test_what_is_refused():
     run(fixed)
     X = ufl.SpatialCoordinate(b.scene.mesh)
     refused(uem.InputError, "needs contacts of sliding='finite'", lambda: uem.gradient(fixed, J, X))
+
+
+def test_where_earlier_steps_ended():
+    """sliding='small' projects where the step before has ended: the first step has a gradient, a later one has none."""
+    b = blocks(COMM, "quadrilateral", 2, 3)
+    E = fem.Constant(b.scene.mesh, 1.0)
+    F = uem.LinearElastic(E, 0.3, kind="plane_strain").residual(b.u, ufl.TestFunction(b.V)) * ufl.dx
+    J = ufl.inner(b.u, b.u) * ufl.dx
+    for steps in (1, 2):
+        b.u.x.array[:] = 0.0
+        contact = uem.Contact(b.high, b.low, sliding="small")
+        problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.01), contacts=[contact])
+        with uem.recording(problem) as history:
+            for _ in uem.load_steps(problem, steps):
+                pass
+        for by in (lambda problem=problem: uem.gradient(problem, J, E), lambda history=history: history.gradient(J, E)):
+            if steps == 1:
+                assert np.isfinite(by()[0]).all()
+            else:
+                refused(uem.InputError, "where an earlier step ended", by)
+
+
+def test_shape_with_mortar_on_hexahedra_is_refused():
+    """Facets of hexahedra warp with their nodes; other controls, and nodes in place of mortar, keep their gradients."""
+    s = pressed("hexahedron", law="linear", coupling="mortar")
+    problem = s.solve()
+    refused(uem.InputError, "coupling='mortar' on hexahedra", lambda: uem.gradient(problem, s.J, s.X))
+    assert np.isfinite(uem.gradient(problem, s.J, s.E)[0]).all()
+
+
+@pytest.mark.parametrize("functional, slope", [(lambda h: np.nan, 1.0), (lambda h: h, np.nan), (lambda h: h, 1.0)])
+def test_taylor_tests_without_an_order(functional, slope):
+    """What is not finite, or leaves nothing, has no order."""
+    refused(uem.InputError, "has no order", lambda: uem.taylor_test(functional, slope))
+    assert uem.taylor_test(lambda h: 2 * h + h**2, 2.0) == pytest.approx(2.0)

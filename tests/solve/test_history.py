@@ -140,3 +140,18 @@ def test_page_of_optimisers():
     exec(compile("".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), "optimise.md", "exec"), known)
     for name in ("by_scipy", "by_tao"):
         assert known[name] == pytest.approx([1.0, 0.05], rel=1e-3), name
+
+
+def test_friction_that_is_a_function_of_place_has_no_gradient_by_the_shape():
+    """The coefficient at a node changes with its place; other controls keep their gradients."""
+    b = blocks(COMM, "triangle", 2, 2)
+    E = fem.Constant(b.scene.mesh, 1.0)
+    F = uem.LinearElastic(E, 0.3, kind="plane_strain").residual(b.u, ufl.TestFunction(b.V)) * ufl.dx
+    contact = uem.Contact(b.high, b.low, friction=lambda x: 0.2 + 0.1 * x[0])
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.01), contacts=[contact])
+    with uem.recording(problem) as history:
+        run(problem)
+    J = ufl.inner(b.u, b.u) * ufl.dx
+    X = ufl.SpatialCoordinate(b.scene.mesh)
+    refused(uem.InputError, "a function of place", lambda: history.gradient(J, X))
+    assert np.isfinite(history.gradient(J, E)[0]).all()

@@ -34,8 +34,8 @@ AnyControl: TypeAlias = Control | ContactParameter
 def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl] | AnyControl) -> list[Array | fem.Function]:
     """Derivatives of a functional at the present equilibrium by parameters of the problem, by one adjoint solve (collective).
 
-    Exact for the discrete problem: the contact conditions are eliminated, not smoothed. With mortar on facets of hexahedra that warp, and
-    on curved rigid surfaces, it is as exact as Newton's tangent. The state is left as it is.
+    Exact for the discrete problem: the contact conditions are eliminated, not smoothed. With mortar on facets of hexahedra that warp
+    (by the shape: refused), and on curved rigid surfaces, it is as exact as Newton's tangent. The state is left as it is.
 
     Args:
         problem: in statics, without friction, heat through contacts and laws with history; its last step is the state.
@@ -114,10 +114,20 @@ def taylor_test(functional: Callable[[float], float], slope: float, size: float 
 
     Returns:
         The least order of all halvings.
+
+    Raises:
+        InputError: if J or the slope is not finite, or nothing is left of J at some h, which has no order.
     """
     first = functional(0.0)
     left = np.array([abs(functional(size / 2**k) - first - size / 2**k * slope) for k in range(halvings + 1)])
-    return float(np.log2(left[:-1] / left[1:]).min())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        order = float(np.log2(left[:-1] / left[1:]).min())
+    if not np.isfinite(left).all() or np.isnan(order):
+        raise InputError(
+            f"taylor_test: |J(h) - J(0) - h slope| = {left} for h from {size} on has no order: expected a finite J and slope, and a J that "
+            "is not linear in h"
+        )
+    return order
 
 
 def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
@@ -140,6 +150,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
                     f"the gradient of {what} depends on all steps, of which the last alone is known: take the steps while "
                     "uem.recording(problem) keeps them, and ask that history"
                 )
+        if not recorded:
+            refuse_kept_projections(problem, problem.progress.steps)
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.heat is not None for contact in problem.contacts):
@@ -156,6 +168,16 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
 
     # derivatives are known of each contact
     part_contacts(problem)
+
+
+def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:
+    """Refuse contacts that were projected where a step before the last ended, of which there is no derivative."""
+    for contact in problem.contacts:
+        if steps > 1 and contact.sliding == "small":
+            raise InputError(
+                f"contact '{contact.name}': after {steps} steps, contactors of sliding='small' are projected where an earlier step ended, "
+                "of which there is no derivative: expected one step, or sliding='finite' or 'fixed'"
+            )
 
 
 def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
@@ -266,5 +288,12 @@ def _check_shape(problem: UnitedProblem) -> None:
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )
+    if config.gdim == 3 and config.mesh.topology.cell_name() == "hexahedron":
+        for contact in problem.contacts:
+            if contact.coupling == "mortar":
+                raise InputError(
+                    f"contact '{contact.name}': there is no gradient by the shape with coupling='mortar' on hexahedra, whose facets warp: "
+                    "expected coupling='node_to_surface', or tetrahedra"
+                )
     if any(contact.adjust or callable(contact.offset) for contact in problem.contacts):
         raise InputError("a gradient by the shape needs an offset that is a number, and no adjust: others change with the shape")

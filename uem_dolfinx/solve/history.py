@@ -25,7 +25,7 @@ from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.materials.elastic import material_of
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.gradient import AnyControl, check_controls, check_problem, refuse_results
+from uem_dolfinx.solve.gradient import AnyControl, check_controls, check_problem, refuse_kept_projections, refuse_results
 from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.records import Record, Records
@@ -152,8 +152,15 @@ class History:
         load = problem.load if isinstance(problem.load, Mapping) else {}
         density = None if dynamics is None else dynamics.mass.density
         made_of = [] if density is None else list(traverse_unique_terminals(density))
+        varied = [c.name for c in problem.contacts if c.pair.frictional and callable(as_law(c.friction).field)]
         with agreed(problem.comm):
+            refuse_kept_projections(problem, len(self))
             for k, m in enumerate(controls):
+                if isinstance(m, ufl.SpatialCoordinate) and varied:
+                    raise InputError(
+                        f"controls[{k}] is the shape, with which the friction of contact '{varied[0]}', a function of place, changes: "
+                        "there is no derivative by it; expected a number"
+                    )
                 if isinstance(m, fem.Constant) and callable(load.get(m)):
                     raise InputError(
                         f"controls[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
