@@ -49,6 +49,23 @@ def test_patch(coupling, n, cell, degree):
         lawful(contact, force=p)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+@pytest.mark.parametrize(("degree", "coupling"), [(1, "mortar"), (2, "node_to_surface"), (2, "mortar")])
+def test_pressures_to_integrate(degree, coupling, cell):
+    """The integral over a contactor that overhangs its target is the normal force, which holds what presses on the top."""
+    p = 3.0
+    s = Revolved(rectangle((0, -1), (1, 0), (4, 3), cell), rectangle((0, 0), (1.3, 1), (5, 3), cell), cell=cell, degree=degree)
+    s.hold_axis(2)
+    s.hold(1, -1.0)
+    foot = s.side(1, 0.0, 1)
+    contact = uem.Contact(foot, s.side(1, 0.0, 0), coupling=coupling)
+    law = uem.LinearElastic(E, NU, kind="axisymmetric")
+    s.problem(law.residual(s.u, s.v) * ufl.dx + p * s.v[1] * uem.ds(s.side(1, 1.0, 1)), [contact], rtol=1e-12).solve()
+    assert contact.resultant().normal == pytest.approx(p * np.pi * 1.3**2, rel=1e-4)
+    total = uem.integrate(contact.pressure_to_integrate() * uem.ds(foot))
+    assert total == pytest.approx(contact.resultant().normal, rel=1e-10)
+
+
 @pytest.mark.parametrize(("coupling", "n"), [("node_to_surface", (4, 4)), ("mortar", (5, 3))])
 def test_tied_cylinders_are_pulled(coupling, n):
     """A uniaxial tension goes through the tie."""
@@ -176,6 +193,9 @@ def test_press_fit(degree, coupling):
     assert highest(COMM, np.abs(contact.pressures / (delta / gives) - 1)) < (0.01 if degree == 1 else 1e-3)
     assert contact.resultant().force == pytest.approx([0.0, 0.0], abs=1e-12)
     assert contact.balance().force < 1e-12
+    normal = contact.resultant().normal
+    assert normal == pytest.approx(2 * np.pi * b * height * delta / gives, rel=0.01)
+    assert uem.integrate(contact.pressure_to_integrate() * uem.ds(s.side(0, b + delta, 0))) == pytest.approx(normal, rel=1e-10)
 
 
 def punch_and_base(mu, **how):
