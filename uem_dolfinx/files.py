@@ -26,6 +26,9 @@ T = TypeVar("T")
 #: Bytes that MPI-IO gets at once, because it counts them in C's int.
 #: [format; bytes; -]
 PIECE = 2**30
+#: Longest path as given: Open MPI's MPI-IO overruns a buffer of 256 bytes, in which endings are appended to it.
+#: [format; bytes; -]
+LONGEST_PATH = 200
 #: What helps where a file cannot be written.
 REMEDY = "check the folder, its rights and its free space"
 
@@ -65,11 +68,16 @@ class Trouble:
 
 
 def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
-    """A path, the same on all ranks; InputTypeError or InputError if it is none (collective)."""
+    """A path, the same on all ranks; InputTypeError or InputError if it is none or too long (collective)."""
     with agreed(comm):
         given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
         if not Path(value).name:
             raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
+        if (n := len(os.fsencode(value))) > LONGEST_PATH:
+            raise InputError(
+                f"{what} has {n} bytes, and MPI-IO takes at most {LONGEST_PATH}: give a shorter one, relative to the "
+                f"working folder, not {value}"
+            )
     given.alike(comm, "files", **{what: str(value)})
     return Path(value)
 

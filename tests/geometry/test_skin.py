@@ -13,6 +13,8 @@ from body_scenes import all_facets, ball, dimension, skin_of, turned
 from helpers import CELLS, at, box, highest
 
 from uem_dolfinx import forms
+from uem_dolfinx.errors import SurfaceError
+from uem_dolfinx.geometry.skin import names_of_bodies
 from uem_dolfinx.geometry.surfaces import surface_nodes
 
 COMM = MPI.COMM_WORLD
@@ -183,3 +185,20 @@ def test_cones_hold_the_normals_around_a_node(cell, degree):
         length = np.linalg.norm(cones, axis=2)
         assert np.abs(length * (length - 1)).max(initial=0.0) < 1e-13
         assert ((length > 0.5).sum(axis=1) >= faces).all()
+
+
+def test_names_of_bodies():
+    """Each body has one name, also where a part has that of another body by default."""
+    first, second, both = np.array([True, False]), np.array([False, True]), np.array([True, True])
+    assert names_of_bodies({}, 2) == ["body 1", "body 2"]
+    assert names_of_bodies({"a": second}, 2) == ["body 1", "a"]
+    assert names_of_bodies({"body 2": second}, 2) == ["body 1", "body 2"]
+    assert names_of_bodies({"body 2": first, "body 1": second}, 2) == ["body 2", "body 1"]
+    for parts, words in (
+        ({"body 2": first}, "'body 2' is the name of two bodies"),
+        ({"a": both}, "'a' is the name of two bodies"),
+        ({"a": first, "b": first}, "'b' and 'a' are one body"),
+        ({"body 1": first, "b": first}, "'b' and 'body 1' are one body"),
+    ):
+        with pytest.raises(SurfaceError, match=words):
+            names_of_bodies(parts, 2)

@@ -136,7 +136,7 @@ class GeneralContact:
 
         Raises:
             TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
-            SurfaceError: if nothing is left that may touch, or a body has two names.
+            SurfaceError: if nothing is left that may touch, or a body has two names, or two bodies have one.
         """
         from uem_dolfinx.geometry.skin import Skin
 
@@ -250,12 +250,10 @@ class GeneralContact:
         return self._skin.body_of_node == body, self._skin.body == body
 
     def _name_bodies(self) -> None:
-        self._names = [f"body {k + 1}" for k in range(self._skin.n_bodies)]
-        for name, part in self.bodies.items():
-            for body in np.flatnonzero(self._skin.bodies_of(_part(self._config, part, "bodies"))):
-                if self._names[body] in self.bodies:
-                    raise SurfaceError(f"bodies: '{name}' and '{self._names[body]}' are one body: give each body one name")
-                self._names[body] = name
+        from uem_dolfinx.geometry.skin import names_of_bodies
+
+        parts = {name: self._skin.bodies_of(_part(self._config, part, "bodies")) for name, part in self.bodies.items()}
+        self._names = names_of_bodies(parts, self._skin.n_bodies)
 
     @property
     def all_surfaces(self) -> Tag:

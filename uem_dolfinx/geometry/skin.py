@@ -11,6 +11,7 @@ import numpy as np
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import SHARP_EDGE, FacetData, TargetFacets, pairs_of_equals, spread_of, unit
@@ -186,3 +187,29 @@ class Skin(TargetFacets):
         cones[there, place + 1] = arrived.reshape(-1, 2, g)
         cones[:, 0] = unit(cones.sum(axis=1))
         return cones[nodes]
+
+
+def names_of_bodies(parts: dict[str, Bools], n: int) -> list[str]:
+    """Name of each body, one for each: that of its part, or "body 1", "body 2", ... in the order of the mesh's input.
+
+    Args:
+        parts: whether each body belongs to the part of a name, ``(n,)``, the same on all ranks.
+        n: number of bodies.
+
+    Raises:
+        SurfaceError: if a body has two names, or two bodies have one.
+    """
+    names: dict[int, str] = {}
+    for name, part in parts.items():
+        for body in np.flatnonzero(part).tolist():
+            if body in names:
+                raise SurfaceError(f"bodies: '{name}' and '{names[body]}' are one body: give each body one name")
+            names[body] = name
+    found: dict[str, int] = {}
+    for body in range(n):
+        name = names.setdefault(body, f"body {body + 1}")
+        if (first := found.setdefault(name, body)) != body:
+            raise SurfaceError(
+                f"bodies: '{name}' is the name of two bodies, number {first + 1} and {body + 1} in the mesh's input: give each its own"
+            )
+    return [names[body] for body in range(n)]
