@@ -304,6 +304,25 @@ def test_facets_that_come_and_go_are_not_missed(facets, way):
     assert COMM.allreduce(seen) > 30
 
 
+@pytest.mark.parametrize("far", [0.3, 3.0, 20.0])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_lists_of_a_failed_attempt_are_made_anew(cell, far):
+    """Back at the start of the step, lists that an attempt made far away are what they were, however far they reach."""
+    skin = cloud(cell, 6, 3)
+    n = lists_of(skin)
+    n.update()
+    before, times = listed(n), n.times_made
+    start = skin.config.displacement.copy()
+    drawn(skin, 6, 4)
+    skin.config.displacement[:] *= far
+    n.update()
+    away = n.times_made
+    skin.config.displacement[:] = start
+    n.update()
+    assert listed(n) == before
+    assert n.times_made == (away + 1 if away > times else times)
+
+
 def test_trial_states_far_away_and_back():
     """A long trial step makes lists anew, and so does the way back; what is listed then is what was listed before."""
     skin = cloud("triangle", 6, 3)

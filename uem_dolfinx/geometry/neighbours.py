@@ -127,7 +127,7 @@ class Neighbours:
         #: Number of the order that they keep.
         self.number = next(_orders)
         self._made_at: Array | None = None
-        self._kept, self._farther = False, 0.0
+        self._kept, self._made_in_attempt, self._farther = False, False, 0.0
         self._reach = np.zeros(skin.n_bodies)
         self._lasts = self._reach
         self.lists: list[Listing] = []
@@ -151,6 +151,8 @@ class Neighbours:
                 self._made_at = None
             self._overlap = self._farther = 0.0
         stale = self._made_at is None or bool((self._motion(self._made_at) > self._lasts).any())
+        # lists made where bodies had moved to in an attempt do not outlive it
+        stale = stale or (self._made_in_attempt and not self._motion(self._committed).any())
         if reduced(self._config.comm, stale, op=MPI.LOR):
             self._make()
 
@@ -171,6 +173,7 @@ class Neighbours:
         motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
         self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), max(self._farther, self._overlap))
         self._made_at = config.x.copy()
+        self._made_in_attempt = bool(self._motion(self._committed).any())
         self.times_made += 1
         # what facets' ranks have to know of a node, which goes where a facet may be in reach
         n, g, own = len(self.nodes), config.gdim, skin.body_of_node[self.nodes]
