@@ -81,6 +81,23 @@ def test_energy_given(caplog):
             refuse(3.0, length)
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e3])
+def test_a_bar_at_rest_is_not_given_energy(scale, caplog):
+    """A bar that lies on a plane without any load does so in steps that are not cut, at sizes from nm to km."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [0.1 * scale, scale], [1, 100])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, w = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.0, kind="plane_stress").residual(u, w) * ufl.dx
+    foot = s.tag("foot", 0, lambda x: np.isclose(x[:, 1], 0.0, atol=1e-6 * scale))
+    contact = uem.Contact(foot, uem.RigidPlane((0, 0), (0, 1)))
+    dynamics = uem.Dynamics(uem.consistent_mass(V, 1.0))
+    problem = uem.UnitedProblem(F, u, contacts=[contact], dynamics=dynamics)
+    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+        steps = list(uem.time_steps(problem, 0.005 * scale, 0.02 * scale))
+    assert [step.cuts for step in steps] == [0] * 4
+    assert "of energy" not in caplog.text
+
+
 class Passing:
     """A small block whose tip moves straight from ``start`` to ``end``, past a rigid circle of radius 1 about the origin."""
 

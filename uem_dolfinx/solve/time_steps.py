@@ -24,6 +24,7 @@ from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import ConvergedStep, begin_checkpoint, between_steps
+from uem_dolfinx.solve.system import CLOSED
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
@@ -269,7 +270,12 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
     if K is None:
         return 0.0
     compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()
-    return float(reduced(problem.comm, sum(0.25 * float(f @ (compliance * f)) for f in forces)))
+    held = sum(0.25 * float(f @ (compliance * f)) for f in forces)
+    # of gaps that count as closed, which rounding leaves
+    open_still = CLOSED * problem.config.size
+    pressed = np.logical_or.reduce([f != 0.0 for f in forces])
+    held += 0.5 * float(K.ravel()[pressed].sum()) * open_still**2
+    return float(reduced(problem.comm, held))
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:
