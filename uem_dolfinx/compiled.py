@@ -19,6 +19,21 @@ _known: dict[tuple[str, str], Any] = {}
 
 
 @contextmanager
+def _meshes_kept(what: Any) -> Iterator[None]:
+    """Leave the meshes of a form as they are.
+
+    FFCx 0.5 gives them another coordinate element where it compiles anew, which changes the hash of all that is made of them later.
+    """
+    domains = [(domain, domain.ufl_coordinate_element()) for domain in (what.ufl_domains() if isinstance(what, ufl.Form) else ())]
+    try:
+        yield
+    finally:
+        for domain, element in domains:
+            if domain.ufl_coordinate_element() is not element:
+                domain._ufl_coordinate_element = element
+
+
+@contextmanager
 def kept() -> Iterator[None]:
     """Within this block DOLFINx compiles, or looks up in its cache, only what this process has not compiled before.
 
@@ -33,7 +48,8 @@ def kept() -> Iterator[None]:
         signature = what.signature() if isinstance(what, ufl.Form) else repr(what)
         key = signature, repr((args, sorted(options.items())))
         if not comm.allreduce(key in _known, op=MPI.LAND):
-            compiled, module, _ = compile_anew(comm, what, *args, **options)
+            with _meshes_kept(what):
+                compiled, module, _ = compile_anew(comm, what, *args, **options)
             # as DOLFINx finds it in its cache, without the source
             _known[key] = compiled, module, (None, None)
         return _known[key]

@@ -63,6 +63,18 @@ def expanded(form: ufl.Form) -> ufl.Form | None:
     return None if found.empty() else found
 
 
+def by_places(form: ufl.Form, domain: Any, direction: Any) -> ufl.Form | None:
+    """Derivative of a form along a change of the positions of a mesh's nodes; None where it does not depend on them.
+
+    All coordinates in the form become one object: UFL compares them by hashes that FFCx 0.5 changes where users compile forms.
+    """
+    X = ufl.SpatialCoordinate(domain)
+    own = X.ufl_domain()
+    parts = [part for integral in form.integrals() for part in traverse_unique_terminals(integral.integrand())]
+    found = {part: X for part in parts if isinstance(part, ufl.SpatialCoordinate) and part.ufl_domain() == own}
+    return expanded(ufl.derivative(ufl.replace(form, found) if found else form, X, direction))
+
+
 #: Of forms that have been expanded: which integrals are left, and which Functions and Constants of these, by the forms' signatures.
 _left: dict[str, tuple[list[int], list[int], list[int]]] = {}
 

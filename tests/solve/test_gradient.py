@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import SCENES, along, orders, pressed, wave
+from dolfinx import mesh as dm
+from gradient_scenes import SCENES, along, dot, orders, pressed, wave
 from helpers import blocks, clamp, linear, modulus, raised, refused, run, slow
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.options import has_hypre
+from uem_dolfinx.geometry.axisymmetry import revolved
 
 COMM = MPI.COMM_WORLD
 
@@ -259,3 +261,28 @@ def test_taylor_tests_without_an_order(functional, slope):
     """What is not finite, or leaves nothing, has no order."""
     refused(uem.InputError, "has no order", lambda: uem.taylor_test(functional, slope))
     assert uem.taylor_test(lambda h: 2 * h + h**2, 2.0) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_by_the_shape_from_a_cold_cache(axisymmetric):
+    """Code that is compiled anew, by a step or by users' own forms, leaves coordinates in forms what they were."""
+    mesh = dm.create_unit_square(COMM, 1, 1)
+    c = 2.0 + COMM.bcast(np.random.default_rng().random())  # no code of before serves
+    if axisymmetric:
+        uem.axisymmetric(mesh)
+    V = uem.function_space(mesh, ("Lagrange", 1, (2,)))
+    u, v, X = fem.Function(V), ufl.TestFunction(V), ufl.SpatialCoordinate(mesh)
+    kind = "axisymmetric" if axisymmetric else "plane_strain"
+    F = (c + X[0]) * uem.LinearElastic(1.0, 0.3, kind=kind).residual(u, v) * ufl.dx
+    J = (1 + X[0]) * u[1] * ufl.dx
+    ends = [dm.locate_entities_boundary(mesh, 1, lambda x, z=z: np.isclose(x[1], z)) for z in (0.0, 1.0)]
+    problem = uem.UnitedProblem(F, u, bcs=[uem.dirichlet(V, ends[0]), uem.dirichlet(V, ends[1], 1, -0.05)])
+    element = mesh.ufl_domain().ufl_coordinate_element()
+    run(problem)
+    assert mesh.ufl_domain().ufl_coordinate_element() is element
+    fem.form(c * X[0] * u[0] * ufl.dx)
+    (by,) = uem.gradient(problem, J, ufl.SpatialCoordinate(mesh))
+    du = uem.tangent(problem, [(X, wave(V))])
+    whole = revolved(J)
+    explicit = ufl.derivative(whole, u, du), forms.by_places(whole, mesh, wave(V))
+    assert sum(forms.assemble_scalar(forms.form(one), COMM) for one in explicit) == pytest.approx(dot(by, wave(V)), rel=1e-10)

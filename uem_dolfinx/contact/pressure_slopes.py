@@ -100,8 +100,9 @@ class PressureSlopes:
         if self.contact.contactor.dim > 0:
             V = compat.function_space(config.mesh, config.degree)
             area = self.contact.surface.integral(ufl.TestFunction(V), self._current)
-            for by, change in ((config.whole, du), (ufl.SpatialCoordinate(config.mesh), shape)):
-                if (form := forms.expanded(ufl.derivative(area, by, change))) is not None:
+            along_u = forms.expanded(ufl.derivative(area, config.whole, du))
+            for form in (along_u, forms.by_places(area, config.mesh, shape)):
+                if form is not None:
                     areas += forms.assemble_array(V, forms.form(form))[nodes]
         slopes = self._over * (lam - p * kinematics.areas_along(areas))
         if self._stretching is not None:

@@ -274,7 +274,7 @@ class Linearised:
                 continue
             if isinstance(m, ufl.SpatialCoordinate):
                 shape.x.array[:] += values_in(config.V, change)
-                if (form := forms.expanded(ufl.derivative(self.F, m, change))) is not None:
+                if (form := forms.by_places(self.F, config.mesh, change)) is not None:
                     forces.array[:] -= self.assembled(form)
                 continue
             if (form := along(self.F, m, change)) is not None:

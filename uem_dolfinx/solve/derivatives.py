@@ -87,7 +87,7 @@ class Derivatives:
         V = self._V
 
         def by(form: ufl.Form) -> Array | None:
-            found = self._compiled(form, X, lambda: forms.expanded(ufl.derivative(form, X, ufl.TestFunction(V))))
+            found = self._compiled(form, X, lambda: forms.by_places(form, V.mesh, ufl.TestFunction(V)))
             return None if found is None else forms.assemble_array(V, found)
 
         return self._added(terms, fem.Function(V), by)
