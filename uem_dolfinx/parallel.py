@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +26,9 @@ T = TypeVar("T")
 #: Exit status of a run that Ctrl-C to one rank has ended between what is collective, as shells have it.
 #: [format; exit status; test_signals.py::test_one_rank_is_interrupted_before_the_steps]
 INTERRUPTED = 128 + signal.SIGINT
+#: How often a rank looks whether the others have come.
+#: [bound; seconds; -]
+POLLED = 1e-3
 
 
 def agree(comm: MPI.Comm, error: BaseException | None) -> None:
@@ -121,6 +125,50 @@ def ask_together(comm: MPI.Comm, what: str, f: Callable[..., T], *args: Any) -> 
     with agreed(comm):
         return ask(what, f, *args)
     raise AssertionError("an error that nobody raised")
+
+
+class _Meeting:
+    """A communicator of its own for one on which its ranks wait for each other with an end, until some have not come in time."""
+
+    def __init__(self, comm: MPI.Comm):
+        self.comm, self.missed = comm.Dup(), False
+
+
+def _free(comm: MPI.Comm, key: int, meeting: _Meeting) -> None:
+    """End a meeting with the communicator that it is for."""
+    meeting.comm.Free()
+
+
+#: Key under which a communicator has its meeting.
+_MEETING = MPI.Comm.Create_keyval(delete_fn=_free)
+
+
+def prepare_meeting(comm: MPI.Comm) -> None:
+    """Make what ``all_come`` needs, once for each communicator (collective)."""
+    if comm.size > 1 and comm.Get_attr(_MEETING) is None:
+        comm.Set_attr(_MEETING, _Meeting(comm))
+
+
+def all_come(comm: MPI.Comm, seconds: float) -> bool:
+    """Whether all ranks come here, the last one no later than so many seconds after this one; the answer is the same on all that come.
+
+    It may be called by some ranks only, at any time after ``prepare_meeting``: messages of other calls are not disturbed. Ranks that
+    have missed each other once do not meet again.
+    """
+    if comm.size == 1:
+        return True
+    meeting: _Meeting = comm.Get_attr(_MEETING)
+    # the second time for those that come when others have just given up
+    for _ in range(2):
+        if meeting.missed:
+            return False
+        request, end = meeting.comm.Ibarrier(), time.monotonic() + seconds
+        while not request.Test():
+            if time.monotonic() > end:
+                meeting.missed = True
+                break
+            time.sleep(POLLED)
+    return not meeting.missed
 
 
 class Exchange:

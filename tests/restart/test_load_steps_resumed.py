@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from helpers import serial, start_process
 from ramp_scenes import COMM, RAMPS
-from restart_scenes import bits
+from restart_scenes import Killed, bits
 from results_scenes import rows, same_series, series
 
 import uem_dolfinx as uem
@@ -99,7 +99,7 @@ def test_done_is_done(kind, folder):
 def test_begun_by_the_load_steps(folder):
     """Without ``begin`` before, and called twice, the second call finds that it is meant."""
     first = RAMPS["ramped"](COMM)
-    checkpoint = uem.Checkpoint(folder / "run", every=1)
+    checkpoint = Killed(folder / "run", every=1)
     steps = first.steps(checkpoint)
     made = [next(steps) for _ in range(5)]
     steps.close()

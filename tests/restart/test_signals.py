@@ -15,11 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import ufl
 from dolfinx import fem
 from helpers import blocks, environment, linear, serial, start_process
-from ramp_scenes import COMM, nothing
-from resting_scenes import Bar
+from ramp_scenes import COMM, five_steps, nothing
 
 import uem_dolfinx as uem
 from uem_dolfinx.parallel import INTERRUPTED
@@ -46,23 +44,6 @@ def send(number, rank=COMM.size - 1):
     """A signal to one rank alone, which has come when this returns."""
     if COMM.rank == rank:
         os.kill(os.getpid(), number)
-
-
-def scene(in_time, load):
-    """A problem, and a function that begins its five steps with or without a checkpoint."""
-    if in_time:
-        problem = Bar((0.0, -3.0), load=load).problem
-        return problem, lambda checkpoint: uem.time_steps(problem, 0.02, 0.1, checkpoint=checkpoint)
-    b = blocks(COMM, "triangle")
-    weight = fem.Constant(b.scene.mesh, 0.0)
-
-    def pull(factor):
-        weight.value = factor
-        load(factor)
-
-    F = linear(b.u, 1.0) + 0.1 * weight * ufl.TestFunction(b.V)[1] * ufl.dx
-    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)], load=pull)
-    return problem, lambda checkpoint: uem.load_steps(problem, 5, checkpoint=checkpoint)
 
 
 @pytest.mark.parametrize("number", ENDS, ids=["SIGINT", "SIGTERM"])
@@ -183,7 +164,7 @@ def test_one_rank_is_interrupted(in_time, number, within, kept, folder, handlers
     def load(at):
         at_step_3("load")
 
-    problem, begin = scene(in_time, load)
+    problem, begin = five_steps(in_time, load)
     solve = problem.system.solve
 
     def interrupted_solve(*what):
@@ -203,16 +184,16 @@ def test_one_rank_is_interrupted(in_time, number, within, kept, folder, handlers
     # not what the iteration had come to
     assert np.array_equal(problem.u.x.array, committed)
     if kept:
-        again, begin = scene(in_time, nothing)
+        again, begin = five_steps(in_time, nothing)
         assert len(list(begin(uem.Checkpoint(folder / "run")))) == 3
-        whole, begin = scene(in_time, nothing)
+        whole, begin = five_steps(in_time, nothing)
         list(begin(None))
         np.testing.assert_allclose(again.u.x.array, whole.u.x.array, rtol=0, atol=1e-9 * np.abs(whole.u.x.array).max())
 
 
 def test_once_more(handlers):
     """Ctrl-C after a signal acts at once; SIGTERM twice, as some senders send it, is one."""
-    problem, begin = scene(False, nothing)
+    problem, begin = five_steps(False, nothing)
     with pytest.raises(SystemExit):
         for _ in begin(None):
             send(signal.SIGTERM)
@@ -230,7 +211,7 @@ def test_once_more(handlers):
 
 def test_what_nobody_has_acted_on(handlers):
     """A signal in the last pass of a loop that is left is handed on to whoever had it before."""
-    _, begin = scene(False, nothing)
+    _, begin = five_steps(False, nothing)
     steps = begin(None)
     next(steps)
     send(signal.SIGTERM, COMM.rank)
@@ -242,7 +223,7 @@ def test_what_nobody_has_acted_on(handlers):
 def test_handlers_of_others(handlers):
     """What is ignored stays ignored, what others install meanwhile stays theirs, and problems may step within each other's steps."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _, begin = scene(False, nothing)
+    _, begin = five_steps(False, nothing)
     for _ in begin(None):
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     signal.signal(signal.SIGINT, handlers[0][signal.SIGINT])
@@ -250,7 +231,7 @@ def test_handlers_of_others(handlers):
     next(outer)
     ours = signal.getsignal(signal.SIGTERM)
     assert ours not in (handlers[0][signal.SIGTERM], signal.SIG_DFL)
-    _, begin_other = scene(False, nothing)
+    _, begin_other = five_steps(False, nothing)
     for _ in begin_other(None):
         pass
     assert signal.getsignal(signal.SIGTERM) == ours
@@ -262,7 +243,7 @@ def test_handlers_of_others(handlers):
 def test_outside_the_main_thread():
     """Python allows handlers in the main thread only; elsewhere steps run without."""
     found, before = [], signal.getsignal(signal.SIGTERM)
-    problem, begin = scene(False, nothing)
+    problem, begin = five_steps(False, nothing)
 
     def run():
         found.extend(signal.getsignal(signal.SIGTERM) for _ in begin(None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from restart_scenes import Killed
 from resting_scenes import COMM, Bar
 
 import uem_dolfinx as uem
@@ -15,7 +16,7 @@ def test_table_made_before_the_checkpoint_is_read(kind, folder):
     """It refuses the first row and leaves the file alone; made after the checkpoint was read it goes on."""
 
     def run(end, early):
-        bar, checkpoint = Bar((0.0, -3.0)), uem.Checkpoint(folder / "run", every=2)
+        bar, checkpoint = Bar((0.0, -3.0)), Killed(folder / "run", every=2)
         if not early:
             checkpoint.begin(bar.problem.state())
         path = folder / "table.csv"

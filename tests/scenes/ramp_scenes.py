@@ -12,8 +12,9 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
-from helpers import Scene, at, blocks, box, clamp, scene, st_venant
-from restart_scenes import slider
+from helpers import Scene, at, blocks, box, clamp, linear, scene, st_venant
+from restart_scenes import Killed, slider
+from resting_scenes import Bar
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -37,7 +38,7 @@ class Ramps:
 
     def run(self, folder: Path, *, every: int = 10**6, stop: int | None = None, cell: bool = False) -> list[uem.LoadStep]:
         """Step with the checkpoint ``run`` and results ``out`` in a folder, and leave after some steps; returns those made."""
-        done, checkpoint = [], uem.Checkpoint(folder / "run", every=every)
+        done, checkpoint = [], Killed(folder / "run", every=every)
         checkpoint.begin(self.problem.state())
         with uem.ResultsWriter(folder / "out", self.problem, fields={"u2": self.problem.u[1]}, resume=True) as writer:
             writer.write(0.0)
@@ -134,3 +135,20 @@ def loaded(comm: MPI.Comm) -> Ramps:
 
 
 RAMPS = {"sliding": sliding, "ramped": ramped, "plastic": plastic, "forming": forming, "rolling": rolling, "loaded": loaded}
+
+
+def five_steps(in_time: bool, load: Callable[[float], Any]) -> tuple[uem.UnitedProblem, Callable[[Any], Iterator[Any]]]:
+    """A problem, and a function that begins its five steps with or without a checkpoint."""
+    if in_time:
+        problem = Bar((0.0, -3.0), load=load).problem
+        return problem, lambda checkpoint: uem.time_steps(problem, 0.02, 0.1, checkpoint=checkpoint)
+    b = blocks(COMM, "triangle")
+    weight = fem.Constant(b.scene.mesh, 0.0)
+
+    def pull(factor: float) -> None:
+        weight.value = factor
+        load(factor)
+
+    F = linear(b.u, 1.0) + 0.1 * weight * ufl.TestFunction(b.V)[1] * ufl.dx
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)], load=pull)
+    return problem, lambda checkpoint: uem.load_steps(problem, 5, checkpoint=checkpoint)

@@ -84,6 +84,13 @@ def small(comm=COMM, *, degree=1, name="u", numbers=("time",), seed=None, **how)
     return uem.State(b.scene.mesh, {name: u}, numbers=dict.fromkeys(numbers, 1.5))
 
 
+class Killed(uem.Checkpoint):
+    """Of a run that is left as one that is killed: nothing more is written."""
+
+    def leave(self, *what):
+        """Write nothing."""
+
+
 class Impact:
     """A plastic block that flies aslant onto a plastic one, which a moving foot and a growing load drive against it."""
 
@@ -128,7 +135,7 @@ class Impact:
 
     def run(self, folder, *, every=10**6, stop=None, end=END, tolerance=TOLERANCE, dt=DT):
         """Step with tables ``energy.csv`` and ``history.csv`` and the checkpoint ``run`` in a folder; returns the steps."""
-        checkpoint, steps = uem.Checkpoint(folder / "run", every=every), []
+        checkpoint, steps = Killed(folder / "run", every=every), []
         checkpoint.begin(self.problem.state())
         with (
             uem.EnergyBook(self.problem, external=self.external, path=folder / "energy.csv", resume=True) as book,

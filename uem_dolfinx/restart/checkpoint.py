@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 from collections.abc import Iterator
 from hashlib import blake2b
 from pathlib import Path
@@ -22,10 +23,10 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray
-from uem_dolfinx.errors import CheckpointError
+from uem_dolfinx.errors import CheckpointError, UEMError
 from uem_dolfinx.files import REMEDY, Trouble, flush, given_path, read_at, write_at
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.parallel import agreed, all_come, ask_together, is_agreed, prepare_meeting
 from uem_dolfinx.restart.interruption import Interruption, end_run
 from uem_dolfinx.restart.numbering import DIGEST, fingerprint, hashes
 from uem_dolfinx.restart.state import State
@@ -38,6 +39,9 @@ MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
 #: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
+#: How long a rank that leaves a loop waits for the others before it goes on without writing.
+#: [bound; seconds; test_left_early.py::test_left_by_one_rank]
+LEAVING = 30.0
 
 
 def write_checkpoint(path: str | Path, state: State) -> None:
@@ -276,6 +280,9 @@ class Checkpoint:
             for step in uem.time_steps(problem, dt, end, checkpoint=checkpoint):
                 ...
 
+    Where the loop or the block is left before its end, by ``break``, ``return``, an error of the script's own or a step that fails, the
+    last converged step is written, if all ranks leave there. A second Ctrl-C ends the run at once, with what was written before.
+
     Other loops call ``begin(state)`` before the first step, ``step()`` after each, and ``finish()`` at the end.
 
     Args:
@@ -290,6 +297,8 @@ class Checkpoint:
         given.kind("path", path, isinstance(path, (str, os.PathLike)), "the path of a file")
         self.path, self.every = Path(path), given.count("every", every)
         self._state: State | None = None
+        #: Whether steps have been made since the last writing, and whose caller has one that it is not done with.
+        self._unwritten, self._loop = False, None  # type: bool, object
         #: Signals that ask the run to end.
         self.interruption = Interruption(finishing=True)
 
@@ -307,6 +316,7 @@ class Checkpoint:
         if self._state is not None:
             self.check(*state.functions.values())
         self._state, comm, found = state, state.comm, False
+        prepare_meeting(state.mesh.comm)
         trouble = _trouble(comm, f"what a killed run left beside {self.path} cannot be removed", "check the rights of the folder")
         with trouble:
             if comm.rank == 0:
@@ -342,11 +352,12 @@ class Checkpoint:
         if self._state is None:
             raise CheckpointError(f"{self.path}: there is no state to keep yet; call begin(state) before the first step")
         self._state.steps += 1
+        self._unwritten, self._loop = True, None
         number = self.interruption.agreed(self._state.comm)
         if number:
             self.end(number)
         if self._state.steps % self.every == 0:
-            write_checkpoint(self.path, self._state)
+            self._write()
 
     def finish(self) -> None:
         """Write the end state, from which the same script goes on if it is given a later end (collective).
@@ -359,17 +370,60 @@ class Checkpoint:
             number = self.interruption.agreed(self._state.comm)
             if number:
                 self.end(number)
-            write_checkpoint(self.path, self._state)
+            self._write()
 
     def end(self, number: int) -> NoReturn:
         """Write the state and end the run on a signal of this number (collective)."""
+        self._write()
+        end_run(number, f"the checkpoint {self.path} holds the last step")
+
+    def hand_out(self, loop: object) -> None:
+        """Note that a loop's caller has a converged step, until ``step()`` counts it."""
+        self._loop = loop
+
+    def leave(self, error: BaseException | None, loop: object = None) -> None:
+        """Write the last step that is done where a loop or the ``with`` block is left before its end, if all ranks leave (collective).
+
+        Args:
+            error: by which it is left; None for none.
+            loop: that is left, if it is one which hands out steps; nothing is written where another one has begun since.
+
+        Raises:
+            CheckpointError: if there is no other error and it cannot be written; an earlier file stays.
+        """
+        state, inside = self._state, self._loop is not None
+        at_once = isinstance(error, CheckpointError) or (isinstance(error, KeyboardInterrupt) and not is_agreed(error))
+        if state is None or not (self._unwritten or inside) or (inside and loop not in (None, self._loop)) or at_once:
+            return
+        torn = error is not None and not inside
+        if (torn and not state.back) or sys.is_finalizing():
+            return
+        if not is_agreed(error) and not all_come(state.mesh.comm, LEAVING):
+            logger.warning("%s: rank %d leaves the steps without the others; nothing is written", self.path, state.comm.rank)
+            return
+        self._unwritten, self._loop = True, None
+        try:
+            for hook in state.back if torn else []:
+                hook()
+            state.steps += inside
+            self._write()
+        except UEMError as refused:
+            if error is None:
+                raise
+            logger.warning("where the steps end by %s: %s", type(error).__name__, refused)
+
+    def _write(self) -> None:
+        """Write the state (collective)."""
         if self._state is not None:
             write_checkpoint(self.path, self._state)
-        end_run(number, f"the checkpoint {self.path} holds the last step")
+        self._unwritten, self._loop = False, None
 
     def __enter__(self) -> Checkpoint:
         self.interruption.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.interruption.__exit__(kind, error, trace)
+        try:
+            self.leave(error)
+        finally:
+            self.interruption.__exit__(kind, error, trace)

@@ -109,6 +109,8 @@ class State:
         numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
         collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
         restore: called on all ranks after reading, to go on from them.
+        back: called on all ranks where a run ends by an error within a step, to return to the last step that is done. Without any, a
+            loop of the script's own that ends by an error writes nothing.
         settings: what the run is made with, by name; a file of other settings is refused, unless there are none on either side.
         by_default: names of settings that are what they are where nobody names them; a file that does not know of such is not refused.
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
@@ -120,6 +122,7 @@ class State:
     numbers: dict[str, Any] = field(default_factory=dict)
     collect: list[Callable[[], None]] = field(default_factory=list)
     restore: list[Callable[[], None]] = field(default_factory=list)
+    back: list[Callable[[], None]] = field(default_factory=list)
     steps: int = 0
     settings: dict[str, str] = field(default_factory=dict)
     by_default: set[str] = field(default_factory=set)

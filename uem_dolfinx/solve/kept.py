@@ -83,7 +83,16 @@ def state_of(problem: Any) -> State:
             take_multipliers(problem)
 
     state.collect.append(collect)
+
+    def back() -> None:
+        for pair, motion in zip(problem.interfaces, problem.motions):
+            pair.target.motion = motion
+        problem.restore()
+        for control in (problem.step_control, problem.progress.control):
+            control.give_up()
+
     state.restore.append(restore)
+    state.back.append(back)
     return state
 
 

@@ -42,7 +42,7 @@ class StepControl:
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy = nominal, np.inf, 0, 0.0
-        self._cuts, self._read = 0, False
+        self._cuts, self._read, self._longest_before = 0, False, np.inf
 
     def begin(self, nominal: float) -> None:
         """Go on with steps of another nominal length, and say so if it is another than that of the run that is gone on with."""
@@ -61,20 +61,25 @@ class StepControl:
         Returns:
             Whether to try again: not if the error has nothing to do with the length, or if the step would become too short.
         """
-        if not isinstance(error, MENDABLE):
-            return False
-        if 0.5 * length < SHORTEST_LENGTH * self.nominal:
-            if self._cuts:
+        mendable = isinstance(error, MENDABLE)
+        if not mendable or 0.5 * length < SHORTEST_LENGTH * self.nominal:
+            if mendable and self._cuts:
                 error.amend(f"shorter steps, down to {length:.3g}, are no better")
+            self.give_up()
             return False
         self.longest, self._cuts = 0.5 * length, self._cuts + 1
         logger.info("step %d failed (%s); cut to %.3g", self.number + 1, error, self.longest)
         return True
 
+    def give_up(self) -> None:
+        """After a step that fails for good, make the next one as long as that one was meant to be."""
+        self.longest = self._longest_before
+
     def done(self, iterations: Sequence[object]) -> tuple[int, int]:
         """Count a step that converged with this history; returns its number and how often it had been cut."""
         if len(iterations) - 1 <= EASY:
             self.longest *= 2.0
+        self._longest_before = self.longest
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1
         return self.number, cuts
 
@@ -86,4 +91,4 @@ class StepControl:
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Go on from what ``to_checkpoint`` returned; other numbers may stand beside them."""
         self.number, self.longest, self.largest_energy, self.nominal = (kept[name] for name in self.to_checkpoint())
-        self._read = True
+        self._read, self._longest_before = True, self.longest

@@ -224,11 +224,14 @@ def between_steps(
     Raises:
         KeyboardInterrupt: after Ctrl-C, with the last committed state in the problem and in the checkpoint.
         SystemExit: likewise with status 143 after SIGTERM.
-        CheckpointError: if the checkpoint cannot be written.
+        CheckpointError: if the checkpoint cannot be written. On any other error, and where the caller leaves the loop, the last
+            committed state is in it, too.
     """
     told = comm.bcast(logger.isEnabledFor(logging.INFO))
     outer = progress.interruption, progress.end
     progress.interruption = Interruption() if checkpoint is None else checkpoint.interruption
+    #: this loop, for the checkpoint
+    loop = object()
     if checkpoint is not None:
         progress.end = checkpoint.end
     try:
@@ -238,6 +241,8 @@ def between_steps(
                     if told:
                         logger.info("%s", step.summary(contacts))
                     progress.inside = True
+                    if checkpoint is not None:
+                        checkpoint.hand_out(loop)
                     yield step
                     progress.inside = False
                     if checkpoint is None:
@@ -248,5 +253,9 @@ def between_steps(
                     checkpoint.finish()
             except InterruptedStepError as interrupted:
                 progress.end(interrupted.number)
+    except BaseException as error:
+        if checkpoint is not None:
+            checkpoint.leave(error, loop)
+        raise
     finally:
         (progress.interruption, progress.end), progress.inside = outer, False
