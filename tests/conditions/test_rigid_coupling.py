@@ -322,6 +322,27 @@ def test_a_block_that_strikes():
 # -- what is refused -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_a_number_is_no_vector(cell):
+    """A single number has no direction: not as a number, a Constant or a function's value, unless it is 0 or there is one component."""
+    b = Bar(cell)
+    for kind in ("number", "constant", "function"):
+        for what in ("force", "moment"):
+
+            def solve(kind=kind, what=what):
+                value = {"number": 2.0, "constant": fem.Constant(b.scene.mesh, 2.0), "function": lambda _: 2.0}[kind]
+                b.problem(uem.RigidCoupling(b.right, b.point, **{what: value})).solve()
+
+            if what == "moment" and b.k == 1:
+                solve()
+            else:
+                refused(uem.InputError, (what, f"{b.g} finite numbers", "no direction"), solve)
+    b.problem(uem.RigidCoupling(b.right, b.point, force=0.0, moment=np.ones(b.k))).solve()
+    refused(
+        uem.InputError, ("equations[0]", "no direction"), lambda: b.problem(equations=[uem.periodic(b.right, b.left, jump=0.1)])
+    )
+
+
 def test_what_is_refused():
     b = Bar()
     shared = [uem.RigidCoupling(b.right, b.point), uem.RigidCoupling(b.right, b.point)]

@@ -244,8 +244,8 @@ def periodic(
         map: takes places ``(n, gdim)`` of the follower to those of the leader; None shifts them by the distance of the surfaces, or, with
             a ``turn``, turns them back about the origin.
         turn: rotation ``R (gdim, gdim)`` of the components; None leaves them.
-        jump: a number for all components, or numbers ``(gdim,)``, a ``fem.Constant`` of such, or a function of the load factor or time that
-            returns such. Followed as ``b`` of ``Equation``.
+        jump: a vector ``(gdim,)``, one number for a scalar field; numbers, a ``fem.Constant`` or a function of the load factor or time
+            that returns them. Followed as ``b`` of ``Equation``.
 
     Returns:
         What ``UnitedProblem(..., equations=[...])`` takes.
@@ -286,17 +286,19 @@ def checked_value(what: str, value: Any, size: int | None) -> Any:
 
 
 def values_of(what: str, value: Any, size: int | None) -> Array:
-    """Numbers of a right-hand side: ``(size,)``, one number stands for all.
+    """Numbers of a right-hand side: ``(size,)``; a single 0 stands for a vector of zeros.
 
     Raises:
         InputTypeError, InputError: if they are no finite numbers, or more or less of them.
     """
-    words = "a finite number" if size == 1 else f"a finite number, or {size or '2 or 3'} of them"
+    words = "a finite number" if size == 1 else f"{size or '2 or 3'} finite numbers, one for each component"
+    held = isinstance(value, fem.Constant)
     try:
-        array = np.array(value.value if isinstance(value, fem.Constant) else value, dtype=float, ndmin=1)
+        array = np.array(value.value if held else value, dtype=float, ndmin=1)
     except (TypeError, ValueError):
         raise InputTypeError(given.sentence(what, value, f"{words}, a Constant, or a function of the load factor")) from None
-    sizes = (1, size) if size else (1, 2, 3)
-    if array.ndim != 1 or len(array) not in sizes or not np.isfinite(array).all():
-        raise InputError(given.sentence(what, value, words))
-    return np.broadcast_to(array, (size,)) if size else array
+    zero = not held and len(array) == 1 and not array.any()
+    if array.ndim != 1 or not (len(array) in ((size,) if size else (1, 2, 3)) or zero) or not np.isfinite(array).all():
+        remedy = "a single number has no direction" if array.shape == (1,) and np.isfinite(array[0]) else ""
+        raise InputError(given.sentence(what, value.value if held else value, words, remedy))
+    return np.zeros(size) if zero and size else array

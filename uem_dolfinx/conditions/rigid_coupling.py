@@ -35,8 +35,8 @@ class RigidCoupling:
     Args:
         where: tag of facets, of cells or of anything with nodes that are not on one line.
         point: in the drawing ``(gdim,)``; no node need be there.
-        force: at the point ``(gdim,)``; numbers, a ``fem.Constant`` or a function of the load factor or time.
-        moment: about the point, a number in the plane, ``(3,)`` in space; likewise.
+        force: at the point, a vector ``(gdim,)``; numbers, a ``fem.Constant`` or a function of the load factor or time.
+        moment: about the point, a number in the plane, a vector ``(3,)`` in space; likewise.
         motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
             None where it is free: ``(u_x, u_y, angle)`` in the plane, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in space, with r the rotation
             vector in radians. Numbers are approached along with the Dirichlet values. None leaves all free.
