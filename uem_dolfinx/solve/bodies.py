@@ -23,6 +23,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.tangent import Inversions, Tangent
 
 if TYPE_CHECKING:
@@ -202,6 +203,10 @@ class Bodies:
             of_points = FORCE_ROUNDING * np.linalg.norm([one.rounding() for one in self._added])
             of_displacement = float(np.hypot(of_displacement, of_points))
         return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
+
+    def rounding_of_displacement(self) -> float:
+        """Norm of the forces of the displacement that its rounding, and that of its gradient, can make (collective)."""
+        return first(np.maximum(self.rounding(np.zeros(0, np.int32)), self.strain_rounding()))
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
         """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""

@@ -66,12 +66,12 @@ class FloatingBodies:
     Args:
         bodies: without contact.
         pairs: of all contacts.
-        linear: equations of users, None for none; without contacts and these nothing is done about bodies that float.
+        linear: equations of users, None for none.
         far_apart: contacts that are not looked at until bodies come near; None if all are.
 
     Attributes:
-        rigid: rigid motions of the bodies; None without contacts.
-        motions: those of the present step, None if conditions and inertia hold all bodies.
+        rigid: rigid motions of the bodies; None of a scalar field.
+        motions: those of the present step, None if conditions, springs and inertia hold all bodies.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class FloatingBodies:
         self.rigid: RigidMotions | None = None
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
-        if config.moves and (pairs or linear is not None):
+        if config.moves:
             free, finite = bodies.free[: config.n_owned], not bodies.tangent.linear
             self.rigid = RigidMotions(config, free, finite)
             self._at_rest = self._floating(self.rigid)
@@ -93,6 +93,8 @@ class FloatingBodies:
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
+        #: Sum of the forces that the step began with; None before they were known.
+        self._loads: float | None = None
         #: Likewise with those that friction alone resists, where all contactors slip.
         self._sliding: Array = np.zeros((0, 0))
 
@@ -110,7 +112,7 @@ class FloatingBodies:
         bodies = self._bodies
         if not motions.any_open():
             return None
-        if not self._has_springs:
+        if (self._pairs or self._linear is not None) and not self._has_springs:
             return motions
         bodies.initial_stiffness()
         motions.ask_stiffness(bodies.tangent.K)
@@ -128,6 +130,7 @@ class FloatingBodies:
             self._far_apart.begin_step(self.motions is not None)
         if self.motions is not None:
             self.motions.forget_supports()
+            self._loads = None
             self._fall(place, freely=True)
 
     def begin_motion(self) -> None:
@@ -331,7 +334,9 @@ class FloatingBodies:
         force, scale = motions.forces(residual)
         f = basis @ (basis.T @ force)
         size = np.linalg.norm(f.reshape(-1, n), axis=1)
-        if size.max() <= LOADED * scale:
+        self._loads = scale if self._loads is None else self._loads
+        # where all bodies float, what equilibrium leaves is rounding, and small beside the loads that the step began with
+        if size.max() <= max(LOADED * max(scale, self._loads), self._bodies.rounding_of_displacement()):
             return None, False
         pairs = self._looked_at()
         ahead = [pair.approach for pair in pairs]

@@ -18,8 +18,9 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
-from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.norms import Norm, first, ratio, worst
+from uem_dolfinx.solve.unheld import unheld
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
@@ -235,6 +236,7 @@ def solve_united(
         The history; its last entry is the converged state.
 
     Raises:
+        FloatingBodyError: if the residual stays and what is solved for grows, since nothing holds a body or a field.
         ConvergenceError: after ``max_iterations``, or where an active set does not settle, with the history.
         PrecisionError: if rounding hides whether the forces are in equilibrium.
         NotFiniteError: if the residual is NaN or infinite at the start of the step.
@@ -244,6 +246,7 @@ def solve_united(
     start: Norm = 0.0
     norm: Norm = 0.0
     left: Norm = 0.0
+    within: Norm = np.inf
     stalled: int | Ints = 0
     norms, length = bodies.unknowns.norms, 1.0
 
@@ -252,8 +255,14 @@ def solve_united(
         more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
         return np.maximum(np.maximum(rounding, left), more)
 
+    def bounded(rounding: Norm) -> Norm:
+        # of a displacement no larger than the model, than at the start, or than conditions lead it: bodies that fly excuse nothing
+        if not np.any(rounding > within):
+            return rounding
+        return np.minimum(rounding, np.maximum(within, FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()))
+
     def in_equilibrium(norm: Norm, scale: Norm, rounding: Norm) -> bool:
-        return bool(np.all(norm <= np.maximum(rtol * np.maximum(scale, start), rounding_of_all(rounding, 1))))
+        return bool(np.all(norm <= np.maximum(rtol * np.maximum(scale, start), bounded(rounding_of_all(rounding, 1)))))
 
     method.place()
     if not bodies.assemble():
@@ -266,7 +275,7 @@ def solve_united(
             state = method.assemble_constraints(in_equilibrium)
         if k == 0:
             # a displacement that comes back to nothing keeps the rounding of what it was
-            start, left = state.norm, np.minimum(state.rounding, rtol * forces_before)
+            start, left, within = state.norm, np.minimum(state.rounding, rtol * forces_before), state.rounding
         forces = np.maximum(state.scale, start)
         if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * first(forces)):
             bodies.assemble()
@@ -278,23 +287,29 @@ def solve_united(
         if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
             # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
             real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
-            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), rounding)
+            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding))
             small = np.where((small < norm) & (norm <= rounding), excused, small)
         converged = steady and state.closed and bool(np.all(norm <= small))
         hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
-        if converged or hidden or k == max_iterations:
+        flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding)) < norm) & (norm <= rounding))
+        if converged or hidden or flown.any() or k == max_iterations:
             history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
                 return history
             if hidden:
                 raise _no_precision(*worst(norm, rounding, real))
+            if flown.any():
+                error = unheld(bodies, int(flown.argmax()), history[-1].residual)
+                # a shorter step may keep bodies in their contacts
+                raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
             break
         # the residual that a step begins with knows nothing of conditions and gaps
         relative = ratio(norm, forces) if k > 0 else 1.0
         with _told(history):
             problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * first(forces), relative, check_signals)
         driving = np.maximum(norms(problem.rhs), norms(step.rhs))
+        within = np.maximum(within, LARGEST_ROUNDING * driving) if k == 0 else within
         residual = ratio(driving, np.maximum(forces, driving if k == 0 else 0.0))
         changed = state.changed or exchanges > 0
         history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
