@@ -5,10 +5,13 @@ Every check names the thing, its value, what was expected and, where that is not
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Callable, Collection, Sequence
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache, wraps
+from typing import Any, ClassVar
 
 from mpi4py import MPI
 
@@ -21,6 +24,9 @@ from uem_dolfinx.errors import InputError, InputTypeError
 #: Values are shown with so many letters.
 #: [format; letters; -]
 LONGEST = 80
+#: What the names of the package's modules begin with.
+#: [format; -; -]
+PACKAGE = "uem_dolfinx."
 
 
 @dataclass(frozen=True)
@@ -191,3 +197,85 @@ def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
                     f"{where}: {what} = {first} on rank 0, but {other} on rank {rank}: expected the same on all ranks; "
                     "compute it alike on all of them, or send it to all"
                 )
+
+
+class Sealed:
+    """A public object that, once it is made, refuses attributes that there are not, and arguments that count no more.
+
+    Attributes:
+        SETTABLE: arguments that may be set anew at any time, each with what checks a value and returns it, None for nothing.
+    """
+
+    SETTABLE: ClassVar[Mapping[str, Callable[[Any], Any] | None]] = {}
+    _made = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Have the outermost ``__init__`` of an object seal it."""
+        super().__init_subclass__(**options)
+        init = cls.__dict__.get("__init__")
+        if init is None:
+            return
+
+        @wraps(init)
+        def making(self: Any, *args: Any, **named: Any) -> None:
+            init(self, *args, **named)
+            if type(self).__init__ is making:
+                self._made = True
+
+        cls.__init__ = making  # type: ignore[method-assign]
+
+    @property
+    def _called(self) -> str:
+        """What it is called in messages."""
+        own, kind = self.__dict__.get("name"), type(self).__name__
+        return f"the {kind} {own!r}" if isinstance(own, str) else f"a {kind}"
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether arguments may still be set, as nothing has been made of it."""
+        return False
+
+    def _too_late(self) -> str:
+        """Why arguments count no more, and what to do."""
+        kind, more = type(self).__name__, " or ".join(self.SETTABLE)
+        whole = "" if kind == "UnitedProblem" else ", and a new problem of it"
+        return f"counts only as an argument: make a new {kind}{whole}" + (f"; only {more} may be set" if more else "")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute.
+
+        Raises:
+            InputError: for one that there is not, or one that comes too late.
+        """
+        # the package's own lines set what they need
+        if self._made and not name.startswith("_") and not sys._getframe(1).f_globals.get("__name__", "").startswith(PACKAGE):
+            if name in self.SETTABLE:
+                check = self.SETTABLE[name]
+                value = value if check is None else check(value)
+            else:
+                self._refuse(name, value)
+        super().__setattr__(name, value)
+
+    def _refuse(self, name: str, value: Any) -> None:
+        """Raise where an attribute is none, is computed, or comes too late."""
+        kind: Any = type(self)
+        arguments = arguments_of(kind)
+        there = inspect.getattr_static(self, name, None)
+        computed = isinstance(there, property) and there.fset is None
+        if name in arguments and not self._is_open and not computed:
+            raise InputError(f"{self._called}: {name} = {shown(value)} {self._too_late()}")
+        # classes that others derive are their own
+        if computed or (there is None and name not in self.__dict__ and kind.__module__.startswith(PACKAGE)):
+            known = sorted({*self.SETTABLE, *(n for n in arguments if self._is_open and n in self.__dict__)})
+            hint = did_you_mean(name, known, f"expected one of {', '.join(known)}" if known else "expected none to be set")
+            raise InputError(f"{self._called} has no '{name}' to be set: {hint}")
+
+
+@cache
+def arguments_of(kind: Any) -> tuple[str, ...]:
+    """Names of the arguments that a class and those that it derives from are made with."""
+    names: dict[str, None] = {}
+    for one in kind.__mro__:
+        if "__init__" in one.__dict__ and one is not object:
+            names |= dict.fromkeys(list(inspect.signature(one.__dict__["__init__"]).parameters)[1:])
+    return tuple(names)

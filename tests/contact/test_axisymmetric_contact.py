@@ -277,7 +277,7 @@ def test_checkpoints(coupling, folder):
     whole, problem, _, _ = make()
     list(uem.load_steps(problem, 3))
     for step in uem.load_steps(make()[1], 3, checkpoint=uem.Checkpoint(path, every=1)):
-        if step.number == 2:
+        if step.number == 1:
             break
     s, problem, contact, law = make()
     steps = list(uem.load_steps(problem, 3, checkpoint=uem.Checkpoint(path, every=1)))

@@ -16,6 +16,7 @@ import pytest
 from dolfinx import fem, mesh
 from helpers import raised
 from ramp_scenes import RAMPS
+from restart_scenes import Killed
 from resting_scenes import Bar
 from results_scenes import pressed, rows, same_series, series, strains
 
@@ -195,7 +196,7 @@ def test_made_before_the_checkpoint_is_read(folder):
     late = RAMPS["ramped"](COMM)
     writer = uem.ResultsWriter(folder / "out", late.problem, fields={"u2": late.problem.u[1]}, resume=True)
     late.calls[0][0]()
-    steps = late.steps(uem.Checkpoint(folder / "run"))
+    steps = late.steps(Killed(folder / "run"))
     step = next(steps)
     with pytest.raises(uem.CheckpointError, match="call checkpoint.begin"):
         writer.write(step)

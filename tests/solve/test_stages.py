@@ -10,7 +10,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from helpers import M, blocks, clamp, highest, linear, modulus, refused, slow
-from restart_scenes import COMM, bits
+from restart_scenes import COMM, Killed, bits
 
 import uem_dolfinx as uem
 from uem_dolfinx import forms
@@ -111,7 +111,7 @@ def test_interrupted_is_uninterrupted(stops, folder):
 
     def run(name, stop=None):
         column, made = Column(friction=0.1), []
-        checkpoint = uem.Checkpoint(folder / f"{name}.uem", every=1)
+        checkpoint = Killed(folder / f"{name}.uem", every=1)
         checkpoint.begin(column.problem.state())
         steps = [*column.steps(), uem.Step("rough", 2, friction={column.joint: 0.3}, offset={column.joint: 0.01})]
         with uem.HistoryWriter(folder / f"{name}.csv", column.problem, resume=True) as history:
@@ -146,7 +146,7 @@ def test_a_list_that_is_left_is_left_again(stop, folder):
 
     def run(name, stop=None):
         column, made = Column(friction=0.1), []
-        checkpoint = uem.Checkpoint(folder / name, every=1)
+        checkpoint = Killed(folder / name, every=1)
         for steps in (
             column.steps()[:3],
             [uem.Step("on", 2, offset={column.joint: -0.01}), uem.Step("rough", 2, friction={column.joint: 0.3})],
@@ -193,7 +193,7 @@ def test_equations_go_on(folder):
         squeezed, made = uem.Equation([((0.5, 1.0), (0.0, 1.0)), ((0.5, 0.5), (0.0, -1.0))], -0.004), []
         column = Column(equations=[squeezed])
         steps = [column.steps()[0], uem.Step("let go", 2, bcs=column.held("bottom", "sides"))]
-        for step in uem.load_steps(column.problem, steps, checkpoint=uem.Checkpoint(folder / name, every=1)):
+        for step in uem.load_steps(column.problem, steps, checkpoint=Killed(folder / name, every=1)):
             made.append(column.forces())
             if step.time == stop:
                 break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, reduced
 
 
-class PointLoad:
+class PointLoad(given.Sealed):
     """A force at a node, or at each of several.
 
         uem.PointLoad(tags["tip"], (0.0, -3.0))
@@ -36,6 +36,8 @@ class PointLoad:
             what is no tag of points.
     """
 
+    SETTABLE: ClassVar = {"force": None}
+
     def __init__(self, at: Any, force: npt.ArrayLike | fem.Constant):
         self.at, self.force = at, force
         given.vector("force", self._values)
@@ -49,7 +51,7 @@ class PointLoad:
         return given.vector("the force of a PointLoad", self._values, gdim), None
 
 
-class PointSpring:
+class PointSpring(given.Sealed):
     """A linear spring between a node, or each of several, and where it was drawn: the force on the node is ``-k u``.
 
         uem.PointSpring(tags["foot"], 1e4)              # alike in all directions

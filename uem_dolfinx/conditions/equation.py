@@ -75,7 +75,7 @@ class LinearEquations(Protocol):
         """How many different right-hand sides there are."""
 
 
-class Equation:
+class Equation(given.Sealed):
     """A linear equation between displacements of nodes: ``sum_k inner(c_k, u(place_k)) = b``.
 
         uem.Equation([(tags["tip"], (0, 1)), ((0.0, 1.0), (0, -2))])                       # u_y of the tip is twice that at (0, 1)
@@ -137,7 +137,7 @@ class Equation:
         return _of_terms(np.zeros(len(own), dtype=np.int64), node, c)
 
 
-class Periodic:
+class Periodic(given.Sealed):
     """Nodes of a surface that move as their images do: what ``periodic`` makes."""
 
     firm = False

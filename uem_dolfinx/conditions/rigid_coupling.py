@@ -21,7 +21,7 @@ from uem_dolfinx.geometry.tags import Part, name_of
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 
-class RigidCoupling:
+class RigidCoupling(given.Sealed):
     """Nodes of a surface or a body that move with a point as one rigid body, or that share what acts at the point.
 
         uem.RigidCoupling(tags["end"], (10.0, 0.5), force=(0.0, -3.0), moment=12.0)
@@ -100,6 +100,10 @@ class RigidCoupling:
             )
         #: The ``dynamics.added_mass.AddedMass`` that they are in a problem; None without any.
         self.added: Any = None
+        #: Rotation that was known last, which tells the number of turns ``(n_turns,)``.
+        self.turns: Array = np.zeros(self._sizes[1])
+        #: Force and moment that the prescribed motion needs, as read last.
+        self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
         self._set: RigidSet | None = None
         self._asked: dict[Any, Any] = {}
 
@@ -124,10 +128,6 @@ class RigidCoupling:
                 f"the RigidCoupling of '{self.name}': its {self._set.count} nodes lie on a line or in one place, and do not tell how it "
                 "turns: expected at least two nodes in the plane, three that are not on a line in space"
             )
-        #: Rotation that was known last, which tells the number of turns ``(n_turns,)``.
-        self.turns: Array = np.zeros(self._sizes[1])
-        #: Force and moment that the prescribed motion needs, as read last.
-        self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
         return self._set
 
     @property
@@ -212,7 +212,8 @@ class RigidCoupling:
     @property
     def reaction(self) -> tuple[Array, Any]:
         """Force ``(gdim,)`` and moment about the point with which the prescribed motion acts on the part; zero where it is free."""
-        force, moment = self.reactions
+        # in no problem there is none
+        _, (force, moment) = self.nodes, self.reactions
         return force, float(moment[0]) if len(moment) == 1 else moment
 
     def read_reactions(self, forces: Array) -> None:

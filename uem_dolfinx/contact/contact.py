@@ -51,16 +51,11 @@ if TYPE_CHECKING:
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
 MAX_PENETRATION = 0.05
 BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
-#: What there is to be set; the first two are the contact's own.
-SETTINGS = (
-    "taken", "config", "contactor", "target", "coupling", "sliding", "normals", "max_penetration", "thickness", "chords", "friction",
-    "measure", "name", "tied", "offset", "adjust", "heat",
-)  # fmt: skip
 REACH = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
-class Contact(WatchedContact):
+class Contact(WatchedContact, given.Sealed):
     """A contactor surface that may touch a target.
 
     Args:
@@ -104,6 +99,7 @@ class Contact(WatchedContact):
             a tag tells which they are. Also where an attribute is set that there is not, or that the problem would not take any more.
     """
 
+    SETTABLE = dict.fromkeys(("friction", "offset"))
     #: Whether it is one of those that a general contact consists of.
     of_all_surfaces = False
     #: What friction by pairs of surfaces it has, as one of those.
@@ -174,17 +170,19 @@ class Contact(WatchedContact):
         self._offsets: Offsets | None = None
         self._fields: dict[str, fem.Function] = {}
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_"):
-            called = f"contact '{self.name}'" if "name" in self.__dict__ else "a Contact"
-            if name not in SETTINGS:
-                raise InputError(f"{called} has no '{name}' to be set: expected one of {', '.join(SETTINGS[2:])}")
-            if self.__dict__.get("taken") and name not in ("taken", "friction", "offset"):
-                raise InputError(
-                    f"{called}: {name} = {given.shown(value)} comes too late, its problem has been made: make a new Contact, and a new "
-                    "problem of it; only friction and offset may be set between steps"
-                )
-        super().__setattr__(name, value)
+    @property
+    def _called(self) -> str:
+        return f"contact '{self.name}'"
+
+    @property
+    def _is_open(self) -> bool:
+        return not self.taken
+
+    def _too_late(self) -> str:
+        return (
+            "comes too late, its problem has been made: make a new Contact, and a new problem of it; only friction and offset may be "
+            "set between steps"
+        )
 
     def __repr__(self) -> str:
         """Its name, coupling and sliding, and friction and a tie if there is any."""

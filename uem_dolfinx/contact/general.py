@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.geometry.skin import Apart, Skin
 
 
-class GeneralContact:
+class GeneralContact(given.Sealed):
     """Every surface against every other, and against rigid ones, by one declaration.
 
     Surfaces are found from the mesh; what does not come near anything costs next to nothing. Between two bodies the nodes of the one

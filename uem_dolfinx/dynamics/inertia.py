@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 DynamicsMemory = tuple[float, float, float, Array, list[Array], list[list[Array]]]
 
 
-class Dynamics:
+class Dynamics(given.Sealed):
     """What a problem needs to move in time; hand it to ``UnitedProblem`` and step by ``time_steps``.
 
     Args:

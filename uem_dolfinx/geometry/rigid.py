@@ -105,7 +105,7 @@ class RigidProjection:
         return self.shape_operator[which]
 
 
-class RigidSurface:
+class RigidSurface(given.Sealed):
     """Rigid target of any shape, still or moved as a rigid body.
 
     The gap is ``distance / |gradient|``, which is the signed distance wherever it is zero; a gradient of constant direction

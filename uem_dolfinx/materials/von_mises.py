@@ -41,7 +41,7 @@ SIMPLEX_DEGREES = {1: (1, 1), 2: (2, 2)}
 TENSOR_DEGREES = {1: (2, 0), 2: (4, 2)}
 
 
-class VonMises:
+class VonMises(given.Sealed):
     """Elasto-plasticity with the yield surface of von Mises, associated flow, isotropic and kinematic hardening.
 
         S = C : (E - E_p),    q(S - 2/3 kinematic_hardening E_p) <= yield_stress + hardening * peeq

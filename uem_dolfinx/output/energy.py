@@ -50,7 +50,7 @@ class Energies:
     defect: float
 
 
-class EnergyBook(Closing):
+class EnergyBook(Closing, given.Sealed):
     """Book of energies and momenta, one row per time step, as a table in a CSV file if wanted.
 
     Columns: those of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... that the

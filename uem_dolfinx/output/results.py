@@ -30,7 +30,7 @@ from uem_dolfinx.solve.time_steps import TimeStep
 ENDINGS = ("scalars", "vectors")
 
 
-class HistoryWriter(Closing):
+class HistoryWriter(Closing, given.Sealed):
     """CSV file with one row per load step or time step, complete after every row.
 
     Columns: ``factor`` or ``time``, ``step`` (how many steps the problem has done), ``newton_iterations``, and for every contact
@@ -132,7 +132,7 @@ class HistoryWriter(Closing):
         self._pairs.close()
 
 
-class ResultsWriter(Closing):
+class ResultsWriter(Closing, given.Sealed):
     """Time series of everything there is to see: fields for ParaView and the history.
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` as ``HistoryWriter`` does, ``PATH_pairs.csv`` too, and where

@@ -27,7 +27,7 @@ VTK_TYPES = {
 }  # fmt: skip
 
 
-class SurfaceWriter(Closing):
+class SurfaceWriter(Closing, given.Sealed):
     """Time series of the contactors' surfaces alone, on which pressures are seen from all sides.
 
     Writes ``PATH.pvd``, complete after every step, which names the files ``PATH_surfaces/STEP_CONTACT_RANK.vtu`` that every rank writes of

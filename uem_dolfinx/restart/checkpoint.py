@@ -269,7 +269,7 @@ def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
         )
 
 
-class Checkpoint:
+class Checkpoint(given.Sealed):
     """Keeps a run's state in a file, so that the same script goes on where it was killed.
 
     As a context manager, and while load or time steps run with it, it takes care of Ctrl-C and of SIGTERM, which batch systems send

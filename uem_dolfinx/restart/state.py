@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.geometry.rigid import Motion
@@ -98,7 +98,7 @@ class ContactEntry:
 
 
 @dataclass
-class State:
+class State(given.Sealed):
     """What a run goes on from; the order of the mesh's input is found when it is first written or read, and kept.
 
     Attributes:
@@ -116,6 +116,10 @@ class State:
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """
 
+    SETTABLE: ClassVar = dict.fromkeys(
+        ("functions", "contacts", "numbers", "collect", "restore", "back", "steps", "settings", "by_default")
+    )
+
     mesh: Any
     functions: dict[str, fem.Function] = field(default_factory=dict)
     contacts: list[Contact] = field(default_factory=list)
@@ -126,6 +130,10 @@ class State:
     steps: int = 0
     settings: dict[str, str] = field(default_factory=dict)
     by_default: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        """Seal it."""
+        self._made = True
 
     @property
     def comm(self) -> MPI.Comm:

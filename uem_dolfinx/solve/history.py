@@ -32,7 +32,7 @@ from uem_dolfinx.solve.records import Record, Records
 from uem_dolfinx.solve.sweep import Sweep
 
 
-class History:
+class History(given.Sealed):
     """All steps that a problem takes while it is recorded, see :func:`recording`.
 
     Args:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 ACCURACY = given.between(0.0, 1.0)
 
 
-class UnitedProblem:
+class UnitedProblem(given.Sealed):
     """Bodies in contact by the United Elements Method, in statics, or in dynamics where there is inertia.
 
     Solves ``F(u; v) = 0`` with the contactors of every contact united to their targets:
@@ -102,6 +102,8 @@ class UnitedProblem:
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM meanwhile.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
+
+    SETTABLE = {"load": check_load} | dict.fromkeys(("rtol", "max_iterations", "line_search", "verbose"))
 
     @end_together(lambda self, F, u, **options: u.function_space.mesh.comm if isinstance(u, fem.Function) else None)
     def __init__(
@@ -153,8 +155,8 @@ class UnitedProblem:
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, equations, **others)
             self.materials = check_materials(materials, F, u, displacement)
-            still = dynamics is None
-            self.dynamics = given.kind("dynamics", dynamics, still or isinstance(dynamics, Dynamics), "Dynamics, or None")
+            there = dynamics is None or isinstance(dynamics, Dynamics)
+            self.dynamics = given.kind("dynamics", dynamics, there, "Dynamics, or None")
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
@@ -222,8 +224,7 @@ class UnitedProblem:
         scalar = [ScalarTie(self.config, tie, free) for tie in ties] if ties else []
         self._of_users = [*scalar, *equations], couplings, [tie.followed for tie in scalar]
         self.unite(self.load, clock.get("at", 0.0))
-        if self.linear is not None:
-            options["linear"] = self.linear
+        options |= {} if self.linear is None else {"linear": self.linear}
         #: The ``solve.stages.Stage`` that the problem is in; None outside of those.
         self.stage: Any = None
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
@@ -257,8 +258,7 @@ class UnitedProblem:
 
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""
-        config = self.config
-        dofmap = self.u.function_space.dofmap
+        config, dofmap = self.config, self.u.function_space.dofmap
         size = f"{dofmap.index_map_bs * dofmap.index_map.size_global} unknowns in {config.gdim}D"
         kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
         names = ", ".join(map(repr, [contact.name for contact in [*self.ties, *self.contacts]])) or "none"

@@ -24,7 +24,7 @@ CONDUCTANCE = given.Range("0 or a positive number, infinity, or a function of pr
 SHARE = given.Range("a number from 0 to 1, or None for no heat of friction", lambda x: (x >= 0) & (x <= 1))
 
 
-class Conductance:
+class Conductance(given.Sealed):
     """Heat through a contact: the power ``h (T - T_target)`` per area leaves the contactor and enters the target.
 
     Args:

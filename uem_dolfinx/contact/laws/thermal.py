@@ -12,7 +12,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.conductance import part_number
 
 
-class OfTemperature:
+class OfTemperature(given.Sealed):
     """A coefficient of friction, or another law's first parameter, that is a function of the temperature at the contactors.
 
     The temperature that counts is the mean of the contactor's and of that which it faces on the target; against a rigid surface the mean
