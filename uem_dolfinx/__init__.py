@@ -159,6 +159,11 @@ _LATER = {
 }  # fmt: skip
 
 
+def __dir__() -> list[str]:
+    """The public names, whether their modules have been imported or not."""
+    return sorted([*__all__, *(name for name in globals() if name.startswith("__"))])
+
+
 def __getattr__(name: str) -> object:
     """A public name of a module that has not been imported yet."""
     if name not in _LATER:

@@ -264,8 +264,9 @@ class Sealed:
         computed = isinstance(there, property) and there.fset is None
         if name in arguments and not self._is_open and not computed:
             raise InputError(f"{self._called}: {name} = {shown(value)} {self._too_late()}")
-        # classes that others derive are their own
-        if computed or (there is None and name not in self.__dict__ and kind.__module__.startswith(PACKAGE)):
+        # classes that others derive are their own, and a single letter, which is no misspelt word, is a note of the script's
+        own = name in self.__dict__ or len(name) == 1 or not kind.__module__.startswith(PACKAGE)
+        if computed or (there is None and not own):
             known = sorted({*self.SETTABLE, *(n for n in arguments if self._is_open and n in self.__dict__)})
             hint = did_you_mean(name, known, f"expected one of {', '.join(known)}" if known else "expected none to be set")
             raise InputError(f"{self._called} has no '{name}' to be set: {hint}")

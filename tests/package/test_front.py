@@ -106,6 +106,7 @@ def test_links_of_the_readmes():
 def test_reference():
     assert sorted(uem.__all__, key=str.lower) == sorted(set(uem.__all__), key=str.lower)
     assert all(getattr(uem, name).__doc__ for name in uem.__all__)
+    assert [name for name in dir(uem) if not name.startswith("__")] == sorted(uem.__all__)
 
 
 # -- the first run -----------------------------------------------------------------------------------------------------

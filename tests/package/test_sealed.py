@@ -49,6 +49,15 @@ def test_misspelt(folder):
         assert "misspelt" in str(told.value), name
 
 
+def test_a_note():
+    """A name of one letter is the script's own, unless it is an argument."""
+    b = blocks(COMM, "triangle")
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.05))
+    problem.b = b
+    assert problem.b is b
+    refused(uem.InputError, "make a new UnitedProblem", lambda: setattr(problem, "u", fem.Function(b.V)))
+
+
 LATE = [
     ("problem", "bcs", []), ("problem", "points", []), ("problem", "contacts", []), ("problem", "materials", []), ("problem", "F", None),
     ("problem", "dynamics", None), ("general", "friction", 0.2), ("coupling", "motion", (0, 0, 0)), ("coupling", "force", (0.0, 1.0)),
