@@ -12,7 +12,7 @@ from dolfinx import fem
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.geometry.rigid import RigidSurface
-from uem_dolfinx.solve.checks import set_loads
+from uem_dolfinx.solve.loading import set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
 
 

@@ -1,30 +1,26 @@
-"""What a problem is handed, looked at before anything is made of it: residual, load, Dirichlet conditions and their values.
+"""What a problem is handed, looked at before anything is made of it: residual, Dirichlet conditions and their values.
 
-Each check looks at this rank's part; whoever asks has the ranks agree. Loads are set here, too.
+Each check looks at this rank's part; whoever asks has the ranks agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from ufl.constantvalue import ScalarValue
-from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
+from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
-from uem_dolfinx.parallel import agreed, ask_together
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
@@ -87,61 +83,6 @@ def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
         raise InputError(
             f"{what} are not there for a displacement among other fields: expected a problem of a displacement; {remedy}"
         )
-
-
-def check_load(load: Any) -> Mapping[fem.Constant, Any] | Callable[[float], None] | None:
-    """The load as a function of the factor or the time, or as Constants and their values, each numbers or a function; or None.
-
-    Raises:
-        InputTypeError, InputError: naming what it is instead.
-    """
-    expected = "a scalar Constant, a dictionary of Constants and their values, a function of the load factor or time, or None"
-    if isinstance(load, fem.Constant):
-        if np.shape(load.value) != ():
-            raise InputError(
-                f"load is a Constant of the shape {np.shape(load.value)}: expected {expected}; as load={{constant: value}} it grows to "
-                "this value"
-            )
-        return {load: np.float64(1.0)}
-    if isinstance(load, Mapping):
-        given.kind("load", load, bool(load), expected)
-        for constant, value in load.items():
-            given.kind("a name in load", constant, isinstance(constant, fem.Constant), "a Constant")
-            if not callable(value):
-                _fitting(constant, value)
-        return {c: value if callable(value) else np.asarray(value, dtype=float)[()] for c, value in load.items()}
-    if load is not None and (isinstance(load, Expr) or not callable(load)):
-        raise InputTypeError(given.sentence("load", load, expected))
-    return load
-
-
-def set_loads(comm: MPI.Comm, load: Any, at: float) -> None:
-    """Set what a problem's ``load`` sets at a load factor or time; None sets nothing (collective).
-
-    Raises:
-        InputError, InputTypeError: where the value of a Constant is no finite number, or numbers of another shape.
-        UserFunctionError: if a function raises.
-    """
-    if isinstance(load, Mapping):
-        for constant, value in load.items():
-            now = ask_together(comm, f"the load of a Constant at {at:.6g}", value, at) if callable(value) else value * at
-            with agreed(comm):
-                constant.value = _fitting(constant, now)
-    elif load is not None:
-        ask_together(comm, f"load({at:.6g})", load, at)
-
-
-def _fitting(constant: fem.Constant, value: Any) -> Any:
-    """The value as an array of the Constant's shape."""
-    shape = np.shape(constant.value)
-    words = f"finite numbers of the shape {shape}" if shape else "a finite number"
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputTypeError(given.sentence("the value of a Constant in load", value, words)) from None
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(given.sentence("the value of a Constant in load", value, words))
-    return array
 
 
 def check_conditions(config: Configuration, bcs: Any) -> list[Any]:

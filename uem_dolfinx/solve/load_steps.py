@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.errors import ConvergenceError, InputError, UEMError, UserFunctionError
+from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.load_step import LoadStep
+from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
@@ -122,11 +122,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         except UEMError as error:
             if progress.control.shorten(way.tried, error):
                 continue
-            # where it is the load's function that fails, it may fail here, too
-            with suppress(UserFunctionError):
-                problem.set_load(done)
-            # the targets that the load moves are back, too
-            problem.restore()
+            take_back(problem, done)
             if unstable is not None:
                 error.amend(
                     f"at the load factor {unstable:.4g} the equilibrium was unstable, as the united matrix had negative eigenvalues: the "

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import UEMError
+from uem_dolfinx.errors import UEMError, UserFunctionError
 from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.loading import bring_load, forget_load
 from uem_dolfinx.solve.newton import Iteration
 
 
@@ -64,6 +68,41 @@ def move_targets(problem: Any, motions: list[Motion | None]) -> None:
     for pair, motion in zip(problem.interfaces, motions):
         if pair.target.motion is not motion:
             pair.target.motion = motion
+
+
+def take_back(problem: Any, at: float) -> None:
+    """Return to the committed state after a failed step, with the loads of its load factor or time (collective)."""
+    # where it is the load's function that fails, it may fail here, too
+    with suppress(UserFunctionError):
+        bring_load(problem, at)
+    forget_load(problem)
+    # the targets that the load moves are back, too
+    problem.restore()
+
+
+def take_alone(problem: Any, start: Array | None, fraction: float) -> list[Iteration]:
+    """Take one step with these arguments of ``UnitedProblem.attempt``, under loads of the factor or the present time (collective).
+
+    Loads stay as they are where the ramp has a start of its own, and where they have been set since the last step.
+    """
+    progress, dynamics = problem.progress, problem.dynamics
+    with agreed(problem.comm):
+        fraction = given.number("fraction", fraction)
+    before, now = (progress.factor, fraction) if dynamics is None else (dynamics.time, dynamics.time)
+    known = getattr(problem.load, "at", None) if problem.set_at is None else problem.set_at
+    own = start is None and known is None
+    try:
+        if own:
+            bring_load(problem, now)
+        history: list[Iteration] = problem.attempt(start=start, fraction=fraction)
+    except UEMError:
+        if own:
+            take_back(problem, before)
+        raise
+    if dynamics is None and start is None:
+        progress.factor = now if known is None else known
+    problem.commit()
+    return history
 
 
 def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, bool]) -> list[Iteration]:

@@ -29,14 +29,8 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
-from uem_dolfinx.solve.checks import (
-    check_conditions,
-    check_load,
-    check_materials,
-    check_residual,
-    check_values,
-    set_loads,
-)
+from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values
+from uem_dolfinx.solve.loading import check_load, forget_load, set_by_load, set_loads
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
 from uem_dolfinx.solve.passages import refuse_passages
@@ -243,6 +237,8 @@ class UnitedProblem(given.Sealed):
 
         self._before = Memory.of(self)
         self.led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
+        #: Load factor or time that loads have been set to for the next step; None before that.
+        self.set_at: float | None = None
         #: What keeps all steps for gradients; None for nothing.
         self.history: Any = None
         for contact in self.contacts:
@@ -280,6 +276,7 @@ class UnitedProblem(given.Sealed):
 
         ``known`` says whether the committed state has been reached with them; else the next step begins with them.
         """
+        self.set_at = None if known else at
         if self.stage is not None:
             self.stage.take_load(at)
         set_loads(self.comm, self.load, at)
@@ -291,22 +288,21 @@ class UnitedProblem(given.Sealed):
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
 
-        In the body of a loop over ``load_steps`` or ``time_steps`` it is equilibrium again at the step's load factor or time, under
-        loads, Dirichlet values and fields as they are now: the step is taken once more from the state that it began with, and what
-        comes of it takes its place. Histories of friction and plasticity, and velocities, are those of one step, however often it
-        is taken.
+        The load factor is 1, in dynamics the time the present one, for ``load`` and all functions of equations, couplings, preloads and
+        friction. In the body of a loop over ``load_steps`` or ``time_steps`` the step is taken once more from the state that it began with
+        and replaced, at its load factor or time, under loads, Dirichlet values and fields as they are now. Histories of friction and
+        plasticity, and velocities, are those of one step, however often it is taken.
 
-        Arguments, return value and errors are those of :meth:`attempt`; a step that fails when it is taken again stays what it was.
+        Arguments, return value and errors are those of :meth:`attempt`, with loads of the factor ``fraction``; they stay as they are with
+        a ``start``, or if ``set_load`` has set them since the last step. A step that fails when it is taken again stays what it was.
         KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
         """
+        from uem_dolfinx.solve.memory import take_again, take_alone
+
         with self.progress.checking_signals(self.comm):
             if self.progress.inside and start is None and fraction == 1.0:
-                from uem_dolfinx.solve.memory import take_again
-
                 return take_again(self, self._before, self.led)
-            history = self.attempt(start=start, fraction=fraction)
-            self.commit()
-            return history
+            return take_alone(self, start, fraction)
 
     def attempt(
         self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: ContactMethod | None = None
@@ -336,7 +332,10 @@ class UnitedProblem(given.Sealed):
         compat.set_bc_values(wanted, self.bodies.bcs)
         with agreed(self.comm):
             check_values(self.config, self.bodies.bcs, wanted)
-        self.bodies.wanted[:] = start + fraction * (wanted - start) if fraction < 1.0 else wanted
+        if fraction < 1.0:
+            as_it_is = set_by_load(self.load, self.bodies.bcs, len(wanted))
+            wanted = np.where(as_it_is, wanted, start + fraction * (wanted - start))
+        self.bodies.wanted[:] = wanted
         try:
             self.bodies.begin_step()
             if self.linear is not None:
@@ -368,6 +367,7 @@ class UnitedProblem(given.Sealed):
         from uem_dolfinx.solve.memory import Memory
 
         self._before = Memory.of(self)
+        forget_load(self)
         self.progress.steps += 1
         self.keep()
 

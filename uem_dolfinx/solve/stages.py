@@ -30,6 +30,7 @@ from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import check_conditions
 from uem_dolfinx.solve.kept import take_multipliers
+from uem_dolfinx.solve.loading import check_load
 from uem_dolfinx.solve.memory import move_targets
 from uem_dolfinx.solve.parted import part_contacts
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -215,7 +216,7 @@ class Stage:
             return lambda s: (1.0 - self._share(s)) * np.asarray(start) + self._share(s) * np.asarray(end)
 
         ramps = [ramp(start, end) for start, end in zip(starts, [*constants.values(), *bolts.values()])]
-        problem.load = dict(zip(constants, ramps)) if constants else loads
+        problem.load = dict(zip(constants, ramps)) if constants else check_load(loads)
         for (bolt, force), follows in zip(bolts.items(), ramps[len(constants) :]):
             take_preload(bolt, None if force is None else follows, not fresh)
         return starts

@@ -13,7 +13,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_field, given_friction
 from uem_dolfinx.contact.preload import Preload
-from uem_dolfinx.solve.checks import check_load
+from uem_dolfinx.solve.loading import check_load
 
 
 @dataclass(frozen=True, eq=False, repr=False)
