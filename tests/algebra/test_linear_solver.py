@@ -58,6 +58,29 @@ def test_cg_gives_way(comm, condition, symmetric, gives_way, monkeypatch):
         assert (K * dq - rhs).norm() <= 1e-9 * rhs.norm()
 
 
+@pytest.mark.skipif(not has_mumps(), reason="needs MUMPS")
+@pytest.mark.parametrize("scale, gives_way", [(1.0, False), (1e4, True)])
+def test_gmres_gives_way(comm, scale, gives_way, monkeypatch):
+    """In a large problem what GMRES does not solve in one cycle is factorised until the next step begins, and solved as accurately."""
+    monkeypatch.setattr(options, "DIRECT_UP_TO", {2: 0, 3: 0})
+    # no multigrid would leave it so many
+    monkeypatch.setattr(options, "multigrid_options", lambda *amg: {"pc_type": "none"})
+    config = Configuration(blocks(comm, "triangle", 16, 16, gap=0.5).u)
+    solver, K, P = UnitedSolver(config, "gmres_gives_way_", None), mass(config), united(config, [])
+    rows = K.createVecLeft()
+    rows.array[:] = scale ** (np.arange(*rows.owner_range) / rows.size) * (1.0 + np.arange(rows.local_size) % 3)
+    K.diagonalScale(rows, None)
+    rhs = K.createVecLeft()
+    rhs.array[:] = np.cos(np.arange(rhs.local_size))
+    for _ in range(2):
+        solver.begin_step()
+        solver.set_operator(P, K, None)
+        assert solver.iterative
+        dq, iterations = solver.solve(rhs)
+        assert solver.iterative != gives_way and iterations <= options.GMRES_RESTART + 1
+        assert (K * dq - rhs).norm() <= 1e-9 * rhs.norm()
+
+
 @pytest.mark.parametrize("part, symmetric", [(0.0, True), (3e-12, True), (3e-11, False)])
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
 def test_what_counts_as_symmetric(comm, part, symmetric, scale):

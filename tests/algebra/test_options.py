@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from petsc4py import PETSc
 
 from uem_dolfinx.algebra import options
-from uem_dolfinx.algebra.options import default_options
+from uem_dolfinx.algebra.options import GMRES_RESTART, default_options, options_in_turn
 
 
 @pytest.mark.parametrize("hypre", [True, False])
@@ -18,3 +19,26 @@ def test_direct_solvers_up_to(size, gdim, first, hypre, monkeypatch):
     assert default_options(size, gdim)[0]["ksp_type"] == first and not default_options(size, gdim)[1]
     between, instead = default_options(10_000, 3)
     assert between["ksp_type"] == ("cg" if hypre else "preonly") and bool(instead) == hypre
+
+
+@pytest.mark.skipif(not options.has_mumps(), reason="needs MUMPS")
+@pytest.mark.parametrize(
+    "size, gdim, at_need", [(40_000, 3, True), (900_000, 3, False), (900_000, 2, True), (9_000_000, 2, False)]
+)
+def test_factorised_at_need(size, gdim, at_need):
+    """Where default options fail a factorisation takes over, as long as there is memory for it, and only there."""
+    first, instead, need = options_in_turn(None, "at_need_", size, gdim, False)
+    assert first["ksp_type"] == "cg" and first["ksp_gmres_restart"] == GMRES_RESTART and not instead
+    assert (need.get("ksp_type") == "preonly") == at_need and not options_in_turn(
+        {"ksp_type": "cg"}, "at_need_", size, gdim, False
+    )[2]
+
+
+def test_no_options_are_the_default_ones():
+    """No option asks for no more than None does, but where PETSc's database has some for the prefix."""
+    assert options_in_turn({}, "empty_", 40_000, 3, False) == options_in_turn(None, "empty_", 40_000, 3, False)
+    PETSc.Options()["empty_ksp_type"] = "gmres"
+    try:
+        assert options_in_turn({}, "empty_", 40_000, 3, False) == [{}, {}, {}]
+    finally:
+        del PETSc.Options()["empty_ksp_type"]

@@ -16,7 +16,7 @@ from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_spa
 from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
-from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, default_options, last_words, tell_unused
+from uem_dolfinx.algebra.options import GMRES_RESTART, NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused
 from uem_dolfinx.algebra.products import UnitedMatrix, made_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
@@ -40,7 +40,7 @@ UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 class UnitedSolver:
     """KSP for ``P'KP dq = P'(r - K c)``.
 
-    PETSc's ``options`` are given without ``prefix``; None chooses by size. Without ``ksp_rtol`` solves are as accurate as is of use.
+    PETSc's ``options`` are given without ``prefix``; none choose by size. Without ``ksp_rtol`` solves are as accurate as is of use.
     """
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
@@ -50,8 +50,8 @@ class UnitedSolver:
             check_options({} if options is None else options, prefix)
         given.alike(space.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
         self._prefix = prefix
-        #: Options that are asked for first, and those that take over for the rest of a step where they fail or do not suit.
-        self._first, self._instead = default_options(size, space.gdim, space.mixed) if options is None else (dict(options), {})
+        #: Options that are asked for first, those that take over for the rest of a step where they do not suit, and where they fail.
+        self._first, self._instead, self._at_need = options_in_turn(options, prefix, size, space.gdim, space.mixed)
         #: Options of the user's that PETSc has not asked for yet; None once the user was told.
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self._first or PETSc.Options(prefix).hasName("ksp_rtol")
@@ -169,8 +169,7 @@ class UnitedSolver:
             self._use(self._first)
         self._begins = False
         if self._petrov_galerkin and self._instead and self.iterative:
-            # it tells the sign of the determinant as well
-            self._use(self._instead)
+            self._use(self._instead)  # it tells the sign of the determinant as well
         self._served = None
         self._on_condensed = self._condense(restriction, test, K, G, same)
         if self._on_condensed or self._served is not None:
@@ -178,8 +177,7 @@ class UnitedSolver:
         self._factor_of = None
         self._kept.drop()
         if self._petrov_galerkin:
-            # direct solvers need no P'KP; for others it makes the preconditioner
-            if self.iterative:
+            if self.iterative:  # P'KP makes the preconditioner
                 self._set_symmetric(restriction, K, G)
             self._adapt(False)
             self._set_unsymmetric(restriction, test, K, G)
@@ -283,7 +281,8 @@ class UnitedSolver:
             reader = PETSc.PC().create(self.space.comm)
             reader.setType("none")
         self.ksp.setPC(reader)
-        with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType()):
+        few = {"ksp_max_it": GMRES_RESTART} if self._at_need and not symmetric and self.iterative else {}
+        with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType(), **few):
             self.ksp.setFromOptions()
         self.ksp.setPC(pc)
 
@@ -408,11 +407,12 @@ class UnitedSolver:
             ) from error
         self._tell_unused()
         reason, iterations = self.ksp.getConvergedReason(), int(self.ksp.getIterationNumber())
-        if reason < 0 and self._instead and self.iterative:
-            logger.debug("CG left the united system with reason %d after %d iterations: it is factorised", reason, iterations)
-            matrix, _ = self.ksp.getOperators()
-            self._use(self._instead)
-            self.ksp.setOperators(matrix)
+        if reason < 0 and self._at_need and self.iterative:
+            logger.debug("%s left the system with reason %d after %d iterations: it is factorised", kinds, reason, iterations)
+            self._A, symmetric = self.ksp.getOperators()[0], self._symmetric
+            self._use(self._at_need)
+            self._adapt(symmetric)
+            self.ksp.setOperators(self._A)
             dq, more = self.solve(rhs)
             return dq, iterations + more
         if reason < 0 or not (self.iterative or np.isfinite(dq.norm())):

@@ -23,6 +23,13 @@ HYPRE_FROM = {2: 300_000, 3: 4_000}
 #: CG that takes more iterations leaves a matrix to a factorisation that pays.
 #: [convention; iterations; test_linear_solver.py::test_cg_gives_way]
 FEW_ITERATIONS = 200
+#: A matrix that CG or GMRES does not solve is factorised up to so many unknowns, by dimension: its LU factors take some 8 GiB.
+#: [bound; unknowns; test_options.py::test_factorised_at_need]
+FACTORISED_UP_TO = {2: 3_000_000, 3: 200_000}
+#: GMRES stagnates where many contactors slip if it forgets what it has found: after so many vectors, which take no more memory than a
+#: matrix in 3D, it does, or leaves the matrix to a factorisation that pays.
+#: [convention; iterations; test_linear_solver.py::test_gmres_gives_way]
+GMRES_RESTART = 100
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)
 #: Options that misspelt ones are likely to mean.
@@ -55,10 +62,23 @@ def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str
     if mixed:
         return direct, {}
     if size > DIRECT_UP_TO[gdim]:
-        return {"ksp_type": "cg", "ksp_max_it": 2000} | multigrid_options(), {}
+        return {"ksp_type": "cg", "ksp_max_it": 2000, "ksp_gmres_restart": GMRES_RESTART} | multigrid_options(), {}
     if size > HYPRE_FROM[gdim] and has_hypre():
         return {"ksp_type": "cg", "ksp_max_it": FEW_ITERATIONS} | multigrid_options("hypre"), direct
     return direct, {}
+
+
+def options_in_turn(options: Mapping[str, Any] | None, prefix: str, size: int, gdim: int, mixed: bool) -> list[dict[str, Any]]:
+    """PETSc options that are asked for first, those that take over where they fail or do not suit, and those where they fail.
+
+    Without any ``options``, here or for this ``prefix`` in PETSc's database, ``default_options`` are taken, and where these are
+    iterative, MUMPS up to ``FACTORISED_UP_TO`` unknowns where they fail.
+    """
+    if options or (options is not None and PETSc.Options(prefix).getAll()):
+        return [dict(options), {}, {}]
+    chosen, instead = default_options(size, gdim, mixed)
+    need = has_mumps() and not mixed and size <= FACTORISED_UP_TO[gdim] and chosen["ksp_type"] != "preonly"
+    return [chosen, instead, instead or (default_options(0, gdim)[0] if need else {})]
 
 
 def multigrid_options(amg: str = "") -> dict[str, Any]:

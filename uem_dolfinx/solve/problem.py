@@ -68,7 +68,7 @@ class UnitedProblem(given.Sealed):
         couplings: parts that move rigidly with a point, or share what acts there: of ``RigidCoupling``.
         points: forces and springs at nodes, as ``PointLoad`` and ``PointSpring``, which are no terms of F.
         petsc_options_prefix: prefix of the linear solver's options.
-        petsc_options: its options without prefix; None chooses MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
+        petsc_options: its options without prefix; none choose MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
             iterative solve is as accurate as its Newton iteration can use.
         load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped; several as
             ``{constant: value}``, each with its value at the full load, a number or numbers like its own, to which it grows in
