@@ -141,3 +141,36 @@ def test_a_step_that_fails_leaves_its_loads():
         break
     refused(uem.InputError, "the value of a Constant in load", block.problem.solve)
     assert abs(float(block.y.value) - 0.5 * SIZE) <= 1e-15
+
+
+def test_a_constant_that_nothing_follows():
+    """It is refused by name; what a form, condition, equation, coupling, point, contact or function holds is not."""
+    free = fem.Constant(Block("term").u.function_space.mesh, 0.0)
+    words = ("item 2 of load", "a Constant that is 0.0 now", "nothing follows it")
+    for kind in KINDS:
+        refused(uem.InputError, words, lambda kind=kind: Block(kind, load=lambda b: {b.y: b.full, free: 3.0}))
+        refused(
+            uem.InputError,
+            ("the loads of step 1, 'go'", "nothing follows it"),
+            lambda kind=kind: uem.load_steps(Block(kind).problem, [uem.Step("go", loads={free: 3.0})]),
+        )
+    # functions that read it follow it
+    holder = {"c": free}
+    for f in (lambda s: float(free.value), lambda s: float(holder["c"].value)):
+        block = Block("equation", f, load=lambda b: {free: SIZE})
+        block.problem.solve()
+        assert abs(block.found() - 1.0) <= 1e-9
+        refused(
+            uem.InputError, "item 2 of load", lambda f=f: Block("term", load=lambda b: {b.y: 1.0, fem.Constant(b.V.mesh, 0.0): f})
+        )
+
+
+def test_a_condition_of_a_later_step_follows():
+    """A Constant that a step sets may be the value of a condition that another step has."""
+    block = Block("term")
+    y = fem.Constant(block.V.mesh, 0.0)
+    held = [*block.bcs, uem.dirichlet(block.V, block.top, 1, y)]
+    steps = [uem.Step("first", loads={y: SIZE}), uem.Step("then", 2, bcs=held)]
+    for _ in uem.load_steps(block.problem, steps):
+        pass
+    assert abs(uem.integrate(block.u[1] * uem.ds(block.top)) - SIZE) <= 1e-9 * SIZE

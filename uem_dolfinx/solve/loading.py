@@ -7,18 +7,22 @@ steps, from the displacement at which these begin.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from ufl.core.expr import Expr
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import Bools
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.errors import InputError, InputTypeError
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 
 class ByFunction:
@@ -133,3 +137,93 @@ def set_by_load(load: Any, bcs: Sequence[Any], n: int) -> Bools:
             forms.values_of(c)[...] = value
     with np.errstate(invalid="ignore"):
         return np.asarray(found[1] - found[0] == 1.0)
+
+
+def ramped(load: Any, bcs: Sequence[Any], start: Array, wanted: Array, fraction: float) -> Array:
+    """Unknowns ``(n,)`` on their way from ``start`` to ``wanted``, but for Dirichlet values that the load sets."""
+    if fraction >= 1.0:
+        return wanted
+    return np.where(set_by_load(load, bcs, len(wanted)), wanted, start + fraction * (wanted - start))
+
+
+# -- Constants that nothing follows ----------------------------------------------------------------------------------------
+
+#: Objects within objects that are looked into for a Constant.
+#: [bound; objects; test_loads.py::test_a_constant_that_nothing_follows]
+DEPTH = 4
+
+
+def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load", beside: Sequence[Any] = ()) -> None:
+    """Refuse Constants in a load that nothing of the problem follows (collective).
+
+    Args:
+        problem: a ``UnitedProblem``.
+        load: what ``check_load`` returned.
+        bcs: Dirichlet conditions that the Constants may be values of.
+        what: the load is, for the message.
+        beside: other objects and functions that may hold them, as those of a step.
+
+    Raises:
+        InputError: naming the first of them.
+    """
+    if not isinstance(load, Mapping):
+        return
+    n, in_forms = len(problem.u.x.array), problem.bodies.F.constants()
+    held = np.array([bool(set_by_load({c: 0.0}, bcs, n).any()) for c in load])
+    held = reduced(problem.comm, held, op=MPI.LOR)
+    parts = [problem.equations, problem.couplings, problem.points, problem.dynamics, problem.materials, problem.declared]
+    for i, (c, follows) in enumerate(zip(load, held)):
+        if follows or any(c is one for one in in_forms):
+            continue
+        others = [value for constant, value in load.items() if constant is not c]
+        found = any(_holds(one, c, DEPTH, set()) for one in (parts, others, beside))
+        if not reduced(problem.comm, found, op=MPI.LOR):
+            now = given.shown(np.asarray(c.value).tolist())
+            raise InputError(
+                f"item {i + 1} of {what}, a Constant that is {now} now, is in no form, Dirichlet condition, equation, coupling, point load "
+                "or contact of the problem, so that nothing follows it: expected a Constant of these; rigid surfaces and all else are "
+                "moved by a function of the load factor as load"
+            )
+
+
+def _holds(one: Any, c: fem.Constant, depth: int, seen: set[int]) -> bool:
+    """Whether an object is a Constant, or holds it in its attributes, items, terms, or what a function reads."""
+    if one is c:
+        return True
+    if (
+        depth == 0
+        or id(one) in seen
+        or isinstance(one, (str, bytes, int, float, np.ndarray, type, ModuleType, fem.FunctionSpace))
+    ):
+        return False
+    seen.add(id(one))
+    inside: list[Any] = []
+    if isinstance(one, ufl.Form):
+        return any(c is part for part in one.constants())
+    if isinstance(one, Expr):
+        return any(c is part for part in traverse_unique_terminals(one))
+    if isinstance(one, Mapping):
+        inside = [*one.keys(), *one.values()]
+    elif isinstance(one, (list, tuple, set)):
+        inside = list(one)
+    elif isinstance(one, MethodType):
+        inside = [one.__self__, one.__func__]
+    elif isinstance(one, FunctionType):
+        cells = [cell.cell_contents for cell in one.__closure__ or () if _is_set(cell)]
+        named = [one.__globals__[name] for name in one.__code__.co_names if name in one.__globals__]
+        inside = [*cells, *named, *(one.__defaults__ or ())]
+    elif isinstance(one, partial):
+        inside = [one.func, *one.args, *one.keywords.values()]
+    else:
+        inside = list(getattr(one, "__dict__", {}).values())
+    # items of a list lie as deep as the list
+    flat = isinstance(one, (list, tuple, set, Mapping))
+    return any(_holds(part, c, depth if flat else depth - 1, seen) for part in inside)
+
+
+def _is_set(cell: CellType) -> bool:
+    """Whether a variable of an enclosing function has a value yet."""
+    try:
+        return cell.cell_contents is not None
+    except ValueError:
+        return False

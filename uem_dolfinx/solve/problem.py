@@ -30,7 +30,7 @@ from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values
-from uem_dolfinx.solve.loading import check_load, forget_load, set_by_load, set_loads
+from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
 from uem_dolfinx.solve.passages import refuse_passages
@@ -171,8 +171,8 @@ class UnitedProblem(given.Sealed):
         #: Contacts as they were declared, and all that they consist of: a general one is several.
         ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
         self.declared: list[Contact | GeneralContact] = contacts
-        #: What else was declared: ties of a scalar field, linear equations, and couplings.
-        self.ties, self.equations, self.couplings = ties, equations, couplings
+        #: What else was declared: ties of a scalar field, linear equations, couplings, and loads and springs at points.
+        self.ties, self.equations, self.couplings, self.points = ties, equations, couplings, points
         self.contacts: list[Contact] = parts_of(contacts, self.config)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
@@ -251,6 +251,7 @@ class UnitedProblem(given.Sealed):
         beside = {"equations": equations, "couplings": couplings, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
+        refuse_idle(self, self.load, self.bodies.bcs)
 
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""
@@ -332,10 +333,7 @@ class UnitedProblem(given.Sealed):
         compat.set_bc_values(wanted, self.bodies.bcs)
         with agreed(self.comm):
             check_values(self.config, self.bodies.bcs, wanted)
-        if fraction < 1.0:
-            as_it_is = set_by_load(self.load, self.bodies.bcs, len(wanted))
-            wanted = np.where(as_it_is, wanted, start + fraction * (wanted - start))
-        self.bodies.wanted[:] = wanted
+        self.bodies.wanted[:] = ramped(self.load, self.bodies.bcs, start, wanted, fraction)
         try:
             self.bodies.begin_step()
             if self.linear is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -30,7 +31,7 @@ from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import check_conditions
 from uem_dolfinx.solve.kept import take_multipliers
-from uem_dolfinx.solve.loading import check_load
+from uem_dolfinx.solve.loading import check_load, refuse_idle
 from uem_dolfinx.solve.memory import move_targets
 from uem_dolfinx.solve.parted import part_contacts
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -61,6 +62,10 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
             raise InputError("the problem is being recorded, and Steps change what it is: record the load steps of one load")
         for i, step in enumerate(steps):
             _check(problem, step, f"step {i + 1}" + (f", '{step.name}'" if step.name else ""))
+    bcs = [bc for conditions in (problem.bodies.bcs, *(step.bcs or () for step in steps)) for bc in conditions]
+    for i, step in enumerate(steps):
+        words = f"the loads of step {i + 1}" + (f", '{step.name}'" if step.name else "")
+        refuse_idle(problem, step.loads, bcs, words, [replace(one, loads=None) for one in steps])
     told = [[step.name, step.n, step.ramp, -1 if step.bcs is None else len(step.bcs)] for step in steps]
     switched = [[f"{contact.name}: {on}" for contact, on in step.contacts.items()] for step in steps]
     given.alike(problem.comm, "load_steps", steps=told, contacts=switched)
