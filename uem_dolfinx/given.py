@@ -181,6 +181,12 @@ def items(what: str, value: Any, fits: Callable[[Any], bool], one: str) -> list[
     return list(value)
 
 
+def plain(value: Any) -> Any:
+    """A value in which arrays are lists, and Constants what they are now."""
+    value = getattr(value, "value", value)
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
     """Refuse values that differ from rank to rank, which would have the ranks wait for each other for ever (collective).
 

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray, Array
-from uem_dolfinx.conditions.places import nodes_at
+from uem_dolfinx.conditions.places import is_point, nodes_at
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -46,6 +46,10 @@ class PointLoad(given.Sealed):
     def _values(self) -> Any:
         return self.force.value if isinstance(self.force, fem.Constant) else self.force
 
+    def given_values(self) -> dict[str, Any]:
+        """Its values as they are now, by name."""
+        return {"the place": self.at if is_point(self.at) else None, "the force": self._values}
+
     def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
         """Force ``(gdim,)`` as it is now, and stiffness ``(gdim, gdim)``, None without any."""
         return given.vector("the force of a PointLoad", self._values, gdim), None
@@ -77,6 +81,10 @@ class PointSpring(given.Sealed):
         square = k.ndim == 2 and k.shape[0] == k.shape[1] <= 3 and bool(np.isfinite(k).all())
         if not square or not np.array_equal(k, k.T) or np.linalg.eigvalsh(k)[0] < -np.finfo(float).eps * np.abs(k).max():
             raise InputError(given.sentence("stiffness", stiffness, words))
+
+    def given_values(self) -> dict[str, Any]:
+        """As of ``PointLoad``."""
+        return {"the place": self.at if is_point(self.at) else None, "the stiffness": self._k}
 
     def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
         """As of ``PointLoad``."""

@@ -149,6 +149,14 @@ class RigidCoupling(given.Sealed):
                 )
                 self._asked[key] = ask_together(comm, what, value, at)
 
+    def given_values(self) -> dict[str, Any]:
+        """Its values as they are now, by name; functions are those that they were asked for last."""
+        loads: dict[Any, Any] = {"force": self._loads[0], "moment": self._loads[1], **self.prescribed}
+        now = {key if isinstance(key, str) else f"motion[{key}]": self._asked.get(key, v) for key, v in loads.items()}
+        return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia} | {
+            f"the {key}": v for key, v in now.items()
+        }
+
     def loads(self) -> tuple[Array, Array]:
         """Force ``(gdim,)`` and moment ``(n_turns,)`` at the point as they are now (collective)."""
         with agreed(self.nodes.config.comm):

@@ -157,6 +157,11 @@ class UnitedRows:
             if callable(one.b) and not isinstance(one.b, fem.Constant):
                 self._asked[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
 
+    def given_values(self) -> dict[str, Any]:
+        """Right-hand sides as they are now, by name."""
+        now = [one.b if asked is None else asked for one, asked in zip(self._declared, self._asked)]
+        return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
+
     def _values(self) -> Array:
         """Right-hand sides as they are now ``(n_values,)`` (collective)."""
         with agreed(self._config.comm):

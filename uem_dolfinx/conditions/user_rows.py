@@ -37,6 +37,9 @@ class UserRows(Protocol):
     def take_load(self, at: float) -> None:
         """Ask functions for the values of a load factor or time (collective)."""
 
+    def given_values(self) -> dict[str, Any]:
+        """Right-hand sides of linear equations as they are now, by name."""
+
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step whose ramp began at a displacement ``(n_owned, gdim)`` and goes so far (collective)."""
 
@@ -163,6 +166,10 @@ class JoinedRows:
             self.linear.take_load(at)
         for one in self._couplings:
             one.take_load(at)
+
+    def given_values(self) -> dict[str, Any]:
+        """As of ``UserRows``."""
+        return {} if self.linear is None else self.linear.given_values()
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """As of ``UserRows``."""

@@ -21,6 +21,7 @@ from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
+from uem_dolfinx.parallel import agreed
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
@@ -103,17 +104,36 @@ def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
     return bcs
 
 
-def check_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> None:
-    """Refuse Dirichlet values that are not finite.
+def check_values(problem: Any, wanted: Array) -> None:
+    """Refuse values that a step cannot begin with (collective).
 
     Args:
-        config: configuration of the displacement.
-        bcs: Dirichlet conditions.
-        wanted: all unknowns with their values, ghosts included ``(n,)``.
+        problem: whose conditions and loads are set for the step.
+        wanted: all unknowns with their Dirichlet values, ghosts included ``(n,)``.
 
     Raises:
-        NotFiniteError: naming condition, value and place.
+        NotFiniteError: for a Dirichlet value that is not finite, naming condition, value and place.
+        InputError: for Constants and numbers in the residual, Dirichlet conditions, points, couplings and equations that differ from rank
+            to rank, naming the first and two ranks.
     """
+    with agreed(problem.comm):
+        _check_finite(problem.config, problem.bodies.bcs, wanted)
+    if problem.comm.size == 1:
+        return
+    points = [] if problem.bodies.points is None else [one for one, _ in problem.bodies.points.parts]
+    forms = {name: form for name, form in problem.settings.forms.items() if isinstance(form, ufl.Form)}
+    values = {f"Constant {i} of {name}": c.value for name, form in forms.items() for i, c in enumerate(form.constants(), 1)}
+    values |= {
+        f"the value of bcs[{i}]": getattr(getattr(bc, "g", None), "value", None) for i, bc in enumerate(problem.bodies.bcs)
+    }
+    values |= {f"{what} of points[{i}]": v for i, one in enumerate(points) for what, v in one.given_values().items()}
+    for one in problem.couplings:
+        values |= {f"{what} of the RigidCoupling of '{one.name}'": v for what, v in one.given_values().items()}
+    values |= {} if problem.linear is None else problem.linear.given_values()
+    given.alike(problem.comm, "the values that a step begins with", **{what: given.plain(v) for what, v in values.items()})
+
+
+def _check_finite(config: Configuration, bcs: Sequence[Any], wanted: Array) -> None:
     for i, bc in enumerate(bcs):
         dofs = compat.bc_dofs(bc)[0]
         bad = dofs[~np.isfinite(wanted[dofs])]

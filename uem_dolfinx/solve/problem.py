@@ -331,8 +331,7 @@ class UnitedProblem(given.Sealed):
             fraction = given.number("fraction", fraction)
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.bodies.bcs)
-        with agreed(self.comm):
-            check_values(self.config, self.bodies.bcs, wanted)
+        check_values(self, wanted)
         self.bodies.wanted[:] = ramped(self.load, self.bodies.bcs, start, wanted, fraction)
         try:
             self.bodies.begin_step()

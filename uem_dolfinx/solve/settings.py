@@ -20,6 +20,7 @@ from dolfinx import fem
 from ufl.constantvalue import RealValue
 from ufl.corealg.traversal import unique_pre_traversal
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law, follows_load, parameters
@@ -38,7 +39,7 @@ NONE = "none"
 
 
 class Settings:
-    """Takes what a problem is made with (making one is not collective).
+    """Takes what a problem is made with (making one is collective).
 
     Args:
         forms: residual and damping form, by name.
@@ -58,7 +59,7 @@ class Settings:
         dynamics: Dynamics | None,
         beside: Mapping[str, str],
     ):
-        self._contacts, self._dynamics = contacts, dynamics
+        self.forms, self._contacts, self._dynamics = forms, contacts, dynamics
         #: Words that are the same on all ranks, and values whose extent over all ranks counts, by name.
         self._words: dict[str, str] = dict(beside)
         self._values: dict[str, Array] = {}
@@ -79,6 +80,7 @@ class Settings:
             shown = ", ".join(f"{n:.6g}" for n in numbers[-SHOWN:])
             digest = blake2b(repr((numbers, operators)).encode(), digest_size=DIGEST).hexdigest()
             self._words[f"{name}, its expressions and numbers"] = f"{shown} in {digest}"
+            given.alike(u.function_space.mesh.comm, "UnitedProblem", **self._words)
             for i, constant in enumerate(form.constants(), 1):
                 self._words[f"{name}, Constant {i}"] = " ".join(f"{v:.6g}" for v in np.ravel(constant.value))
             for i, f in enumerate(form.coefficients(), 1):
