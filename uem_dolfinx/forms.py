@@ -356,9 +356,17 @@ def values_of(m: fem.Constant | fem.Function) -> Any:
     return m.x.array if isinstance(m, fem.Function) else m.value
 
 
-def in_all_cells(F: ufl.Form, u: fem.Function) -> ufl.Form:
-    """A residual that couples unknowns in all cells, by nothing where it is not integrated: its tangent then has their diagonal."""
-    if any(i.integral_type() == "cell" and i.subdomain_id() == "everywhere" for i in F.integrals()):
+def in_all_cells(F: ufl.Form, u: fem.Function, laws: bool = False) -> ufl.Form:
+    """A residual that couples unknowns in all cells, by nothing where it is not integrated: its tangent then has their diagonal.
+
+    Args:
+        F: residual; one that does not depend on u stays as it is.
+        u: unknowns.
+        laws: whether it depends on u by laws with history, too.
+    """
+    of_u = [i for i in F.integrals() if any(part is u for part in traverse_unique_terminals(i.integrand()))]
+    some = of_u or (F.integrals() if laws else [])
+    if not some or any(i.integral_type() == "cell" and i.subdomain_id() == "everywhere" for i in some):
         return F
     nothing = fem.Constant(u.function_space.mesh, 0.0)
     return F + nothing * ufl.inner(u, F.arguments()[0]) * ufl.dx(u.function_space.mesh)

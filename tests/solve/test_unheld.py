@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import CELLS, at, box, scene, st_venant
+from helpers import CELLS, at, blocks, box, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -156,3 +156,77 @@ def test_fields_beside_a_displacement(held):
     words = "nothing holds part 1 of the mixed space on the body" if held else "the body with its middle at .* moves along"
     with pytest.raises(uem.FloatingBodyError, match=words):
         problem.solve()
+
+
+class Pressed:
+    """A block of some stiffness that is pressed on another one, whose cells the residual takes in or leaves out."""
+
+    def __init__(self, cell, degree=1):
+        self.b = b = blocks(COMM, cell, 2, 3, degree=degree)
+        self.mesh, self.V, self.g = b.scene.mesh, b.V, b.gdim
+        middle = self.mesh.geometry.x[compat.geometry_dofs(self.mesh)].mean(axis=1)[:, self.g - 1]
+        self.tool, self.block = (
+            uem.Tag(name, 1, self.g, self.mesh, np.flatnonzero(where).astype(np.int32))
+            for name, where in (("tool", middle < 0), ("block", middle > 0))
+        )
+        self.down = [uem.dirichlet(self.V, b.top, i, -0.02 * (i == self.g - 1)) for i in range(self.g)]
+
+    def problem(self, bcs, left_out=True, contacts=(), **how):
+        """From rest."""
+        self.b.u.x.array[:] = 0.0
+        law = uem.LinearElastic(2.0, 0.3, kind="plane_strain" if self.g == 2 else "3d")
+        F = law.residual(self.b.u, ufl.TestFunction(self.V)) * (uem.dx(self.block) if left_out else ufl.dx)
+        return uem.UnitedProblem(F, self.b.u, bcs=[*bcs, *self.down], contacts=list(contacts), **how)
+
+    def contact(self, **how):
+        """Between the two."""
+        return uem.Contact(self.b.high, self.b.low, **how)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize(("coupling", "options"), [("node_to_surface", None), ("mortar", None), ("node_to_surface", CG)])
+def test_a_held_body_that_is_left_out_of_the_residual(cell, coupling, options):
+    """A tool drawn as a mesh and held at all of its nodes is pressed on as one of some stiffness."""
+    p, forces = Pressed(cell), []
+    for left_out in (False, True):
+        contact = p.contact(coupling=coupling)
+        p.problem([uem.dirichlet(p.V, p.tool)], left_out, [contact], petsc_options=options).solve()
+        forces.append(contact.resultant().force)
+    assert forces[0][-1] > 0.01
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("options", [None, CG])
+@pytest.mark.parametrize("how", ["alone", "contact", "tied", "free"])
+def test_a_body_that_is_left_out_of_the_residual(how, options):
+    """Held at some of its nodes or none: nothing resists the others, which is told."""
+    p = Pressed("triangle", 2)
+    contacts = [] if how == "alone" else [p.contact(tied=how == "tied")]
+    bcs = [] if how == "free" else [uem.dirichlet(p.V, p.b.bottom)]
+    with pytest.raises(uem.InputError, match=r"nothing resists \d+ nodes of the body with its middle at \(0\.5, -0\.5\)"):
+        p.problem(bcs, True, contacts, petsc_options=options).solve()
+
+
+@pytest.mark.parametrize("rotations", ["small", "large"])
+@pytest.mark.parametrize("force", [0.0, 0.01, -0.01])
+def test_a_free_rigid_body_without_stiffness(rotations, force):
+    """It is pressed on the block, stays where it is, or is pulled away, and that is told."""
+    p = Pressed("quadrilateral")
+    contact = p.contact()
+    rigid = uem.RigidCoupling(p.tool, (0.5, -0.5), rotations=rotations, force=(0.0, force))
+    problem = p.problem([], True, [contact], couplings=[rigid])
+    if force < 0:
+        with pytest.raises(uem.FloatingBodyError, match=r"\(0\.5, -0\.5\) moves along"):
+            problem.solve()
+        return
+    problem.solve()
+    np.testing.assert_allclose(contact.resultant().force, [0.0, force], atol=1e-12)
+
+
+def test_conditions_of_a_body_without_stiffness_change():
+    """What holds it in one step is gone in the next one: that is told."""
+    p = Pressed("triangle")
+    problem = p.problem([uem.dirichlet(p.V, p.tool)])
+    steps = [uem.Step("held"), uem.Step("loose", bcs=p.down)]
+    with pytest.raises(uem.InputError, match="nothing resists"):
+        list(uem.load_steps(problem, steps))

@@ -85,7 +85,16 @@ class Nodes:
         return forms.create_matrix(a)
 
     def complete(self, K: PETSc.Mat, free: Bools) -> None:
-        """Bring an assembled matrix into what solvers take."""
+        """Put its largest entry on the diagonal of K where that is zero and components are held, which P crosses out (collective).
+
+        Args:
+            K: just assembled.
+            free: components without Dirichlet condition ``(n_owned, block)``.
+        """
+        diagonal = K.getDiagonal()
+        largest = diagonal.norm(PETSc.NormType.INFINITY) or 1.0
+        diagonal.array[~free.ravel() & (diagonal.array_r == 0.0)] = largest
+        K.setDiagonal(diagonal)
 
     def multipliers(self, A: PETSc.Mat) -> int:
         """Number of unknowns that are expected to make a negative eigenvalue each (collective): none of a displacement."""

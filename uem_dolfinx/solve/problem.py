@@ -177,8 +177,8 @@ class UnitedProblem(given.Sealed):
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")
-        # cells that a coupling makes rigid may have no stiffness, nor be in F
-        F, at_points = revolved(in_all_cells(F, u) if couplings else F), None
+        # cells that conditions hold or a coupling makes rigid may have no stiffness, nor be in F
+        F, at_points = revolved(F if self.config.unknowns.mixed else in_all_cells(F, u, bool(self.materials))), None
         if points or couplings:
             from uem_dolfinx.conditions.at_points import AtPoints
 

@@ -32,6 +32,7 @@ from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, L
 from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.rows import BodyState, OverConstraints, Rows, make_rows, not_held, read_forces, several_answers, unbalanced
 from uem_dolfinx.solve.tangent import added_mass, curvature_of, known_forces, slip_terms, together
+from uem_dolfinx.solve.unheld import refuse_bare
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
@@ -400,6 +401,7 @@ class BodySystem:
         K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
         state = state.with_pressures(self.pairs, K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
+        refuse_bare(self.bodies, P, Q, curvature)
         # a modified Newton loop lets small changes of P pass
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
         linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact

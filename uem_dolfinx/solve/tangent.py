@@ -71,13 +71,17 @@ class Tangent:
         self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
         #: Components without Dirichlet condition ``(n_rows, gdim)``.
         self._free: Bools = np.ones((0, 0), dtype=bool)
+        #: Components that nothing of K resists, without Dirichlet condition ``(n_rows * gdim,)``; None for none on any rank.
+        self.bare: Bools | None = None
+        #: Whether K has zeros on its diagonal, which is completed where components are held.
+        self._lacks = config.unknowns.mixed
         #: Grows with every assembly.
         self.number = 0
 
     def hold(self, free: Bools) -> None:
         """Take which components have no Dirichlet condition ``(n_rows, gdim)``; K has places for all of them."""
         self._free = free
-        if self._unknowns.mixed:
+        if self._lacks:
             # its diagonal was completed where others were held
             self._values = None
 
@@ -96,9 +100,21 @@ class Tangent:
                 self._points.add_stiffness(self.K)
             if self._dynamics is not None and factor:
                 self.K.axpy(factor, self._dynamics.matrix, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-            self._unknowns.complete(self.K, self._free)
+            self._complete(comm)
         self._values, self._factor = values, factor
         self.number += 1
+
+    def _complete(self, comm: MPI.Comm) -> None:
+        """Complete the diagonal of K, and see where nothing but a coupling or a contact can resist (collective)."""
+        zero, mixed = self.K.getDiagonal().array_r == 0.0, self._unknowns.mixed
+        self._lacks = bool(reduced(comm, int(zero.any()), op=MPI.MAX)) or mixed
+        self.bare = None
+        if not self._lacks:
+            return
+        self._unknowns.complete(self.K, self._free)
+        # other fields may have no diagonal
+        free = zero & self._free.ravel()
+        self.bare = free if not mixed and reduced(comm, int(free.any()), op=MPI.MAX) else None
 
 
 def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PETSc.Mat:

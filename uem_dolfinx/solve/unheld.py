@@ -1,11 +1,16 @@
-"""Which body a field has flown off on where nothing holds it: rigid motions of bodies are looked at before they fly, other fields after."""
+"""What nothing holds or resists: the body on which a field has flown off, and one that has no stiffness.
+
+Rigid motions of bodies are looked at before they fly, by ``floating``; other fields when they have.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from petsc4py import PETSc
 
-from uem_dolfinx import compat
-from uem_dolfinx.errors import FloatingBodyError
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.errors import FloatingBodyError, InputError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
@@ -40,4 +45,43 @@ def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
     return FloatingBodyError(
         f"nothing holds {what} on the body with its middle at {described(sums[:-1] / sums[-1])}: it becomes {largest:.3g} there, and "
         f"{residual:.3g} of what drives it is left; give it a Dirichlet condition, or something that its value is to reach equilibrium with"
+    )
+
+
+def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat | None) -> None:
+    """Refuse a united system in which nothing resists some unknowns (collective).
+
+    Args:
+        bodies: with the tangent K.
+        P: of trial.
+        Q: of test.
+        more: what contacts and couplings add to K; None for nothing.
+
+    Raises:
+        InputError: naming the first body and node.
+    """
+    if bodies.tangent.bare is None:
+        return
+    config, comm, n = bodies.config, bodies.comm, bodies.config.n_owned
+    # a row with any entry passes on something of what is moved at random
+    du = P.expand(config.vector(np.random.default_rng(comm.rank).uniform(1.0, 2.0, P.used.shape) * P.used))
+    y = forms.product(bodies.tangent.K, du)
+    if more is not None:
+        y.axpy(1.0, forms.product(more, du))
+    left = Q.transpose(y).array_r == 0.0
+    nodes = np.flatnonzero((left & bodies.tangent.bare & P.used.ravel()).reshape(P.used.shape).any(axis=1))
+    body, count = find_bodies(config)
+    own = body[:n]
+    number = reduced(comm, np.bincount(own[nodes], minlength=count))
+    if not number.any():
+        return
+    where = int(number.argmax())
+    offers = comm.allgather([described(config.X[i]) for i in nodes[own[nodes] == where][:1]])
+    place = next(offer[0] for offer in offers if offer)
+    here = config.X[:n][own == where]
+    sums = reduced(comm, np.append(here.sum(axis=0), float(len(here))))
+    remedy = ", or make it rigid by a RigidCoupling of its cells" if config.moves else ""
+    raise InputError(
+        f"nothing resists {number[where]} nodes of the body with its middle at {described(sums[:-1] / sums[-1])}, as that at {place}: "
+        f"expected terms in F that do; integrate F over its cells, too, with a stiffness, hold these nodes by Dirichlet conditions{remedy}"
     )
