@@ -106,14 +106,14 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
         args: of the function.
 
     Raises:
-        UserFunctionError: naming it, and what it raised where; an error of the package's own passes as it is, and so do SystemExit
-            and KeyboardInterrupt.
+        UserFunctionError: naming it, and what it raised where, GeneratorExit included, which would end the steps without a word; an
+            error of the package's own passes as it is, and so do SystemExit, KeyboardInterrupt and others that are no Exception.
     """
     try:
         return f(*args)
     except UEMError:
         raise
-    except Exception as error:
+    except (Exception, GeneratorExit) as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         raise UserFunctionError(
             f"{what} raised {type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno}); mend the function"

@@ -130,6 +130,12 @@ class Preload(Contact):
         axis = "normal" if self._axis is None else " ".join(f"{a:.6g}" for a in self._axis)
         return super().words() | {"axis": axis}
 
+    def switch(self, on: bool) -> None:
+        """Raise InputError: a section is not opened, it carries the force zero."""
+        raise InputError(
+            f"preload '{self.name}' cannot be switched: it carries no force with Step(..., preload={{preload: 0.0}})"
+        )
+
     def attach(self, config: Configuration, free: Bools, **clock: Any) -> Interface:
         """As of ``Contact``; also (collective).
 

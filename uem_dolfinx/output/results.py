@@ -103,6 +103,7 @@ class HistoryWriter(Closing, given.Sealed):
         self.table.check()
         what = self.table.columns[0]
         with agreed(self.problem.comm):
+            refuse_others(step, self.problem)
             time = given.number(what, clock(step))
         given.alike(self.problem.comm, "write", **{what: time})
         if self._progress.steps > self._known and time < self._last:
@@ -193,6 +194,10 @@ class ResultsWriter(Closing, given.Sealed):
         from uem_dolfinx.output.xdmf import geometry_degree
 
         degree, sources = geometry_degree(mesh), self._sources()
+        with agreed(comm):
+            for name in self._expressions:
+                if name in sources:
+                    raise InputError(f"fields[{name!r}]: the problem's own field has this name in the files: give it another one")
         shapes = {u.ufl_shape: compat.function_space(mesh, degree, u.ufl_shape) for u in sources.values()}
         self._nodal = {name: fem.Function(shapes[u.ufl_shape], name=name) for name, u in sources.items()}
         self._history = partial(HistoryWriter, self._name(".csv"), problem, reaction=reaction, columns=columns)
@@ -308,6 +313,15 @@ class ResultsWriter(Closing, given.Sealed):
         for writer in self._vtx or []:
             writer.close()
         self._vtx = []
+
+
+def refuse_others(step: Any, problem: UnitedProblem) -> None:
+    """Raise InputError for a step that another problem has made."""
+    number = getattr(step, "of_problem", 0)
+    if number and number != problem.progress.number:
+        raise InputError(
+            f"{step} is a step of another problem: expected one of the problem whose state is written; make a writer for each problem"
+        )
 
 
 def _check_fields(fields: Any, mesh: Any) -> None:

@@ -14,7 +14,7 @@ from uem_dolfinx.files import given_path, keep_aside, on_rank_0
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
-from uem_dolfinx.output.results import clock, contact_suffixes
+from uem_dolfinx.output.results import clock, contact_suffixes, refuse_others
 from uem_dolfinx.output.tables import Closing
 from uem_dolfinx.parallel import agree, agreed
 from uem_dolfinx.solve.load_step import LoadStep
@@ -88,6 +88,7 @@ class SurfaceWriter(Closing, given.Sealed):
         if self._closed:
             raise ValueError(f"{self._index} is closed: expected rows before close()")
         with agreed(comm):
+            refuse_others(step, self.problem)
             time = given.number("the time", clock(step))
         with timed("write surfaces"):
             self._steps += 1

@@ -6,6 +6,8 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
 from typing import Any, NoReturn, TypeVar
 
 from mpi4py import MPI
@@ -81,6 +83,7 @@ class Progress:
             ``(n_local, gdim)``.
         left: load factors at which calls of several ``Step`` were left before their end, and none of their later steps begun, by the
             number of the call that each of these counts as.
+        number: that tells the problem from others of this script, which its steps have as ``of_problem``.
     """
 
     steps: int = 0
@@ -98,6 +101,7 @@ class Progress:
     carried: Array | None = None
     of_equations: Array = field(default_factory=lambda: np.zeros((0, 0)))
     left: dict[int, float] = field(default_factory=dict)
+    number: int = field(default_factory=partial(next, count(1)))
     _calls: int = 0
 
     @property
@@ -240,6 +244,8 @@ def between_steps(
                 for step in steps:
                     if told:
                         logger.info("%s", step.summary(contacts))
+                    # steps are frozen but for this
+                    object.__setattr__(step, "of_problem", progress.number)
                     progress.inside = True
                     if checkpoint is not None:
                         checkpoint.hand_out(loop)

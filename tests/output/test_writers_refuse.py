@@ -1,0 +1,57 @@
+"""What writers refuse: steps of another problem and names that are taken; and sections that are not switched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import blocks, raised
+from ramp_scenes import COMM, five_steps, nothing
+
+import uem_dolfinx as uem
+
+
+@pytest.mark.parametrize("in_time", [False, True], ids=["load", "time"])
+def test_a_step_of_another_problem(in_time, folder):
+    """It would be told with a time at which this one never was."""
+    one, begin = five_steps(in_time, nothing)
+    other, _ = five_steps(in_time, nothing)
+    step = next(iter(begin(None)))
+    with uem.ResultsWriter(folder / "own", one, vtx=False) as own, uem.ResultsWriter(folder / "out", other, vtx=False) as out:
+        own.write(step)
+        raised(uem.InputError, "is a step of another problem", lambda: out.write(step))
+        raised(uem.InputError, "is a step of another problem", lambda: out.history.write(step))
+
+
+@pytest.mark.parametrize("name", ["displacement", "gap", "contact_pressure"])
+def test_a_field_of_the_problems_own_name(name, folder):
+    problem, _ = five_steps(False, nothing)
+    raised(
+        uem.InputError,
+        "the problem's own field has this name",
+        lambda: uem.ResultsWriter(folder / "r", problem, fields={name: problem.u[0]}),
+    )
+
+
+def test_a_section_is_not_switched():
+    b = blocks(COMM, "triangle")
+    bolt = uem.Preload(b.high, b.low, force=1.0)
+    raised(uem.InputError, "cannot be switched", lambda: bolt.switch(False))
+
+
+@pytest.mark.parametrize("kind", [GeneratorExit, StopIteration])
+def test_functions_that_end_generators(kind):
+    """They are errors of the function, not the end of the steps, on all ranks; the state is the last converged one."""
+    made = []
+
+    def load(at):
+        if len(made) == 2 and COMM.rank == COMM.size - 1:
+            raise kind
+
+    problem, begin = five_steps(False, load)
+
+    def run():
+        for step in begin(None):
+            made.append((step, np.array(problem.u.x.array)))
+
+    raised(uem.UserFunctionError, kind.__name__, run)
+    assert len(made) == 2 and np.array_equal(made[-1][1], problem.u.x.array)
