@@ -186,6 +186,22 @@ def test_massy_contactors_warn(caplog):
     assert f[:, 1].max() > 600
 
 
+def test_steps_that_give_massy_contactors_energy_are_told(caplog):
+    """Each step in which the bar's energy grows by more than a hundredth of what it began with, and none in flight."""
+    bar = Bar(20, contactors="massy")
+    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+        bar.run(0.5 / 60, 1.3)
+    rows = bar.book.rows
+    energy = np.array([row.kinetic + row.stored for row in rows])
+    grown = [(rows[k].time, more) for k, more in enumerate(np.diff(energy)) if more > 0.01 * energy[0]]
+    told = [m for record in caplog.records if "their contactors have mass" in (m := record.getMessage())]
+    assert len(grown) > 1
+    if COMM.rank == 0:
+        for time, more in grown:
+            assert any(f"give the bodies {more:.3g} of energy" in m and f"from time {time:.6g}:" in m for m in told)
+        assert len(told) < len(rows) / 2
+
+
 def test_massless_contactors_have_no_velocity_of_their_own():
     """In contact with the wall they are at rest, and after it they move with the bar."""
     bar = Bar(50)

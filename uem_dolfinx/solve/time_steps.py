@@ -209,20 +209,17 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
     """Contact forces on both bodies of each contact that does no work by itself, at this rank's nodes (collective)."""
-    assert problem.dynamics is not None
-    if problem.dynamics.contactors != "massless":
-        return []
     touching = compress(problem.contacts, _touching(problem))
     own = slice(problem.config.gdim * problem.config.n_owned)
     return [np.array(c.force.x.array[own]) for c in touching if not c.pair.works]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
-    """Refuse a step within which contacts have given the bodies energy, by more than their share (collective).
+    """Refuse a step within which contacts have given the bodies energy, by more than their share; warn of it with mass (collective).
 
     The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along, the
     less the shorter the step. One that has sunk beside the target's end and is taken back gives a blow in however short a step; from the
-    next attempt on it is left out.
+    next attempt on it is left out. Contactors with mass are given energy in steps of any length.
 
     Args:
         problem: at the end of the step.
@@ -245,6 +242,10 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     at_work = control.largest_energy + _held_by(problem, forces)
     if given <= MOST_GIVEN * at_work:
         return
+    words = f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
+    if dynamics.contactors != "massless":
+        logger.warning("%s, from time %.6g: their contactors have mass; take contactors='massless'", words, dynamics.time)
+        return
     barred = [pair.bar_returned() for pair in problem.pairs]
     for pair, count in zip(problem.pairs, barred):
         if count:
@@ -255,7 +256,6 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
                 count,
                 dynamics.time,
             )
-    words = f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
     if length > SHORTEST_GIVEN * control.nominal or any(barred):
         raise EnergyGivenError(words)
     logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
