@@ -22,7 +22,7 @@ COMM = MPI.COMM_WORLD
 NORMALS = ("facet", "averaged")
 
 
-def slider(cell, way, *, pose=lambda x: x, target=None, normals="facet", start=0.4, gap=0.0):
+def slider(cell, way, *, pose=lambda x: x, target=None, normals="facet", start=0.4, gap=0.0, **how):
     """A small block led by its lid along ``way(factor) -> (gdim,)`` over a slab ``[0, 3] x [-0.75, 0]``; ``pose`` bends both."""
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     low = box(cell, [0.0, *[-0.2] * (g - 2), -0.75], [3.0, *[0.6] * (g - 2), 0.0], [12, *[2] * (g - 2), 3])
@@ -33,7 +33,11 @@ def slider(cell, way, *, pose=lambda x: x, target=None, normals="facet", start=0
     lid, base = s.tag("lid", 1, at(g - 1, 0.4 + gap)), s.tag("base", 0, at(g - 1, -0.75))
     bcs = [*clamp(V, base), fem.dirichletbc(place, fem.locate_dofs_topological(V, g - 1, lid.entities))]
     contact = uem.Contact(
-        s.tag("high", 1, at(g - 1, gap)), s.tag("target", 0, target or at(g - 1, 0.0)), normals=normals, max_penetration=0.1
+        s.tag("high", 1, at(g - 1, gap)),
+        s.tag("target", 0, target or at(g - 1, 0.0)),
+        normals=normals,
+        max_penetration=0.1,
+        **how,
     )
 
     def load(factor):
@@ -58,6 +62,23 @@ def waved(height):
         return y
 
     return pose
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_small_sliding_searches_once_a_step(cell, coupling):
+    """Down a wave the error of small sliding falls with the length of the steps; of rows that are never made again it stays."""
+
+    def force(n, sliding):
+        _, contact, problem = slider(
+            cell, lambda factor: (0.3 * factor, -0.04), pose=waved(0.03), coupling=coupling, sliding=sliding
+        )
+        for _ in uem.load_steps(problem, n):
+            pass
+        return contact.resultant().force[1]
+
+    finite, coarse, fine = force(3, "finite"), force(4, "small"), force(12, "small")
+    assert finite > 0 and abs(fine - finite) < 0.7 * abs(coarse - finite)
 
 
 @pytest.mark.parametrize(

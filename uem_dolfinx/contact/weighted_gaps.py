@@ -46,11 +46,12 @@ class Contactors(OnTarget):
         self.basis: Basis = basis_of(surface.shape)
         self.elimination = Elimination(config, nodes)
         self.remembered = Remembered(config, nodes, surface)
-        self.begin_step()
+        self.faced: Ints = np.zeros((0, 2), np.int64)
 
     def begin_step(self) -> None:
-        """Forget which facets have faced each other."""
-        self.faced: Ints = np.zeros((0, 2), np.int64)
+        """As of ``OnTarget``; which facets have faced each other is forgotten."""
+        super().begin_step()
+        self.faced = np.zeros((0, 2), np.int64)
 
     def sizes(self, x: Array) -> Array:
         """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
