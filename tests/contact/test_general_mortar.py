@@ -6,10 +6,13 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from body_scenes import Discs, grid, oedometer
-from helpers import M, highest, run, slow
+from dolfinx import fem
+from helpers import M, at, box, clamp, highest, linear, modulus, run, scene, slow
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
 GRIDS = [
@@ -54,3 +57,20 @@ def test_excluded_parts_do_not_touch():
     problem = b.problem([contact], oedometer(b, places, (1, 2), 2 * strain), rtol=1e-12)
     run(problem)
     assert contact.n_active == 0 and highest(COMM, np.abs(problem.u.x.array)) == pytest.approx(2 * strain, rel=1e-9)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_forces_of_pairs_count_contactors_that_are_not_active(first):
+    """A narrow stiff block on a wide soft one, of degree 2: rows have contactors beside their own in them, which bear forces as well."""
+    cell = "quadrilateral"
+    s = scene(COMM, cell, [box(cell, [-1, 0], [1, 1], [9, 5]), box(cell, [-0.4, 1], [0.4, 1.5], [5, 3])])
+    u = fem.Function(compat.function_space(s.mesh, 2, (2,)))
+    base, lid = s.tag("base", 0, at(1, 0.0)), s.tag("lid", 1, at(1, 1.5))
+    bcs = [*clamp(u.function_space, base), uem.dirichlet(u.function_space, lid, value=0.0, component=0)]
+    v = ufl.TestFunction(u.function_space)
+    F = linear(u, modulus(s, 1.0, 1000.0)) + 0.0625 * v[1] * uem.ds(lid)
+    contact = uem.GeneralContact(coupling="mortar", order=[[base, lid][first]])
+    run(uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], rtol=1e-11))
+    assert contact.between("body 2").force == pytest.approx([0.0, 0.05], abs=1e-12)
+    (touch,) = contact.touching()
+    assert touch.n_active == contact.n_active and np.abs(touch.force) == pytest.approx([0.0, 0.05], abs=1e-12)

@@ -35,7 +35,7 @@ class Body(MeshTarget):
 
     def __init__(self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[Apart], overlap: float):
         super().__init__(facets)
-        self.skin, self._overlap = skin, overlap
+        self.skin, self.number, self._overlap = skin, body, overlap
         own = np.flatnonzero(skin.body == body)
         #: Numbers of its facets among those of all bodies, over all ranks ``(m,)``.
         self.numbers: Ints = skin.first[skin.config.comm.rank] + own

@@ -62,6 +62,10 @@ class BodiesContact(GeneralPart):
         """Numbers among the facets of all bodies of those that contactors are on ``(n,)``, -1 for none (collective)."""
         return facet
 
+    def opposite(self, skin: Skin) -> Ints:
+        """Numbers of the bodies that contactors are on ``(n,)``, -1 for none (collective)."""
+        return np.asarray(skin.values_at(self.on_skin(self.pair.projection.facet), skin.body))
+
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
         if self._by_pairs is None:
@@ -157,3 +161,7 @@ class MortarContact(BodiesContact):
     def on_skin(self, facet: Ints) -> Ints:
         """See ``BodiesContact``."""
         return np.asarray(self._body.of_facets(facet, self._body.numbers))
+
+    def opposite(self, skin: Skin) -> Ints:
+        """The one body, also of contactors that nothing is opposite to: rows of others may have them."""
+        return np.full(len(self.pair.nodes), self._body.number)

@@ -47,12 +47,14 @@ def forces_of_pairs(
     found: dict[tuple[int, int], Array] = {}
     for k, part in enumerate(parts):
         pair = part.pair
-        i = np.flatnonzero(pair.trial.active)
+        # rows of mortar have the contactors around their own in them, active or not
+        active = pair.trial.active
+        i = np.flatnonzero(active | pair.trial.force.any(axis=1))
         second = np.full(len(i), skin.n_bodies + k)
         if isinstance(part, BodiesContact):
-            second = skin.values_at(part.on_skin(pair.projection.facet[i]), skin.body)
+            second = part.opposite(skin)[i]
         first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
-        rows = np.column_stack([np.ones(len(i)), force, moments(config.of_circles(pair.points[i]) - centre, force)])
+        rows = np.column_stack([active[i], force, moments(config.of_circles(pair.points[i]) - centre, force)])
         keys, inverse = np.unique(first * n + second, return_inverse=True)
         sums = np.zeros((len(keys), rows.shape[1]))
         np.add.at(sums, inverse.ravel(), rows)
