@@ -55,3 +55,26 @@ def test_functions_that_end_generators(kind):
 
     raised(uem.UserFunctionError, kind.__name__, run)
     assert len(made) == 2 and np.array_equal(made[-1][1], problem.u.x.array)
+
+
+WRITERS = {
+    "results": lambda folder, problem: uem.ResultsWriter(folder / "t", problem, vtx=False),
+    "history": lambda folder, problem: uem.HistoryWriter(folder / "t.csv", problem),
+    "energy": lambda folder, problem: uem.EnergyBook(problem, path=folder / "t.csv"),
+}
+
+
+@pytest.mark.parametrize("second", WRITERS)
+@pytest.mark.parametrize("first", WRITERS)
+def test_one_name_for_two_kinds_of_writers(first, second, folder):
+    """The file is not moved away under the first; once that is closed the name is free, and two of a kind are as of two runs."""
+    problem, begin = five_steps(True, nothing)
+    step = next(iter(begin(None)))
+    one = WRITERS[first](folder, problem)
+    one.write(step)
+    if first != second:
+        raised(uem.OutputError, "is the table of", lambda: WRITERS[second](folder, problem))
+        COMM.barrier()
+        assert (folder / "t.csv").exists() and not (folder / "t.1").exists()
+    one.close()
+    WRITERS[second](folder, problem).close()

@@ -101,7 +101,7 @@ class EnergyBook(Closing, given.Sealed):
         suffixes = contact_suffixes(problem.contacts)
         columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
         resume_at = self.dynamics if resume else None
-        self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at)
+        self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at, whose="an EnergyBook")
         begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
         # contacts that were read from a checkpoint know what friction had taken before

@@ -20,7 +20,7 @@ from uem_dolfinx.form_checks import check_expression
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.output.columns import Columns
 from uem_dolfinx.output.pair_tables import PairTables
-from uem_dolfinx.output.tables import Closing, CsvTable
+from uem_dolfinx.output.tables import Closing, CsvTable, refuse_shared
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -57,6 +57,9 @@ class HistoryWriter(Closing, given.Sealed):
         InputError, InputTypeError, UserFunctionError: if what is asked for cannot be had.
     """
 
+    #: Whose table it is, for messages.
+    _whose = "a HistoryWriter"
+
     def __init__(
         self,
         path: str | Path,
@@ -67,6 +70,7 @@ class HistoryWriter(Closing, given.Sealed):
         resume: bool = False,
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+        until = problem.progress if resume else None
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
@@ -74,7 +78,7 @@ class HistoryWriter(Closing, given.Sealed):
         for suffix in suffixes:
             names += [f"{name}{suffix}" for name in ("active", "max_gap", *resultant)]
         self._progress, self._asked = problem.progress, Columns(problem, reaction, columns)
-        self.table = CsvTable(path, problem.comm, names + self._asked.names, problem.progress if resume else None, key="step")
+        self.table = CsvTable(path, problem.comm, names + self._asked.names, until, key="step", whose=self._whose)
         try:
             self._pairs = PairTables(self.table.path, problem, suffixes, names[0], resultant, resume)
         except Exception:
@@ -131,6 +135,12 @@ class HistoryWriter(Closing, given.Sealed):
         """Close the files."""
         self.table.close()
         self._pairs.close()
+
+
+class TableOfResults(HistoryWriter):
+    """The table of a ``ResultsWriter``."""
+
+    _whose = "a ResultsWriter"
 
 
 class ResultsWriter(Closing, given.Sealed):
@@ -200,7 +210,8 @@ class ResultsWriter(Closing, given.Sealed):
                     raise InputError(f"fields[{name!r}]: the problem's own field has this name in the files: give it another one")
         shapes = {u.ufl_shape: compat.function_space(mesh, degree, u.ufl_shape) for u in sources.values()}
         self._nodal = {name: fem.Function(shapes[u.ufl_shape], name=name) for name, u in sources.items()}
-        self._history = partial(HistoryWriter, self._name(".csv"), problem, reaction=reaction, columns=columns)
+        refuse_shared(self._name(".csv"), comm, TableOfResults._whose)
+        self._history = partial(TableOfResults, self._name(".csv"), problem, reaction=reaction, columns=columns)
         self._wants_vtx = compat.has_vtx() if vtx is None else vtx
         #: A run that no checkpoint has put forward has nothing to go on with, which is known for sure at the first step.
         self._undecided = resume and not (problem.progress.resumed or problem.progress.steps)

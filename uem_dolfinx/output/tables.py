@@ -8,12 +8,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, Self
+from weakref import WeakValueDictionary
 
 from mpi4py import MPI
 
-from uem_dolfinx.errors import CheckpointError, UEMError
+from uem_dolfinx.errors import CheckpointError, OutputError, UEMError
 from uem_dolfinx.files import OwnFile, begin_file, given_path, in_use, keep_aside, new_folder, on_rank_0
 from uem_dolfinx.log import logger, timed
+from uem_dolfinx.parallel import agreed
 
 
 class Clock(Protocol):
@@ -42,6 +44,21 @@ class Closing(ABC):
         self.close()
 
 
+#: Tables of this run by the path of their file.
+_open: WeakValueDictionary[Path, CsvTable] = WeakValueDictionary()
+
+
+def refuse_shared(path: Path, comm: MPI.Comm, whose: str) -> None:
+    """Raise OutputError where a writer of another kind in this run has this file as its table, and is not closed (collective)."""
+    other = _open.get(path.absolute())
+    with agreed(comm):
+        if other is not None and not other._closed and other.whose != whose:
+            raise OutputError(
+                f"{path} is the table of {other.whose} of this run: give {whose} another name; a ResultsWriter 'NAME' writes NAME.csv, "
+                "as a HistoryWriter 'NAME.csv' does"
+            )
+
+
 class CsvTable(Closing):
     """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
 
@@ -57,6 +74,7 @@ class CsvTable(Closing):
             to its present time. None begins a new file.
         key: column that does not fall from row to row, by default the first.
         words: columns that hold no numbers.
+        whose: the writer that it is of, for messages.
 
     Raises:
         OutputError: of rank 0, on all ranks, if the file cannot be written, or another run writes the one to go on with.
@@ -72,8 +90,11 @@ class CsvTable(Closing):
         *,
         key: str | None = None,
         words: Sequence[str] = (),
+        whose: str = "a table",
     ):
         self.columns, self.comm, self.path = list(columns), comm, given_path("path", path, comm)
+        refuse_shared(self.path, comm, whose)
+        self.whose = whose
         self._key = 0 if key is None else self.columns.index(key)
         self._clock = None if resume_at is None or isinstance(resume_at, (int, float)) else resume_at
         self._resumed = 0 if self._clock is None else self._clock.resumed
@@ -85,6 +106,7 @@ class CsvTable(Closing):
         self._end, self._later = 0, False
         kept = self._on_rank_0(lambda: self._begin(until))
         numbers = [{name: float(value) for name, value in zip(self.columns, row) if value and name not in words} for row in kept]
+        _open[self.path.absolute()] = self
         #: First and last row kept, by column, as numbers; empty in a new file.
         self.first: dict[str, float] = numbers[0] if kept else {}
         self.last: dict[str, float] = numbers[-1] if kept else {}
