@@ -72,6 +72,10 @@ class FloatingBodyError(UEMError, RuntimeError):
     """A body moves as a rigid body under its loads, and neither conditions nor contacts can hold it."""
 
 
+class ThrownBodyError(FloatingBodyError):
+    """A body that contact held has left it within a step and gone far, and nothing tells where it would come to rest."""
+
+
 class MassError(UEMError, ValueError):
     """A mass cannot be what it is asked to be."""
 

@@ -230,3 +230,34 @@ def test_conditions_of_a_body_without_stiffness_change():
     steps = [uem.Step("held"), uem.Step("loose", bcs=p.down)]
     with pytest.raises(uem.InputError, match="nothing resists"):
         list(uem.load_steps(problem, steps))
+
+
+def squeezed():
+    """A block between a clamped one and one that is led, all surfaces wavy by a hundred thousandth of their size."""
+    corners = [((0.0, 0.0), (2.0, 1.0), (6, 3)), ((0.3, 1.0), (1.7, 1.6), (5, 2)), ((0.6, 1.6), (1.4, 2.2), (3, 2))]
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", list(a), list(b), list(n)) for a, b, n in corners])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    sides = ((1, 1.0), (0, 1.0), (2, 1.6), (1, 1.6), (0, 0.0), (2, 2.2))
+    a, b, c, d, bottom, top = (s.tag(f"side {i}", body, at(1, y)) for i, (body, y) in enumerate(sides))
+    x = s.mesh.geometry.x
+    x[:, :2] += 2e-5 * np.stack([np.sin(3 * x[:, 0] + 2 * x[:, 1] + i) for i in range(2)], axis=1)
+    bcs = [uem.dirichlet(V, bottom), uem.dirichlet(V, top, value=(0.04, -0.06))]
+    F = elastic(uem.LinearElastic, u, v, 2)
+    return uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.Contact(a, b), uem.Contact(c, d)])
+
+
+def test_a_body_that_is_squeezed_out():
+    """A first step that throws the middle block out by many of its sizes is cut."""
+    problem = squeezed()
+    first = next(iter(uem.load_steps(problem, 4)))
+    assert first.cuts > 0 and COMM.allreduce(np.abs(problem.u.x.array).max(initial=0.0), op=MPI.MAX) < 2.0
+    assert problem.contacts[1].resultant().force[1] > 0.0
+
+
+def test_a_body_that_is_thrown_out():
+    """What ``solve`` cannot cut is told, and the bodies are where they were."""
+    problem = squeezed()
+    with pytest.raises(uem.ThrownBodyError, match="throws the body with its middle at .* out of the scene"):
+        problem.solve()
+    assert not problem.u.x.array.any()

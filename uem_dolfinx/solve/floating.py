@@ -39,6 +39,9 @@ TURN = 0.3
 #: Bodies without loads are as light as this part of the most loaded one: what touches them pushes them aside.
 #: [bound; the largest load; -]
 LIGHT = 1e-3
+#: A body that contact has pushed, and holds no more, has gone no farther than so many times the way of all else, deformations included.
+#: [heuristic; largest displacement in the step; test_unheld.py::test_a_body_that_is_squeezed_out]
+THROWN = 10.0
 #: A body that falls comes to rest in so many steps at most.
 #: [bound; steps; -]
 MOST_RIGID_STEPS = 200
@@ -93,6 +96,8 @@ class FloatingBodies:
         self.motions = self._at_rest
         #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
+        #: Less the displacement that the step began with, and less what bodies have fallen since ``(n_local, gdim)``.
+        self._went: Array = np.zeros((0, 0))
         #: Sum of the forces that the step began with; None before they were known.
         self._loads: float | None = None
         #: Likewise with those that friction alone resists, where all contactors slip.
@@ -129,6 +134,7 @@ class FloatingBodies:
         if self._far_apart is not None:
             self._far_apart.begin_step(self.motions is not None)
         if self.motions is not None:
+            self._went = -self._bodies.config.displacement
             self.motions.forget_supports()
             self._loads = None
             self._fall(place, freely=True)
@@ -143,7 +149,11 @@ class FloatingBodies:
         Raises:
             FloatingBodyError: in statics.
         """
-        if self.motions is None or self.motions.share <= LOADED:
+        if self.motions is None:
+            return
+        if self._bodies.dynamics is None:
+            self._refuse_thrown()
+        if self.motions.share <= LOADED:
             return
         told = (
             f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held where it is: its "
@@ -152,6 +162,24 @@ class FloatingBodies:
         if self._bodies.dynamics is None:
             raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest against a drag that fades")
         logger.warning(told)
+
+    def _refuse_thrown(self) -> None:
+        """Refuse a step in which contacts have thrown a body to where they hold it no more (collective).
+
+        Raises:
+            ThrownBodyError: naming the body.
+        """
+        motions, config = self.motions, self._bodies.config
+        assert motions is not None
+        if not self._open.shape[1]:
+            return
+        # what falls has not been thrown
+        way = (config.displacement + self._went)[: config.n_owned]
+        thrown = motions.part(self._open, way)
+        far, else_ = (np.linalg.norm(part, axis=1).max(initial=0.0) for part in (thrown, way - thrown))
+        far, else_ = reduced(self._bodies.comm, np.array([far, else_]), op=MPI.MAX)
+        if far > THROWN * else_ + TOUCHING * config.size:
+            raise motions.thrown(thrown, THROWN * else_)
 
     def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
         """Free components ``(n_rows, gdim)`` without those that hold neutral motions (collective).
@@ -269,6 +297,7 @@ class FloatingBodies:
             if self._far_apart is not None and self._far_apart.look_along(ways):
                 continue
             motions.config.shift(slice(None), ways)
+            self._went -= ways
             damping, before, changed = self._pace(damping, before, v), v, True
         raise motions.error(before)
 

@@ -16,10 +16,11 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
-from uem_dolfinx.errors import FloatingBodyError
+from uem_dolfinx.errors import FloatingBodyError, ThrownBodyError
 from uem_dolfinx.forms import product
 from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import rotation_matrix
 from uem_dolfinx.parallel import reduced
 
@@ -371,6 +372,26 @@ class RigidMotions:
             f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
             "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on; what "
             "swings or rolls comes to rest against a drag that fades"
+        )
+
+    def thrown(self, ways: Array, most: float) -> ThrownBodyError:
+        """What to tell about a body that contact has pushed by ``ways (n_owned, gdim)`` and holds no more (collective).
+
+        Args:
+            ways: of the owned nodes.
+            most: how far is far.
+        """
+        size, own = np.linalg.norm(ways, axis=1), self._body[: self.config.n_owned]
+        far = np.zeros(self.count)
+        np.maximum.at(far, own, size)
+        far = reduced(self.comm, far, op=MPI.MAX)
+        b = int(far.argmax())
+        at = own == b
+        where = reduced(self.comm, np.append((self.config.x[: self.config.n_owned] - ways)[at].sum(axis=0), float(at.sum())))
+        return ThrownBodyError(
+            f"contact throws the body with its middle at {described(where[:-1] / where[-1])} out of the scene: it goes {far[b]:.3g} in "
+            f"this step, where all else goes less than {most:.3g}, and nothing holds it there; take smaller load steps, hold it by a "
+            "Dirichlet condition or by friction, or give it inertia"
         )
 
 
