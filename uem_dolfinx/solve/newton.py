@@ -19,7 +19,7 @@ from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
-from uem_dolfinx.solve.norms import Norm, first, ratio, worst
+from uem_dolfinx.solve.norms import Norm, first, ratio, runs_away, worst
 from uem_dolfinx.solve.unheld import unheld
 
 #: A residual that keeps this part of its norm twice has met its rounding.
@@ -44,7 +44,6 @@ ACCURACY_AT_THE_END = 0.1
 #: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
 #: [convention; norm of the forces; test_trust.py::test_converged_means_converged]
 LARGEST_ROUNDING = 1e-4
-
 
 #: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
 InEquilibrium = Callable[[Norm, Norm, Norm], bool]
@@ -237,7 +236,7 @@ def solve_united(
 
     Raises:
         FloatingBodyError: if the residual stays and what is solved for grows, since nothing holds a body or a field.
-        ConvergenceError: after ``max_iterations``, or where an active set does not settle, with the history.
+        ConvergenceError: after ``max_iterations``, where the residual runs away, or where an active set does not settle, with the history.
         PrecisionError: if rounding hides whether the forces are in equilibrium.
         NotFiniteError: if the residual is NaN or infinite at the start of the step.
         InvertedElementError: if even the shortest step turns a cell inside out.
@@ -292,7 +291,7 @@ def solve_united(
         converged = steady and state.closed and bool(np.all(norm <= small))
         hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
         flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding)) < norm) & (norm <= rounding))
-        if converged or hidden or flown.any() or k == max_iterations:
+        if converged or hidden or flown.any() or (lost := runs_away([i.residual for i in history])) or k == max_iterations:
             history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
@@ -315,10 +314,10 @@ def solve_united(
         history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
         _report(history, verbose)
         length = _advance(bodies, method, problem, step, line_search)
-    last = history[-1]
+    last, more = history[-1], "" if lost else ", or raise max_iterations"
     raise ConvergenceError(
-        f"no convergence in {max_iterations} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
-        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps, or raise max_iterations",
+        f"no convergence in {k} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
+        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps{more}",
         history,
     )
 
