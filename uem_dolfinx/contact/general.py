@@ -22,7 +22,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general_parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.results import Resultant, sum_up
+from uem_dolfinx.contact.results import OfProblem, Resultant, sum_up
 from uem_dolfinx.contact.touching import Touch, forces_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.geometry.skin import Apart, Skin
 
 
-class GeneralContact(given.Sealed):
+class GeneralContact(OfProblem, given.Sealed):
     """Every surface against every other, and against rigid ones, by one declaration.
 
     Surfaces are found from the mesh; what does not come near anything costs next to nothing. Between two bodies the nodes of the one
@@ -140,7 +140,7 @@ class GeneralContact(given.Sealed):
         """
         from uem_dolfinx.geometry.skin import Skin
 
-        self.taken, self._config = True, config
+        self.taken, self._attached = True, config
         alone = [one for one in self.exclude if not _is_pair(one)]
         pairs = [one for one in self.exclude if _is_pair(one)]
         others = [c for c in others if not hasattr(c.target, "project")]

@@ -68,6 +68,20 @@ def imbalance(comm: MPI.Comm, x: Array, f: Array) -> Balance:
     )
 
 
+class OfProblem:
+    """What is of use in a problem only."""
+
+    name: str
+    _attached: Configuration | None = None
+
+    @property
+    def _config(self) -> Configuration:
+        """Configuration of the problem's displacement; a SurfaceError if it is in none."""
+        if self._attached is None:
+            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+        return self._attached
+
+
 class ContactResults:
     """What can be read from a contact after a step.
 

@@ -65,6 +65,7 @@ def animate(
     with agreed(problem.comm):
         if path.suffix not in (".gif", ".mp4"):
             raise InputError(given.sentence("path", str(path), "a name that ends in .gif or .mp4"))
+        given.kind("steps", steps, hasattr(steps, "__iter__"), "steps, as load_steps(problem, 20)")
         every = given.count("every", every)
         given.vector("size", size, 2)
         rate = given.number("frames_per_second", frames_per_second, given.POSITIVE)

@@ -76,6 +76,7 @@ def figure(
         drawn = path is not None and comm.rank == 0
         width, height = given.vector("size", size, 2)
         dpi = given.number("dpi", dpi, given.POSITIVE)
+        panels = given.count("panels", panels)
         canvas = new_canvas(f"the picture {path}", (panels * width, height)) if drawn else None
     with agreed(comm):
         if path is None or canvas is None:

@@ -328,7 +328,7 @@ class ResultsWriter(Closing, given.Sealed):
 
 def refuse_others(step: Any, problem: UnitedProblem) -> None:
     """Raise InputError for a step that another problem has made."""
-    number = getattr(step, "of_problem", 0)
+    number = getattr(step, "_of_problem", 0)
     if number and number != problem.progress.number:
         raise InputError(
             f"{step} is a step of another problem: expected one of the problem whose state is written; make a writer for each problem"

@@ -86,7 +86,7 @@ class SurfaceWriter(Closing, given.Sealed):
         """
         comm = self.problem.comm
         if self._closed:
-            raise ValueError(f"{self._index} is closed: expected rows before close()")
+            raise InputError(f"{self._index} is closed: expected rows before close()")
         with agreed(comm):
             refuse_others(step, self.problem)
             time = given.number("the time", clock(step))

@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 
 from mpi4py import MPI
 
-from uem_dolfinx.errors import CheckpointError, OutputError, UEMError
+from uem_dolfinx.errors import CheckpointError, InputError, OutputError, UEMError
 from uem_dolfinx.files import OwnFile, begin_file, given_path, in_use, keep_aside, new_folder, on_rank_0
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
@@ -165,9 +165,9 @@ class CsvTable(Closing):
         self._end += len(data)
 
     def check(self) -> None:
-        """Raise a ValueError once closed, a CheckpointError if a checkpoint was read after the table was made to go on with its file."""
+        """Raise an InputError once closed, a CheckpointError if a checkpoint was read after the table was made to go on with its file."""
         if self._closed:
-            raise ValueError(f"the table {self.path} is closed: write before close(), inside of its with block")
+            raise InputError(f"the table {self.path} is closed: write before close(), inside of its with block")
         if self._clock is not None and self._clock.resumed != self._resumed:
             raise CheckpointError(
                 f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "

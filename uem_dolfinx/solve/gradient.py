@@ -118,6 +118,9 @@ def taylor_test(functional: Callable[[float], float], slope: float, size: float 
     Raises:
         InputError: if J or the slope is not finite, or nothing is left of J at some h, which has no order.
     """
+    given.kind("functional", functional, callable(functional), "a function of h that returns a number")
+    slope, size = given.number("slope", slope, given.Range("a number", lambda x: True)), given.number("size", size)
+    halvings = given.count("halvings", halvings)
     first = functional(0.0)
     left = np.array([abs(functional(size / 2**k) - first - size / 2**k * slope) for k in range(halvings + 1)])
     with np.errstate(divide="ignore", invalid="ignore"):

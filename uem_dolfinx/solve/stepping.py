@@ -46,7 +46,9 @@ class ConvergedStep:
     def __repr__(self) -> str:
         """All that is not as by default but the history, of which the numbers of iterations and exchanges."""
         shown = {
-            name: value for name, value in vars(self).items() if name != "iterations" and value != getattr(type(self), name, None)
+            name: value
+            for name, value in vars(self).items()
+            if name != "iterations" and not name.startswith("_") and value != getattr(type(self), name, None)
         }
         shown |= {"newton_iterations": self.newton_iterations, "exchanges": self.exchanges}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
@@ -83,7 +85,7 @@ class Progress:
             ``(n_local, gdim)``.
         left: load factors at which calls of several ``Step`` were left before their end, and none of their later steps begun, by the
             number of the call that each of these counts as.
-        number: that tells the problem from others of this script, which its steps have as ``of_problem``.
+        number: that tells the problem from others of this script, which its steps have as ``_of_problem``.
     """
 
     steps: int = 0
@@ -245,7 +247,7 @@ def between_steps(
                     if told:
                         logger.info("%s", step.summary(contacts))
                     # steps are frozen but for this
-                    object.__setattr__(step, "of_problem", progress.number)
+                    object.__setattr__(step, "_of_problem", progress.number)
                     progress.inside = True
                     if checkpoint is not None:
                         checkpoint.hand_out(loop)

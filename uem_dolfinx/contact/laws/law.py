@@ -19,7 +19,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.thermal import OfTemperature
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
@@ -86,6 +86,9 @@ def of_rate(law: FrictionLaw) -> bool:
 def as_law(friction: Any) -> FrictionLaw:
     """The law that a contact was given: Coulomb's where it is a number or a function; refuse all else."""
     if hasattr(friction, "limit"):
+        given.kind(
+            "friction", friction, not isinstance(friction, type), "a number, a function or a law", "make the law with its numbers"
+        )
         return cast(FrictionLaw, friction)
     return Coulomb(friction if callable(friction) else given.number("friction", friction, given.NOT_NEGATIVE))
 
@@ -176,7 +179,12 @@ def asked_at(
     n = len(nodes)
     places = np.zeros((3, n))
     places[: config.gdim] = config.X[nodes].T
-    value = np.array(ask_together(config.comm, words, f, places, *more), dtype=float)
+    found = ask_together(config.comm, words, f, places, *more)
+    with agreed(config.comm):
+        try:
+            value = np.array(found, dtype=float)
+        except (TypeError, ValueError):
+            raise InputTypeError(given.sentence(f"{words}(x)", found, f"{n} numbers")) from None
     if more and value.ndim == 0:
         value = np.full(n, value)
     with agreed(config.comm):
