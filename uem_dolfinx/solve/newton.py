@@ -16,11 +16,11 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Ints
-from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError, PrecisionError
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.norms import Norm, first, ratio, runs_away, worst
-from uem_dolfinx.solve.unheld import unheld
+from uem_dolfinx.solve.unheld import no_precision, unheld
 
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
@@ -254,14 +254,16 @@ def solve_united(
         more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
         return np.maximum(np.maximum(rounding, left), more)
 
-    def bounded(rounding: Norm) -> Norm:
-        # of a displacement no larger than the model, than at the start, or than conditions lead it: bodies that fly excuse nothing
+    def bounded(rounding: Norm, forces: Norm) -> Norm:
+        # what is not small beside forces is rounding of a displacement as large as the model, as at the start, or as conditions lead it
         if not np.any(rounding > within):
             return rounding
-        return np.minimum(rounding, np.maximum(within, FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()))
+        of_model = FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()
+        return np.minimum(rounding, np.maximum(np.maximum(within, LARGEST_ROUNDING * forces), of_model))
 
     def in_equilibrium(norm: Norm, scale: Norm, rounding: Norm) -> bool:
-        return bool(np.all(norm <= np.maximum(rtol * np.maximum(scale, start), bounded(rounding_of_all(rounding, 1)))))
+        forces = np.maximum(scale, start)
+        return bool(np.all(norm <= np.maximum(rtol * forces, bounded(rounding_of_all(rounding, 1), forces))))
 
     method.place()
     if not bodies.assemble():
@@ -286,18 +288,18 @@ def solve_united(
         if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
             # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
             real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
-            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding))
+            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding, forces))
             small = np.where((small < norm) & (norm <= rounding), excused, small)
         converged = steady and state.closed and bool(np.all(norm <= small))
         hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
-        flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding)) < norm) & (norm <= rounding))
+        flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding, forces)) < norm) & (norm <= rounding))
         if converged or hidden or flown.any() or (lost := runs_away([i.residual for i in history])) or k == max_iterations:
             history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
                 return history
             if hidden:
-                raise _no_precision(*worst(norm, rounding, real))
+                raise no_precision(*worst(norm, rounding, real))
             if flown.any():
                 error = unheld(bodies, int(flown.argmax()), history[-1].residual)
                 # a shorter step may keep bodies in their contacts
@@ -319,15 +321,6 @@ def solve_united(
         f"no convergence in {k} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
         f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps{more}",
         history,
-    )
-
-
-def _no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
-    return PrecisionError(
-        f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {ratio(norm, real):.1g} of the forces at work, "
-        f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "
-        "forces; model them as rigid, give them less stiffness or less far to go, or raise rtol if that is accurate enough; bodies that "
-        "lie loose, with nothing to press them together yet, need a weight or a load"
     )
 
 

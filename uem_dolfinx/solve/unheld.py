@@ -1,4 +1,4 @@
-"""What nothing holds or resists: the body on which a field has flown off, and one that has no stiffness.
+"""What nothing holds or resists, and what rounding hides: a body on which a field has flown off, and one that has no stiffness.
 
 Rigid motions of bodies are looked at before they fly, by ``floating``; other fields when they have.
 """
@@ -10,11 +10,12 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.errors import FloatingBodyError, InputError
+from uem_dolfinx.errors import FloatingBodyError, InputError, PrecisionError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
+from uem_dolfinx.solve.norms import ratio
 
 
 def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
@@ -84,4 +85,14 @@ def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat 
     raise InputError(
         f"nothing resists {number[where]} nodes of the body with its middle at {described(sums[:-1] / sums[-1])}, as that at {place}: "
         f"expected terms in F that do; integrate F over its cells, too, with a stiffness, hold these nodes by Dirichlet conditions{remedy}"
+    )
+
+
+def no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
+    """What to tell about a residual of this norm, and this rounding, beside forces of the norm ``real``."""
+    return PrecisionError(
+        f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {ratio(norm, real):.1g} of the forces at work, "
+        f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "
+        "forces; model them as rigid, give them less stiffness or less far to go, or raise rtol if that is accurate enough; bodies that "
+        "lie loose, with nothing to press them together yet, need a weight or a load"
     )
