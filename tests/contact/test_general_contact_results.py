@@ -140,7 +140,9 @@ def test_rigid_surfaces(cell, mu):
     for touch, contact in zip(touching, declared):
         assert touch.n_active == contact.n_active > 0
         assert np.abs(touch.force - contact.resultant().force).max() < 1e-13 and touch.force.max() > 0.002
-        assert np.abs(general.between(touch.second, "body 1").force + touch.force).max() < 1e-15
+        on = general.between(touch.second, "body 1")
+        assert np.abs(on.force + touch.force).max() < 1e-15 and on.normal == pytest.approx(contact.resultant().normal, rel=1e-10)
+    assert general.resultant().normal == pytest.approx(sum(c.resultant().normal for c in declared), rel=1e-10)
 
 
 # -- what is told ------------------------------------------------------------------------------------------------------------

@@ -60,6 +60,9 @@ def test_as_declared_by_hand(cell, degree, h):
     flux, found = one.contacts[0].heat_flux.x.array, contact.heat_flux.x.array
     leads = flux != 0
     assert highest(COMM, np.abs(found - flux)[leads]) < 1e-9 * highest(COMM, np.abs(flux))
+    power = one.contacts[0].heat_power
+    assert contact.heat_power("body 2", "body 1") == pytest.approx(power, rel=1e-8) and power > 0
+    assert contact.heat_power("body 1") == pytest.approx(-power, rel=1e-8)
 
 
 @pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])

@@ -23,7 +23,7 @@ from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general_parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import OfProblem, Resultant, sum_up
-from uem_dolfinx.contact.touching import Touch, forces_of_pairs
+from uem_dolfinx.contact.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
@@ -321,7 +321,8 @@ class GeneralContact(OfProblem, given.Sealed):
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         rigid = [part.resultant(centre) for part in self.parts if not part.pair.target.n_nodes]
         nothing = sum_up(self._config.comm, np.zeros((0, g)), np.zeros((0, g)))
-        return Resultant(sum((r.force for r in rigid), nothing.force), sum((r.moment for r in rigid), nothing.moment))
+        total = sum((r.force for r in rigid), nothing.force), sum((r.moment for r in rigid), nothing.moment)
+        return Resultant(*total, sum(r.normal for r in rigid))
 
     def _sum(self, what: str) -> fem.Function:
         return self._of_all(what, np.add)
@@ -344,9 +345,13 @@ class GeneralContact(OfProblem, given.Sealed):
         Args:
             about: point that moments are taken about ``(gdim,)``; None is the origin.
         """
+        sums = self._sums_of_pairs(about)
+        return [(one.touch, one.moment) for one in sums if one.touch.n_active or one.touch.force.any()]
+
+    def _sums_of_pairs(self, about: npt.ArrayLike | None = None) -> list[Pair]:
         g, rigid = self._config.gdim, [self._rigid_name(part) for part in self.parts]
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
-        return forces_of_pairs(self.parts, self._skin, self._names, rigid, centre)
+        return sums_of_pairs(self.parts, self._skin, self._names, rigid, centre)
 
     def between(self, first: str, second: str | None = None, about: Any = None) -> Resultant:
         """Force and moment on a body from another one or from a rigid surface (collective).
@@ -359,18 +364,16 @@ class GeneralContact(OfProblem, given.Sealed):
         Raises:
             InputError: for an unknown name.
         """
+        return self._between(first, second, about)[0]
+
+    def heat_power(self, first: str, second: str | None = None) -> float:
+        """Power that goes from a body to another one or to a rigid surface, the heat of friction aside; see ``between`` (collective)."""
+        return self._between(first, second, None)[1]
+
+    def _between(self, first: str, second: str | None, about: Any) -> tuple[Resultant, float]:
         names = (*self._names, *(self._rigid_name(part) for part in self.parts if isinstance(part, RigidContact)))
-        given.word("first", first, names)
-        if second is not None:
-            given.word("second", second, names)
-        total = sum_up(self._config.comm, np.zeros((0, self._config.gdim)), np.zeros((0, self._config.gdim)))
-        force, moment = total.force * 1.0, total.moment * 1.0
-        for (a, b, _, f), m in self.forces_of_pairs(about):
-            if first == a and second in (None, b):
-                force, moment = force + f, moment + m
-            elif first == b and second in (None, a):
-                force, moment = force - f, moment - m
-        return Resultant(force, moment)
+        none = np.zeros((0, self._config.gdim))
+        return between(self._sums_of_pairs(about), names, first, second, sum_up(self._config.comm, none, none))
 
     def _rigid_name(self, part: Contact) -> str:
         """What ``touching`` calls the rigid surface of one of the contacts."""
