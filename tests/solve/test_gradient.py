@@ -286,3 +286,30 @@ def test_by_the_shape_from_a_cold_cache(axisymmetric):
     whole = revolved(J)
     explicit = ufl.derivative(whole, u, du), forms.by_places(whole, mesh, wave(V))
     assert sum(forms.assemble_scalar(forms.form(one), COMM) for one in explicit) == pytest.approx(dot(by, wave(V)), rel=1e-10)
+
+
+def test_parameters_that_have_changed():
+    """A load, a field, prescribed values, a target, nodes or the displacement of after the step: refused until they are back."""
+    s = pressed("triangle", rigid="plane", law="linear")
+    problem = s.solve()
+    (first,) = uem.gradient(problem, s.J, s.E)
+    places, target = s.b.scene.mesh.geometry.x, problem.contacts[0].target
+    for values, entry in (
+        (s.load.value, 0),
+        (s.field.x.array, ...),
+        (s.sides.x.array, ...),
+        (s.top.value, 1),
+        (places, (..., 0)),
+    ):
+        before = np.array(values)
+        values[entry] = 1.01 * values[entry] + 1e-3 * np.sin(np.arange(np.size(values[entry])).reshape(np.shape(values[entry])))
+        for ask in (lambda: uem.gradient(problem, s.J, s.E), lambda: uem.tangent(problem, [(s.E, 1.0)])):
+            refused(uem.InputError, "not that of the present parameters", ask)
+        values[...] = before
+    s.u.x.array[:] *= 1.001
+    refused(uem.InputError, "not that of the present parameters", lambda: uem.gradient(problem, s.J, s.E))
+    s.u.x.array[:] /= 1.001
+    target.move(np.array([0.0, 0.01]))
+    refused(uem.InputError, "not that of the present parameters", lambda: uem.gradient(problem, s.J, s.E))
+    target.move(np.zeros(2))
+    assert float(uem.gradient(problem, s.J, s.E)[0]) == pytest.approx(float(first), rel=1e-8)

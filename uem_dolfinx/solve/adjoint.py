@@ -50,10 +50,15 @@ from uem_dolfinx.form_checks import Control
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.derivatives import Derivatives, along, transposed, values_in
+from uem_dolfinx.solve.norms import ratio
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState, Rows
 from uem_dolfinx.solve.system import CLOSED, BodySystem
 from uem_dolfinx.solve.tangent import curvature_of
+
+#: A residual this many times what steps leave is of other parameters than the step's.
+#: [convention; norm of the residual; test_gradient.py::test_parameters_that_have_changed]
+MORE_THAN_LEFT = 1e3
 
 
 class Motion(NamedTuple):
@@ -118,6 +123,7 @@ class Linearised:
     def _linearise(self) -> None:
         system, state = self.problem.system, self._state()
         assert isinstance(system, BodySystem)
+        self._refuse_other_parameters(state)
         # no step begins: a factorisation of the same matrix goes on serving
         system.linearise(state, 1)
         self.K, self.G = self.problem.bodies.tangent.K, system.curvature
@@ -136,6 +142,25 @@ class Linearised:
         self.P, self.rows = state.trial, state.rows
         self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
         return state
+
+    def _refuse_other_parameters(self, state: BodyState) -> None:
+        """Refuse a displacement that is no equilibrium of the present parameters (collective)."""
+        problem, bodies = self.problem, self.problem.bodies
+        largest, found = np.maximum(state.scale, problem.largest_forces), ""
+        if np.any(state.norm > MORE_THAN_LEFT * np.maximum(problem.rtol * largest, state.rounding)):
+            found = f"forces are not in equilibrium, with a residual of {ratio(state.norm, largest):.1g} of the forces at work"
+        if problem.progress.ramp == 0 or problem.progress.factor == 1.0:
+            compat.set_bc_values(bodies.wanted, bodies.bcs)
+            if not bodies.dirichlet_met():
+                found = "the displacement has other values than Dirichlet conditions prescribe"
+            bodies.wanted[:] = problem.u.x.array
+        if not found and not state.closed:
+            found = "contactors are not where their targets are"
+        if found:
+            raise InputError(
+                f"the displacement is not that of the present parameters: {found}; expected Constants, Functions, Dirichlet values, "
+                "targets and nodes as the last step left them; put them back, or solve again"
+            )
 
     def _tell_idle(self) -> None:
         """Count contactors at which functionals have a gradient on either side (collective)."""

@@ -53,8 +53,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 
     Raises:
         InputError, InputTypeError: for a problem whose gradient needs the history of all steps, one without a step, one without the
-            consistent tangent, or what is no functional or no control of this problem; for a J of the pressures of contactors in
-            concave corners of the target, or of those whose equations conflict.
+            consistent tangent, one whose parameters have changed since the last step, or what is no functional or no control of this
+            problem; for a J of the pressures of contactors in concave corners of the target, or of those whose equations conflict.
         LinearSolveError: if the united matrix is singular.
     """
     check_problem(problem, recorded=False)
