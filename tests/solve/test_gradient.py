@@ -203,7 +203,7 @@ def test_what_is_refused():
     the_change = "the change in direction[0]"
     for control, change, words in (
         (s.load, 1.0, f"{the_change} = 1.0: expected finite numbers of shape (2,)"),
-        (s.E, np.nan, f"{the_change} = nan: expected finite numbers of shape ()"),
+        (s.E, np.nan, f"{the_change} = nan: expected finite numbers"),
         (s.field, s.u, f"{the_change} is a Function of another space: expected one of the control's space"),
         (s.X, s.field, f"{the_change} is a Function of another space: expected one of the displacement's space"),
     ):

@@ -270,8 +270,10 @@ def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change
             values = np.asarray(change, dtype=float)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence(what, change, f"finite numbers of shape {shape}")) from None
-        if values.shape != shape or not np.isfinite(values).all():
+        if values.shape != shape:
             raise InputError(given.sentence(what, change, f"finite numbers of shape {shape}"))
+        if not np.isfinite(values).all():
+            raise InputError(given.sentence(what, change, "finite numbers"))
         return
     of, whose = problem.config.V, "the displacement's"
     if isinstance(control, fem.Function):
