@@ -37,6 +37,11 @@ class AmongBodies(NodeToSurface):
             return NothingNear.at(self, points)
         return super().place(points, state)
 
+    def begin_step(self) -> None:
+        """Lists are those that the step began with."""
+        super().begin_step()
+        self.target.neighbours.begin_step()
+
     def look_farther(self) -> bool:
         """Reach four times as far: whether that is not beyond the whole model yet."""
         return self.target.number == 0 and self.target.neighbours.look_farther()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -127,12 +127,13 @@ class Neighbours:
         #: Number of the order that they keep.
         self.number = next(_orders)
         self._made_at: Array | None = None
-        self._kept, self._made_in_attempt, self._farther = False, False, 0.0
+        self._kept, self._farther = False, 0.0
         self._reach = np.zeros(skin.n_bodies)
         self._lasts = self._reach
         self.lists: list[Listing] = []
         #: How often lists have been made.
         self.times_made = 0
+        self._at_start: tuple[Any, ...] | None = None
 
     def _motion(self, since: Array) -> Array:
         """Largest motion of each body's surface on this rank ``(n_bodies,)``."""
@@ -150,15 +151,25 @@ class Neighbours:
             if (self._reach < self._overlap).any():
                 self._made_at = None
             self._overlap = self._farther = 0.0
+            self._at_start = None
         stale = self._made_at is None or bool((self._motion(self._made_at) > self._lasts).any())
-        # lists made where bodies had moved to in an attempt do not outlive it
-        stale = stale or (self._made_in_attempt and not self._motion(self._committed).any())
         if reduced(self._config.comm, stale, op=MPI.LOR):
             self._make()
+        if self._at_start is None:
+            self._at_start = self._memory()
+
+    def begin_step(self) -> None:
+        """A step begins, for the first time or anew: with the lists that an earlier attempt began with, whatever it has made."""
+        if self._at_start is not None and not self._kept:
+            self.lists, self.body, held, self._reach, self._lasts, self._made_at, self._overlap, self._farther = self._at_start
+            self.held = held.copy()
 
     def commit(self) -> None:
         """A step has been kept, or is gone back to: nodes are in front of facets from where they are when they are next looked at."""
         self._kept = True
+
+    def _memory(self) -> tuple[Any, ...]:
+        return self.lists, self.body, self.held.copy(), self._reach, self._lasts, self._made_at, self._overlap, self._farther
 
     def look_farther(self) -> bool:
         """Reach four times as far from the next placement on, until a step is kept: whether that is not beyond the whole model yet."""
@@ -173,7 +184,6 @@ class Neighbours:
         motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
         self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), max(self._farther, self._overlap))
         self._made_at = config.x.copy()
-        self._made_in_attempt = bool(self._motion(self._committed).any())
         self.times_made += 1
         # what facets' ranks have to know of a node, which goes where a facet may be in reach
         n, g, own = len(self.nodes), config.gdim, skin.body_of_node[self.nodes]

@@ -396,6 +396,7 @@ class UnitedProblem(given.Sealed):
             self.dynamics.restore()
         for pair in self.interfaces:
             pair.restore()
+            pair.discretisation.begin_step()
             pair.project()
 
     def state(self) -> State:
