@@ -86,6 +86,8 @@ class Interface(Told):
         self.heat: Heat | None = None
         none: Bools = np.zeros(n, dtype=bool)
         self.redundant = self.reserved = self.barred = none
+        #: ``reserved`` and ``redundant`` as the step began.
+        self._at_start: tuple[Bools, Bools] | None = None
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -392,7 +394,7 @@ class Interface(Told):
         """Tie contactors to the target for good, between two steps, as of ``Tie``; to be followed by ``project`` (collective)."""
         assert self.tie is not None
         self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
-        self.reserved = self.reserved & ~self.tied
+        self._at_start = self.reserved & ~self.tied, self.redundant
         self.restore()
 
     def commit(self) -> None:
@@ -407,11 +409,12 @@ class Interface(Told):
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
+        if not fresh.active.any():
+            self.reserved = np.zeros_like(self.reserved)
+        self._at_start = self.reserved, self.redundant
         self.restore()
         self.discretisation.commit()
         self._wear()
-        if not self.trial.active.any():
-            self.reserved = np.zeros_like(self.reserved)
 
     def _wear(self) -> None:
         """Let gaps be larger by what the committed state has worn (collective)."""
@@ -421,6 +424,8 @@ class Interface(Told):
     def restore(self) -> None:
         """Go back to the committed state; to be followed by ``project``."""
         self.trial = self.committed
+        if self._at_start is not None:
+            self.reserved, self.redundant = self._at_start
         if self.tie is not None:
             self.tie.lose()
 
@@ -434,6 +439,7 @@ class Interface(Told):
         if self.tie is not None:
             # what has been tied since then stays so
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
+        self._at_start = self.reserved, self.redundant
         self.discretisation.commit()
         if self.friction is not None:
             self.friction.forget()
