@@ -35,7 +35,16 @@ from pathlib import Path
 import common
 import numpy as np
 from common import comm
-from benchmarks import cases_bending, cases_friction, cases_motion, cases_pressing, cases_scales, cases_touching, methods
+from benchmarks import (
+    cases_attempts,
+    cases_bending,
+    cases_friction,
+    cases_motion,
+    cases_pressing,
+    cases_scales,
+    cases_touching,
+    methods,
+)
 from benchmarks.cases import COLUMNS, Column, Trial, judge
 from benchmarks.cases_scales import springs
 
@@ -52,6 +61,7 @@ every = [
     *cases_bending.CASES,
     *cases_friction.CASES,
     *cases_motion.CASES,
+    *cases_attempts.CASES,
 ]
 rows = [c for c in every if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
 if not columns or not rows:

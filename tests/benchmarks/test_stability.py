@@ -6,13 +6,22 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from benchmarks import cases_bending, cases_friction, cases_motion, cases_pressing, cases_scales, cases_touching, methods
+from benchmarks import (
+    cases_attempts,
+    cases_bending,
+    cases_friction,
+    cases_motion,
+    cases_pressing,
+    cases_scales,
+    cases_touching,
+    methods,
+)
 from benchmarks.cases import COLUMNS, FORCE, Case, Check, judge
 from benchmarks.cases_laws import check_laws
 from benchmarks.cases_scales import springs
 
 COMM = MPI.COMM_WORLD
-TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_friction, cases_motion)
+TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_friction, cases_motion, cases_attempts)
 CASES = {case.name: case for m in TABLES for case in m.CASES}
 UNITED, MORTAR = COLUMNS[:2]
 

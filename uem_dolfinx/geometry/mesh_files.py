@@ -132,7 +132,7 @@ def check_cells(cells: Ints, points: Array, path: str) -> None:
     same = (ordered[by_nodes[1:]] == ordered[by_nodes[:-1]]).all(axis=1)
     bad = (
         ("a node twice", (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)),
-        ("a node whose coordinates are not finite", ~np.isfinite(points).all(axis=1)[cells].all(axis=1)),
+        ("a node whose coordinates are not finite", ~np.isfinite(points)[cells].all(axis=(1, 2))),
         ("the nodes of another cell", np.isin(np.arange(len(cells)), by_nodes[1:][same])),
     )
     for what, rows in bad:
