@@ -82,12 +82,10 @@ class Interface(Told):
         state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
-        self.initial_overlap, self.mutual = 0.0, False
         self.heat: Heat | None = None
         none: Bools = np.zeros(n, dtype=bool)
         self.redundant = self.reserved = self.barred = none
-        #: ``reserved`` and ``redundant`` as the step began.
-        self._at_start: tuple[Bools, Bools] | None = None
+        self.initial_overlap, self.mutual, self._at_start = 0.0, False, (none, none)
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -409,8 +407,7 @@ class Interface(Told):
         passed = self.off | (self.trial.passed & (self.projection.gap < 0))
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
-        if not fresh.active.any():
-            self.reserved = np.zeros_like(self.reserved)
+        self.reserved = self.reserved & bool(fresh.active.any())
         self._at_start = self.reserved, self.redundant
         self.restore()
         self.discretisation.commit()
@@ -424,8 +421,7 @@ class Interface(Told):
     def restore(self) -> None:
         """Go back to the committed state; to be followed by ``project``."""
         self.trial = self.committed
-        if self._at_start is not None:
-            self.reserved, self.redundant = self._at_start
+        self.reserved, self.redundant = self._at_start
         if self.tie is not None:
             self.tie.lose()
 
