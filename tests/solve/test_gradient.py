@@ -306,6 +306,13 @@ def test_parameters_that_have_changed():
         for ask in (lambda: uem.gradient(problem, s.J, s.E), lambda: uem.tangent(problem, [(s.E, 1.0)])):
             refused(uem.InputError, "not that of the present parameters", ask)
         values[...] = before
+    # a thousand times what rtol = 1e-13 leaves of the forces lies between these changes of the load
+    loaded = np.array(s.load.value)
+    s.load.value[0] = (1 + 2e-10) * loaded[0]
+    uem.gradient(problem, s.J, s.E)
+    s.load.value[0] = (1 + 3e-9) * loaded[0]
+    refused(uem.InputError, "not that of the present parameters", lambda: uem.gradient(problem, s.J, s.E))
+    s.load.value[...] = loaded
     s.u.x.array[:] *= 1.001
     refused(uem.InputError, "not that of the present parameters", lambda: uem.gradient(problem, s.J, s.E))
     s.u.x.array[:] /= 1.001

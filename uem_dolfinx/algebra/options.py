@@ -28,7 +28,7 @@ FEW_ITERATIONS = 200
 FACTORISED_UP_TO = {2: 3_000_000, 3: 200_000}
 #: GMRES stagnates where many contactors slip if it forgets what it has found: after so many vectors, which take no more memory than a
 #: matrix in 3D, it does, or leaves the matrix to a factorisation that pays.
-#: [convention; iterations; test_linear_solver.py::test_gmres_gives_way]
+#: [bound; iterations; test_linear_solver.py::test_gmres_gives_way]
 GMRES_RESTART = 100
 #: Errors of PETSc that say that it has no such type, or no such factorisation.
 NO_SUCH_TYPE = (86, 92)

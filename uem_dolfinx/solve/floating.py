@@ -40,7 +40,7 @@ TURN = 0.3
 #: [bound; the largest load; -]
 LIGHT = 1e-3
 #: A body that contact has pushed, and holds no more, has gone no farther than so many times the way of all else, deformations included.
-#: [heuristic; largest displacement in the step; test_unheld.py::test_a_body_that_is_squeezed_out]
+#: [heuristic; largest displacement in the step; test_unheld.py::test_a_body_that_is_thrown_out]
 THROWN = 10.0
 #: A body that falls comes to rest in so many steps at most.
 #: [bound; steps; -]

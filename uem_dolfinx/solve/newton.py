@@ -42,7 +42,7 @@ FORCING = 1e-4
 #: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
 ACCURACY_AT_THE_END = 0.1
 #: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
-#: [convention; norm of the forces; test_trust.py::test_converged_means_converged]
+#: [bound; norm of the forces; test_trust.py::test_converged_means_converged]
 LARGEST_ROUNDING = 1e-4
 
 #: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
