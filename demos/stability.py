@@ -35,18 +35,10 @@ from pathlib import Path
 import common
 import numpy as np
 from common import comm
-from benchmarks import (
-    cases_attempts,
-    cases_bending,
-    cases_friction,
-    cases_motion,
-    cases_pressing,
-    cases_scales,
-    cases_touching,
-    methods,
-)
+from benchmarks import methods
 from benchmarks.cases import COLUMNS, Column, Trial, judge
 from benchmarks.cases_scales import springs
+from benchmarks.every_case import CASES
 
 import uem_dolfinx as uem
 
@@ -54,18 +46,9 @@ args = common.arguments(__doc__, quick=False, methods="all", cases="all", known=
 asked, picked = args.methods.split(","), args.cases.split(",")
 COLUMN_NAMES = [column.name for column in COLUMNS]
 columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.method in asked]
-every = [
-    *cases_scales.CASES,
-    *cases_touching.CASES,
-    *cases_pressing.CASES,
-    *cases_bending.CASES,
-    *cases_friction.CASES,
-    *cases_motion.CASES,
-    *cases_attempts.CASES,
-]
-rows = [c for c in every if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
+rows = [c for c in CASES if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
 if not columns or not rows:
-    sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in every)}")
+    sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in CASES)}")
 # what other runs have found, by case and method, and their condition numbers: files of theirs are --known
 known = [json.loads(Path(file).read_text(encoding="utf-8")) for file in args.known.split(",") if file]
 known_cells = {(cell["case"], cell["method"]): cell for run in known for cell in run["cells"]}

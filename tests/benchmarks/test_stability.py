@@ -6,28 +6,19 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from benchmarks import (
-    cases_attempts,
-    cases_bending,
-    cases_friction,
-    cases_motion,
-    cases_pressing,
-    cases_scales,
-    cases_touching,
-    methods,
-)
+from benchmarks import methods
 from benchmarks.cases import COLUMNS, FORCE, Case, Check, judge
 from benchmarks.cases_laws import check_laws
 from benchmarks.cases_scales import springs
+from benchmarks.every_case import CASES as EVERY
 
 COMM = MPI.COMM_WORLD
-TABLES = (cases_scales, cases_touching, cases_pressing, cases_bending, cases_friction, cases_motion, cases_attempts)
-CASES = {case.name: case for m in TABLES for case in m.CASES}
+CASES = {case.name: case for case in EVERY}
 UNITED, MORTAR = COLUMNS[:2]
 
 
 def test_names_are_told_apart_on_the_command_line():
-    assert len(CASES) == sum(len(m.CASES) for m in TABLES)
+    assert len(CASES) == len(EVERY)
     assert not any("," in name for name in CASES)
     assert len({column.name for column in COLUMNS}) == len(COLUMNS)
     assert {column.method for column in COLUMNS} == set(methods.METHODS)

@@ -22,7 +22,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general_parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.results import OfProblem, Resultant, sum_up
+from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.contact.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import on_axis
@@ -266,7 +266,7 @@ class GeneralContact(OfProblem, given.Sealed):
     def parts(self) -> list[Contact]:
         """The contacts that it consists of: bodies with bodies, one for each that a node may touch at once, and with each rigid surface."""
         if not self._parts:
-            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+            raise not_attached(self.name)
         return self._parts
 
     @property

@@ -84,8 +84,8 @@ class Interface(Told):
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.heat: Heat | None = None
         none: Bools = np.zeros(n, dtype=bool)
-        self.redundant = self.reserved = self.barred = none
-        self.initial_overlap, self.mutual, self._at_start = 0.0, False, (none, none)
+        self.redundant = self.reserved = self.barred = self._redundant = self._reserved = none
+        self.initial_overlap, self.mutual = 0.0, False
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -392,7 +392,7 @@ class Interface(Told):
         """Tie contactors to the target for good, between two steps, as of ``Tie``; to be followed by ``project`` (collective)."""
         assert self.tie is not None
         self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
-        self._at_start = self.reserved & ~self.tied, self.redundant
+        self._reserved, self._redundant = self.reserved & ~self.tied, self.redundant
         self.restore()
 
     def commit(self) -> None:
@@ -408,7 +408,7 @@ class Interface(Told):
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
         self.reserved = self.reserved & bool(fresh.active.any())
-        self._at_start = self.reserved, self.redundant
+        self._reserved, self._redundant = self.reserved, self.redundant
         self.restore()
         self.discretisation.commit()
         self._wear()
@@ -421,7 +421,7 @@ class Interface(Told):
     def restore(self) -> None:
         """Go back to the committed state; to be followed by ``project``."""
         self.trial = self.committed
-        self.reserved, self.redundant = self._at_start
+        self.reserved, self.redundant = self._reserved, self._redundant
         if self.tie is not None:
             self.tie.lose()
 
@@ -435,7 +435,7 @@ class Interface(Told):
         if self.tie is not None:
             # what has been tied since then stays so
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
-        self._at_start = self.reserved, self.redundant
+        self._reserved, self._redundant = self.reserved, self.redundant
         self.discretisation.commit()
         if self.friction is not None:
             self.friction.forget()

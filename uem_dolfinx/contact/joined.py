@@ -58,7 +58,7 @@ class JoinedInterface(Interface):
         self.reserved, self.redundant, self.barred = (
             np.concatenate([getattr(pair, name) for pair in own]) for name in ("reserved", "redundant", "barred")
         )
-        self._at_start = self.reserved, self.redundant
+        self._reserved, self._redundant = self.reserved, self.redundant
 
     @property
     def members(self) -> Sequence[Interface]:

@@ -54,18 +54,6 @@ class Member(Interface):
     # -- states ----------------------------------------------------------------------------------------------------------
 
     @property
-    def _at_start(self) -> tuple[Bools, Bools]:  # type: ignore[override]
-        reserved, redundant = self.joined._at_start
-        return reserved[self._rows], redundant[self._rows]
-
-    @_at_start.setter
-    def _at_start(self, began: tuple[Bools, Bools]) -> None:
-        every = tuple(a.copy() for a in self.joined._at_start)
-        for whole, part in zip(every, began):
-            whole[self._rows] = part
-        self.joined._at_start = every
-
-    @property
     def trial(self) -> PairState:  # type: ignore[override]
         """State of the present iteration."""
         return self.joined.state_of(self._k, self.joined.trial)
@@ -92,6 +80,8 @@ class Member(Interface):
     reserved = _rows_of("reserved")
     redundant = _rows_of("redundant")
     barred = _rows_of("barred")
+    _reserved = _rows_of("_reserved")
+    _redundant = _rows_of("_redundant")
 
     @property
     def mutual(self) -> bool:  # type: ignore[override]

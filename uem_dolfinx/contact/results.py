@@ -68,6 +68,11 @@ def imbalance(comm: MPI.Comm, x: Array, f: Array) -> Balance:
     )
 
 
+def not_attached(name: str) -> SurfaceError:
+    """What to tell about a contact that is asked for what it has in a problem only."""
+    return SurfaceError(f"contact '{name}' belongs to no problem yet: hand it to a UnitedProblem first")
+
+
 class OfProblem:
     """What is of use in a problem only."""
 
@@ -78,7 +83,7 @@ class OfProblem:
     def _config(self) -> Configuration:
         """Configuration of the problem's displacement; a SurfaceError if it is in none."""
         if self._attached is None:
-            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+            raise not_attached(self.name)
         return self._attached
 
 
@@ -112,7 +117,7 @@ class ContactResults:
                 "reaction of the conditions on either side"
             )
         if self._pair is None:
-            raise SurfaceError(f"contact '{self.name}' belongs to no problem yet: hand it to a UnitedProblem first")
+            raise not_attached(self.name)
         return self._pair
 
     @property

@@ -13,7 +13,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.geometry.nodes import Nodes, described
 from uem_dolfinx.parallel import reduced
 
 
@@ -38,6 +38,12 @@ def rotations(sums: Array) -> Array:
     left, _, right = np.linalg.svd(sums)
     left[:, :, -1] *= np.where(np.linalg.det(left @ right) < 0, -1.0, 1.0)[:, None]
     return np.asarray(left @ right)
+
+
+def middle(comm: MPI.Comm, places: Array) -> str:
+    """Mean of the places ``(n, gdim)`` of all ranks, for error messages (collective)."""
+    sums = reduced(comm, np.append(places.sum(axis=0), float(len(places))))
+    return described(sums[:-1] / sums[-1])
 
 
 _FOUND: WeakKeyDictionary[Nodes, tuple[Ints, int]] = WeakKeyDictionary()

@@ -96,6 +96,10 @@ class Asking(NamedTuple):
     held: Ints
 
 
+#: What placing bodies changes in ``Neighbours``; a step that begins anew has it as it began.
+OF_A_STEP = ("lists", "body", "held", "_reach", "_lasts", "_made_at", "_overlap", "_farther")
+
+
 class Neighbours:
     """Lists of what surface nodes may touch, one for each of the bodies that a node may touch at once (collective).
 
@@ -133,7 +137,7 @@ class Neighbours:
         self.lists: list[Listing] = []
         #: How often lists have been made.
         self.times_made = 0
-        self._at_start: tuple[Any, ...] | None = None
+        self._at_start: dict[str, Any] | None = None
 
     def _motion(self, since: Array) -> Array:
         """Largest motion of each body's surface on this rank ``(n_bodies,)``."""
@@ -156,20 +160,16 @@ class Neighbours:
         if reduced(self._config.comm, stale, op=MPI.LOR):
             self._make()
         if self._at_start is None:
-            self._at_start = self._memory()
+            self._at_start = {name: getattr(self, name) for name in OF_A_STEP} | {"held": self.held.copy()}
 
     def begin_step(self) -> None:
         """A step begins, for the first time or anew: with the lists that an earlier attempt began with, whatever it has made."""
         if self._at_start is not None and not self._kept:
-            self.lists, self.body, held, self._reach, self._lasts, self._made_at, self._overlap, self._farther = self._at_start
-            self.held = held.copy()
+            vars(self).update(self._at_start, held=self._at_start["held"].copy())
 
     def commit(self) -> None:
         """A step has been kept, or is gone back to: nodes are in front of facets from where they are when they are next looked at."""
         self._kept = True
-
-    def _memory(self) -> tuple[Any, ...]:
-        return self.lists, self.body, self.held.copy(), self._reach, self._lasts, self._made_at, self._overlap, self._farther
 
     def look_farther(self) -> bool:
         """Reach four times as far from the next placement on, until a step is kept: whether that is not beyond the whole model yet."""

@@ -18,9 +18,8 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.errors import FloatingBodyError, ThrownBodyError
 from uem_dolfinx.forms import product
-from uem_dolfinx.geometry.bodies import find_bodies, rigid_velocities
+from uem_dolfinx.geometry.bodies import find_bodies, middle, rigid_velocities
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import rotation_matrix
 from uem_dolfinx.parallel import reduced
 
@@ -386,10 +385,9 @@ class RigidMotions:
         np.maximum.at(far, own, size)
         far = reduced(self.comm, far, op=MPI.MAX)
         b = int(far.argmax())
-        at = own == b
-        where = reduced(self.comm, np.append((self.config.x[: self.config.n_owned] - ways)[at].sum(axis=0), float(at.sum())))
+        where = middle(self.comm, (self.config.x[: self.config.n_owned] - ways)[own == b])
         return ThrownBodyError(
-            f"contact throws the body with its middle at {described(where[:-1] / where[-1])} out of the scene: it goes {far[b]:.3g} in "
+            f"contact throws the body with its middle at {where} out of the scene: it goes {far[b]:.3g} in "
             f"this step, where all else goes less than {most:.3g}, and nothing holds it there; take smaller load steps, hold it by a "
             "Dirichlet condition or by friction, or give it inertia"
         )

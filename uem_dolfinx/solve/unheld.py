@@ -11,7 +11,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import FloatingBodyError, InputError, PrecisionError
-from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.bodies import find_bodies, middle
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies import Bodies
@@ -39,12 +39,11 @@ def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
         cells, _ = np.nonzero(compat.cell_dofs(bodies.u.function_space) == node)
         where = int(body[compat.cell_dofs(config.V)[cells[0], 0]])
     where = comm.bcast(where, root=-rank)
-    here = config.X[: config.n_owned][body[: config.n_owned] == where]
-    sums = reduced(comm, np.append(here.sum(axis=0), float(len(here))))
+    here = middle(comm, config.X[: config.n_owned][body[: config.n_owned] == where])
     name = config.unknowns.names[field] if config.unknowns.mixed else bodies.u.name
     what = f"part {name} of the mixed space" if name.isdigit() else f"the {config.name} '{name}'"
     return FloatingBodyError(
-        f"nothing holds {what} on the body with its middle at {described(sums[:-1] / sums[-1])}: it becomes {largest:.3g} there, and "
+        f"nothing holds {what} on the body with its middle at {here}: it becomes {largest:.3g} there, and "
         f"{residual:.3g} of what drives it is left; give it a Dirichlet condition, or something that its value is to reach equilibrium with"
     )
 
@@ -79,11 +78,10 @@ def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat 
     where = int(number.argmax())
     offers = comm.allgather([described(config.X[i]) for i in nodes[own[nodes] == where][:1]])
     place = next(offer[0] for offer in offers if offer)
-    here = config.X[:n][own == where]
-    sums = reduced(comm, np.append(here.sum(axis=0), float(len(here))))
+    here = middle(comm, config.X[:n][own == where])
     remedy = ", or make it rigid by a RigidCoupling of its cells" if config.moves else ""
     raise InputError(
-        f"nothing resists {number[where]} nodes of the body with its middle at {described(sums[:-1] / sums[-1])}, as that at {place}: "
+        f"nothing resists {number[where]} nodes of the body with its middle at {here}, as that at {place}: "
         f"expected terms in F that do; integrate F over its cells, too, with a stiffness, hold these nodes by Dirichlet conditions{remedy}"
     )
 
