@@ -45,6 +45,19 @@ def test_crossings_are_those_of_a_slow_search(seed, g, size):
 
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize(("height", "crosses"), [(1e-16, False), (-1e-16, False), (1e-12, False), (1e-9, True)])
+def test_points_that_ride_on_facets(height, crosses, size):
+    """A point that goes with a facet's corner crosses no facet by rounding; one that comes from clearly above it does."""
+    x0 = size * np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 0.0]]])
+    for angle in (0.5, 1.5, 2.8):
+        x1, reach = x0 @ rotation(2, angle).T, 0.1 * size
+        point = size * np.array([[0.5, height]])
+        end = size * np.array([[0.5, -height]]) @ rotation(2, angle).T
+        found = find_crossings((point, x0), (end, x1), np.ones(2), reach)
+        assert ((found.point == 0) & (found.facet == 0)).any() == crosses
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
 @pytest.mark.parametrize("g", [2, 3])
 def test_ways_as_seen_from_facets(g, size):
     """What moves rigidly by any angle crosses nothing; what else moves crosses the same facets if all turns by up to a right angle."""

@@ -127,15 +127,15 @@ def test_read_back(folder):
 RUN = """
 from pathlib import Path
 import sys
+import ramp_scenes
 from ramp_scenes import COMM, RAMPS
-import uem_dolfinx as uem
 
-class Telling(uem.Checkpoint):
+class Counting(ramp_scenes.Killed):
     def step(self):
         super().step()
         print(self._state.steps, flush=True)
 
-uem.Checkpoint = Telling
+ramp_scenes.Killed = Counting
 RAMPS[{kind!r}](COMM).run(Path({folder!r}), every=2)
 """
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from helpers import blocks, environment, linear, serial, start_process
 from ramp_scenes import COMM, five_steps, nothing
@@ -74,7 +75,7 @@ def test_one_rank_is_interrupted_outside_of_steps(number, within, monkeypatch):
 @pytest.mark.parametrize("what", ["load", "constant", "distance", "friction", "damping", "mass"])
 def test_functions_that_end_one_rank(what, kind):
     """Whatever a function of the user's raises on one rank, and be it the end of the script, ends all ranks alike."""
-    b, now = blocks(COMM, "triangle"), []
+    b, now, made = blocks(COMM, "triangle"), [], []
 
     def fail(value):
         if now and COMM.rank == COMM.size - 1:
@@ -82,10 +83,10 @@ def test_functions_that_end_one_rank(what, kind):
         return value
 
     weight = fem.Constant(b.scene.mesh, 0.0)
-    ground = uem.RigidSurface(lambda x: fail(x[:, 1]), lambda x: np.tile([0.0, 1.0], (len(x), 1)))
+    ground = uem.RigidSurface(lambda x: fail(x[:, 1]) if not made else end(x), lambda x: np.tile([0.0, 1.0], (len(x), 1)))
     options = {
         "load": lambda: {"load": lambda factor: fail(None)},
-        "constant": lambda: {"load": {weight: fail}},
+        "constant": lambda: {"load": {weight: fail}, "F": linear(b.u, 1.0) - weight * ufl.TestFunction(b.V)[0] * ufl.dx},
         "distance": dict,
         "friction": lambda: {"contacts": [uem.Contact(b.high, b.low, friction=lambda x: fail(0.1))]},
         "damping": lambda: {"dynamics": uem.Dynamics(uem.lumped_mass(b.V, 1.0), damping=fail)},
@@ -97,11 +98,10 @@ def test_functions_that_end_one_rank(what, kind):
         # the functions of a surface are asked where there are contactors
         now.extend([1] * (what != "distance"))
         given = {"bcs": b.oedometer(0.05), "contacts": contacts} | options()
-        problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, **given)
+        problem = uem.UnitedProblem(given.pop("F", linear(b.u, 1.0)), b.u, **given)
         owners = COMM.allgather(len(problem.contacts[0].nodes) > 0)
         now.extend([1] * (COMM.rank == owners.index(True)))
-        if what == "distance" and now:
-            ground.distance = end
+        made.extend([1] * (what == "distance" and bool(now)))
         for _ in uem.load_steps(problem, 1):
             pass
 

@@ -21,6 +21,9 @@ from uem_dolfinx.parallel import Exchange
 #: Halvings that find a time to the last bit.
 #: [bound; halvings; -]
 HALVINGS = 53
+#: Who leaves the plane of a facet by less than this part of the reach rides on it.
+#: [bound; the reach; test_crossings.py::test_points_that_ride_on_facets]
+BY_ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
@@ -85,11 +88,11 @@ def find_crossings(
         return -np.einsum("kg,kg->k", n, x[:, 0]), x, n
 
     every = np.arange(len(i))
-    bounds = _extremes(lambda t: height(t, every)[0], -further, 1.0 + further)
-    passed = np.stack([height(t, every)[0] >= 0 for t in bounds])
+    times = np.stack(_extremes(lambda t: height(t, every)[0], -further, 1.0 + further))
+    volumes, _, normals = (np.stack(parts) for parts in zip(*(height(t, every) for t in times)))
+    passed, leaves = volumes >= 0, np.abs(volumes) > BY_ROUNDING * reach * np.linalg.norm(normals, axis=2)
     # from one bound to the next, all of which are halved together
-    interval, k = np.nonzero(passed[:-1] != passed[1:])
-    times = np.stack(bounds)
+    interval, k = np.nonzero((passed[:-1] != passed[1:]) & leaves[:-1] & leaves[1:])
     low, high, falls = times[interval, k], times[interval + 1, k], passed[interval, k]
     for _ in range(HALVINGS if len(k) else 0):
         middle = 0.5 * (low + high)

@@ -286,7 +286,8 @@ def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest
         if k == 0:
             new = active & ~pair.committed.active & (p.gap >= 0.0)
             behind[new] = np.einsum("ng,ng->n", end - x, pair.projection.normal)[new]
-        outside = (p.gap >= 0.0) | (k == 0) | ((k == places) & active)
+        # at the end contactors may rest on a face to rounding
+        outside = (p.gap >= (-PASSAGE_DEPTH * target.stride if k == places else 0.0)) | (k == 0) | ((k == places) & active)
         passed = outside & (deepest > PASSAGE_DEPTH * target.stride) & ~pair.tied
         passed &= (_dot(entry, p.normal) < LOOKING_AWAY) | (moving & ~active)
         depth = np.where(passed, np.maximum(depth, deepest), depth)
