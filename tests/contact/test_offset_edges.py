@@ -80,6 +80,17 @@ def test_what_rounds_an_edge(scale, offset, rounds):
     assert (there.normal != p.normal).any() == rounds
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e3])
+@pytest.mark.parametrize(("away", "rounds"), [(1e-17, False), (1e-15, False), (1e-9, True)])
+def test_points_on_their_feet(away, rounds, scale):
+    """A point that is where its foot is, to rounding, keeps the facet's normal whatever its offset."""
+    x, _, _ = SCENES["2D"]
+    x, point = scale * x, scale * away * np.array([-0.8, 0.6])
+    p = projected(point, x, True, normal_of(x))
+    there = p.across_edges(point[None], np.array([0.1 * scale]))
+    assert (there.normal != p.normal).any() == rounds
+
+
 def test_small_arcs_round_when_the_bound_moves(monkeypatch):
     """The bound decides: an offset of 0.1 facets rounds no edge where the bound is 0.2."""
     x, point, _ = SCENES["2D"]

@@ -11,8 +11,8 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 
-#: A way from the foot that leans from the facet's normal by less, in the cosine of the angle, leans by rounding.
-#: [bound; cosine; -]
+#: A way from the foot that is shorter, in lengths of the facet, or leans from its normal by less, is rounding.
+#: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]
 ALONG_NORMAL = 1e-12
 #: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.
 #: [heuristic; length of the facet; test_offset_edges.py::test_what_rounds_an_edge]
@@ -196,7 +196,9 @@ class FacetProjection:
         """Of ``points (n, gdim)`` at ``offset (n,)``, those in front of an edge that it rounds, with the normal along the way from it."""
         away = points - self.foot
         length, lean = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.normal)
-        beside = (np.abs(lean) < (1.0 - ALONG_NORMAL) * length) & ~self.beyond.any(axis=1)
+        # the way of a point on its foot has a direction by rounding alone
+        beside = (length > ALONG_NORMAL * self.facet_size) & (np.abs(lean) < (1.0 - ALONG_NORMAL) * length)
+        beside &= ~self.beyond.any(axis=1)
         side = np.where(lean < 0.0, -1.0, 1.0)
         # an arc about the edge with the offset as its radius, and as far again on both sides
         beside &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
