@@ -33,7 +33,6 @@ from uem_dolfinx.solve.checks import check_conditions, check_materials, check_re
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
-from uem_dolfinx.solve.passages import refuse_passages
 from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
@@ -349,9 +348,11 @@ class UnitedProblem(given.Sealed):
                 check_signals=lambda: self.progress.check_signals(self.comm),
             )
             self.system.end_step()
-            on = {id(contact.pair.whole) for contact in self.contacts if contact.on}
-            pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on)) if on else ((), ())
-            refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
+            if on := {id(contact.pair.whole) for contact in self.contacts if contact.on}:
+                from uem_dolfinx.solve.passages import refuse_passages
+
+                pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on))
+                refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
         except UEMError as error:
             self.restore()
             if isinstance(error, MENDABLE):
