@@ -119,6 +119,13 @@ def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
             raise SpaceError(f"{what} holds {held} of another mesh: expected all of {mesh}; make both on one mesh")
 
 
+def check_values(what: str, expression: Any, own: Any, mesh: str) -> None:
+    """Refuse a UFL expression without values, which holds a test or trial function, by an InputError, and as ``check_expression``."""
+    if any(isinstance(part, ufl.Argument) for part in ufl.corealg.traversal.traverse_unique_terminals(expression)):
+        raise InputError(f"{what} holds a test or trial function: expected values alone; put a Function in its place")
+    check_expression(what, expression, own, mesh)
+
+
 def check_parts(what: str, form: ufl.Form, u: fem.Function) -> None:
     """Refuse a form of ``u.sub(i)``, of which derivatives by u would know nothing, by an InputError."""
     for f in form.coefficients():

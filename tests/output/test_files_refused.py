@@ -146,14 +146,14 @@ def test_drawing_that_fails(folder):
     """What rank 0 alone draws, and what users hand it, fails on all ranks alike."""
     pytest.importorskip("matplotlib")
     problem = pressed(COMM, "triangle")
-    raised(ValueError, "no such colours", lambda: uem.plot_scene(problem, folder / "a.png", cmap="no such colours"))
+    raised(uem.InputError, "no such colours", lambda: uem.plot_scene(problem, folder / "a.png", cmap="no such colours"))
 
     def curve(s):
         raise ZeroDivisionError("no such curve")
 
-    raised(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, folder / "b.png", reference=curve))
+    raised(uem.UserFunctionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, folder / "b.png", reference=curve))
     with uem.figure(folder / "c.png", COMM) as (panel,):
-        raised(ZeroDivisionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, panel, reference=curve))
+        raised(uem.UserFunctionError, "no such curve", lambda: uem.plot_pressure(problem.contacts, panel, reference=curve))
 
 
 class Unsendable(Exception):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from helpers import blocks, linear, raised
 from ramp_scenes import COMM, five_steps, nothing
 
@@ -23,6 +25,77 @@ def closed(folder):
     writer.write(0.0)
 
 
+def fails_on_the_last_rank(h):
+    if COMM.rank == COMM.size - 1:
+        raise ValueError("on this rank alone")
+    return h * h
+
+
+def one_step():
+    problem, begin = five_steps(False, nothing)
+    next(iter(begin(None)))
+    return problem
+
+
+def elsewhere():
+    """A scene on another mesh."""
+    return blocks(COMM, "triangle")
+
+
+def write(folder, field):
+    problem, _ = five_steps(False, nothing)
+    b = field(problem)
+    uem.ResultsWriter(folder / "r", problem, fields={"a": b})
+
+
+def over_other_mesh(control):
+    problem = one_step()
+    b = elsewhere()
+    own = fem.Constant(problem.u.function_space.mesh, 1.0)
+    uem.gradient(problem, own * problem.u[0] * ufl.dx, [control(b)])
+
+
+def functional_of_other_mesh():
+    problem = one_step()
+    uem.gradient(problem, elsewhere().u[0] * ufl.dx, [fem.Constant(problem.u.function_space.mesh, 1.0)])
+
+
+def history_of_other_mesh():
+    problem, begin = five_steps(False, nothing)
+    with uem.recording(problem) as history:
+        next(iter(begin(None)))
+    history.gradient(elsewhere().u[0] * ufl.dx, [fem.Constant(problem.u.function_space.mesh, 1.0)])
+
+
+def of_law(v):
+    b = elsewhere()
+    uem.VonMises(b.u, 1.0, 0.3, 1.0, kind="plane_strain").residual(v(b))
+
+
+def drawn(folder, name="x.png", **how):
+    pytest.importorskip("matplotlib")
+    uem.plot_scene(five_steps(False, nothing)[0], folder / name, **how)
+
+
+def profile(folder, contacts=None, **how):
+    pytest.importorskip("matplotlib")
+    uem.plot_pressure(five_steps(False, nothing)[0].contacts if contacts is None else contacts, folder / "x.png", **how)
+
+
+def film(folder, **how):
+    pytest.importorskip("matplotlib")
+    problem, begin = five_steps(False, nothing)
+    list(uem.animate(folder / "x.gif", problem, begin(None), **how))
+
+
+def wrong(x):
+    raise KeyError("the user's fault")
+
+
+def moved_back(motions):
+    five_steps(False, nothing)[0].state().move(motions)
+
+
 CASES = {
     "general contact's force": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().resultant()),
     "general contact's bodies": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().touching()),
@@ -39,6 +112,56 @@ CASES = {
         uem.InputTypeError, "steps = 3", lambda f: list(uem.animate(f / "x.gif", five_steps(False, nothing)[0], 3)),
     ),
     "no panels": (uem.InputError, "panels = 0", lambda f: uem.figure(f / "x.png", COMM, 0).__enter__()),
+    "a functional of words": (uem.InputTypeError, "functional.0. = 'x'", lambda f: uem.taylor_test(lambda h: "x", 1.0)),
+    "a functional that fails on one rank": (
+        uem.UserFunctionError, "functional.0. raised ValueError", lambda f: uem.taylor_test(fails_on_the_last_rank, 0.0),
+    ),
+    "places of another mesh": (
+        uem.SpaceError, r"controls.0. holds .* another mesh", lambda f: over_other_mesh(lambda b: ufl.SpatialCoordinate(b.V.mesh)),
+    ),
+    "a field of another mesh": (uem.SpaceError, r"controls.0. holds .* another mesh", lambda f: over_other_mesh(lambda b: b.u)),
+    "a functional of another mesh": (uem.SpaceError, "J is integrated over another mesh", lambda f: functional_of_other_mesh()),
+    "a history's functional of another mesh": (
+        uem.SpaceError, "J is integrated over another mesh", lambda f: history_of_other_mesh(),
+    ),
+    "gradient of a number": (uem.InputTypeError, "u = 3", lambda f: uem.displacement_gradient(3)),
+    "gradient without a mesh": (uem.InputTypeError, "u = ", lambda f: uem.displacement_gradient(ufl.as_vector([1.0, 2.0]))),
+    "gradient of a scalar": (uem.InputError, r"u has the shape \(\)", lambda f: uem.displacement_gradient(elsewhere().u[0])),
+    "variation of a number": (uem.InputTypeError, "u = 3", lambda f: of_law(lambda b: 3)),
+    "variation of a scalar": (uem.InputError, r"u has the shape \(\)", lambda f: of_law(lambda b: ufl.TestFunction(b.V)[0])),
+    "elastic variation of a number": (
+        uem.InputTypeError, "u = 3", lambda f: uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(elsewhere().u, 3),
+    ),
+    "a field of five components": (
+        uem.InputError, r"has the shape \(5,\)", lambda f: write(f, lambda p: ufl.as_vector([p.u[0]] * 5)),
+    ),
+    "a field of three indices": (
+        uem.InputError, r"has the shape \(2, 2, 2\)", lambda f: write(f, lambda p: ufl.grad(ufl.grad(p.u))),
+    ),
+    "a test function as field": (
+        uem.InputError, "holds a test or trial function", lambda f: write(f, lambda p: ufl.TestFunction(p.u.function_space)),
+    ),
+    "motions by number": (uem.InputTypeError, "motions = 3", lambda f: moved_back(3)),
+    "motions of words": (uem.InputTypeError, "motions.0. = 'up'", lambda f: moved_back(["up"])),
+    "motions of other contacts": (uem.InputError, "motions has 7 items", lambda f: moved_back([None] * 7)),
+    "an unknown ending": (uem.InputError, "a name that ends in", lambda f: drawn(f, "x.foo")),
+    "an unknown colour map": (uem.InputError, "did you mean 'rainbow'", lambda f: drawn(f, cmap="rainbow9")),
+    "a colour map by number": (uem.InputTypeError, "cmap = 3", lambda f: drawn(f, cmap=3)),
+    "a test function drawn": (
+        uem.InputError, "field holds a test or trial", lambda f: drawn(f, field=ufl.TestFunction(elsewhere().V)[0]),
+    ),
+    "a drawn field of another mesh": (uem.SpaceError, "of another mesh", lambda f: drawn(f, field=elsewhere().u[0])),
+    "a picture of negative width": (uem.InputError, r"size = \(-1, 2\)", lambda f: drawn(f, size=(-1, 2))),
+    "a film of no height": (uem.InputError, r"size = \(1, 0\)", lambda f: film(f, size=(1, 0))),
+    "a coordinate that raises": (uem.UserFunctionError, "along raised KeyError", lambda f: profile(f, along=wrong)),
+    "a coordinate of more numbers": (uem.InputError, r"along\(x\) has shape", lambda f: profile(f, along=lambda x: x)),
+    "a coordinate of words": (uem.InputTypeError, r"along\(x\) = ", lambda f: profile(f, along=lambda x: ["a"] * len(x))),
+    "a reference of one number": (uem.InputError, r"reference\(x\) has shape", lambda f: profile(f, reference=lambda s: 1.0)),
+    "a window the wrong way round": (uem.InputError, "a lower bound and a larger", lambda f: profile(f, window=(1.0, 0.0))),
+    "pressure of no contact": (uem.InputError, r"contacts = \[\]", lambda f: profile(f, [])),
+    "pressure of a number": (uem.InputTypeError, r"contacts\[0\] = 3", lambda f: profile(f, [3])),
+    "outline of nothing": (uem.InputTypeError, "problem = None", lambda f: uem.outline(None)),
+    "outline of no size": (uem.InputError, "scale = nan", lambda f: uem.outline(five_steps(False, nothing)[0], np.nan)),
 }  # fmt: skip
 
 

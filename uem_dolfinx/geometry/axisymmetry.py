@@ -14,10 +14,11 @@ from mpi4py import MPI
 
 import numpy as np
 import ufl
+from ufl.core.expr import Expr
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.errors import MeshError
+from uem_dolfinx.errors import InputError, MeshError
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.parallel import agree, reduced
 
@@ -91,12 +92,23 @@ def displacement_gradient(u: Any) -> Any:
 
     ``I + displacement_gradient(u)`` is the deformation gradient F, with ``F_33 = 1 + u_r / r``. On the axis, where no point of quadrature
     is but nodes are, the hoop strain is that along the radius.
+
+    Raises:
+        InputTypeError: if it is no UFL expression of a mesh.
+        InputError: if it is no vector with a component for each dimension of the mesh.
     """
+    expected, domains = "a displacement or its variation, as a Function or a TestFunction", []
+    if isinstance(u, Expr):
+        domains = list(ufl.domain.extract_domains(u))
+    given.kind("u", u, bool(domains), expected)
+    if u.ufl_shape != (shape := ufl.SpatialCoordinate(domains[0]).ufl_shape):
+        raise InputError(
+            f"u has the shape {u.ufl_shape}: expected {expected}, of {shape}; among other fields take its part of ufl.split(u)"
+        )
     G = ufl.grad(u)
     if not is_axisymmetric(u):
         return G
-    (domain,) = ufl.domain.extract_domains(u)
-    r = ufl.SpatialCoordinate(domain)[0]
+    r = ufl.SpatialCoordinate(domains[0])[0]
     hoop = ufl.conditional(ufl.gt(r, 0.0), u[0] / r, G[0, 0])
     return ufl.as_tensor([[G[0, 0], G[0, 1], 0], [G[1, 0], G[1, 1], 0], [0, 0, hoop]])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.frames import Frame, Gathering, Pieces
@@ -58,6 +60,10 @@ class Drawing:
                         given.sentence("percentiles", percentiles, "two of them, from 0 to 100, the smaller one first")
                     )
             self.view = checked_view(gdim, view)
+            if hasattr(field, "ufl_shape"):
+                check_values("field", field, problem.config.mesh.ufl_domain(), "the displacement's mesh")
+            if problem.comm.rank == 0:
+                _check_colours(cmap)
         if gdim == 3:
             pictures3d.require(problem.comm)
         size = "|u|" if problem.config.moves else problem.u.name
@@ -91,6 +97,28 @@ def checked_window(gdim: int, window: Sequence[float] | None) -> Array | None:
     if not (np.diff(ends) > 0).all():
         raise InputError(given.sentence("window", window, "on each axis a lower bound and a larger upper one"))
     return ends
+
+
+def checked_size(size: Any) -> tuple[float, float]:
+    """Width and height of a picture in inches, with the errors of ``plot_scene``."""
+    width, height = given.vector("size", size, 2)
+    if not min(width, height) > 0:
+        raise InputError(given.sentence("size", size, "a positive width and height in inches"))
+    return float(width), float(height)
+
+
+def _check_colours(name: Any) -> None:
+    """Refuse a colour map that matplotlib does not know; where there is none, who draws says so."""
+    with suppress(ImportError):
+        from matplotlib import colormaps
+        from matplotlib.colors import Colormap
+
+        if not isinstance(name, Colormap):
+            known = list(colormaps)
+            given.kind("cmap", name, isinstance(name, str), "the name of a colour map of matplotlib, or one of them")
+            if name not in known:
+                remedy = given.did_you_mean(name, known, "matplotlib.colormaps lists them")
+                raise InputError(given.sentence("cmap", name, "the name of a colour map of matplotlib", remedy))
 
 
 def _refuse_of_other_dimension(gdim: int, name: str, value: Any) -> None:

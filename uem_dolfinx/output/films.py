@@ -10,7 +10,7 @@ from uem_dolfinx import given
 from uem_dolfinx.errors import InputError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY, on_rank_0
 from uem_dolfinx.log import logger
-from uem_dolfinx.output.drawings import Drawing
+from uem_dolfinx.output.drawings import Drawing, checked_size
 from uem_dolfinx.output.frames import Frame
 from uem_dolfinx.output.pictures import new_canvas, plot_scene
 from uem_dolfinx.output.tables import given_path
@@ -67,7 +67,7 @@ def animate(
             raise InputError(given.sentence("path", str(path), "a name that ends in .gif or .mp4"))
         given.kind("steps", steps, hasattr(steps, "__iter__"), "steps, as load_steps(problem, 20)")
         every = given.count("every", every)
-        given.vector("size", size, 2)
+        size = checked_size(size)
         rate = given.number("frames_per_second", frames_per_second, given.POSITIVE)
         known = {name: value for name, value in (plot_scene.__kwdefaults__ or {}).items() if name not in ("size", "dpi")}
         for name in how:

@@ -11,11 +11,13 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.output.sections import Shape, rigid_shapes, sections, solid_cells
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
@@ -201,7 +203,16 @@ def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:
     Args:
         problem: the scene.
         scale: magnification of the displacement.
+
+    Raises:
+        InputTypeError: if it is no problem, or the scale no number.
+        InputError: for a 3D scene, whose bodies end in no line.
     """
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    with agreed(problem.comm):
+        scale = given.number("scale", scale)
+        if problem.config.gdim == 3:
+            raise InputError("outline: the outside of a 3D scene has no outline: expected a 2D one; draw it by plot_scene")
     parts = problem.comm.gather(vertex_positions(problem, scale)[boundary(problem.config.mesh)])
     return None if parts is None else np.concatenate(parts)
 

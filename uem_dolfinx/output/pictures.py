@@ -15,13 +15,14 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.errors import MissingBackendError, OutputError
+from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.errors import InputError, InputTypeError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
-from uem_dolfinx.output.drawings import Drawing, checked_view, checked_window
+from uem_dolfinx.output.drawings import Drawing, checked_size, checked_view, checked_window
 from uem_dolfinx.output.frames import gather_contactors
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, ask
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -51,6 +52,14 @@ def new_canvas(what: str, size: tuple[float, float]) -> Any:
     return canvas
 
 
+def _check_ending(path: str | Path, known: Sequence[str]) -> None:
+    """Refuse a picture in a format that matplotlib does not write; without an ending it is a .png."""
+    ending = Path(path).suffix
+    if ending and ending[1:].lower() not in known:
+        remedy = given.did_you_mean(ending, [f".{one}" for one in known], "rename it")
+        raise InputError(given.sentence("picture", str(path), f"a name that ends in .{', .'.join(known)}", remedy))
+
+
 @contextmanager
 def figure(
     path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
@@ -68,16 +77,19 @@ def figure(
         The panels: matplotlib Axes on rank 0, None elsewhere. Hand them to :func:`plot_scene` and :func:`plot_pressure`.
 
     Raises:
+        InputError, InputTypeError: for an argument out of its range, or a name whose ending is no format of matplotlib's.
         MissingBackendError: if matplotlib cannot be imported.
         OutputError: if the picture cannot be written.
         Exception: what rank 0 raises in drawing, on all ranks.
     """
     with agreed(comm):
         drawn = path is not None and comm.rank == 0
-        width, height = given.vector("size", size, 2)
+        width, height = checked_size(size)
         dpi = given.number("dpi", dpi, given.POSITIVE)
         panels = given.count("panels", panels)
         canvas = new_canvas(f"the picture {path}", (panels * width, height)) if drawn else None
+        if canvas is not None and isinstance(path, (str, Path)):
+            _check_ending(path, list(canvas.canvas.get_supported_filetypes()))
     with agreed(comm):
         if path is None or canvas is None:
             yield [None] * panels
@@ -282,30 +294,52 @@ def plot_pressure(
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
+        InputError, InputTypeError: for no contact, or a function that returns anything else than a number for each point.
+        UserFunctionError: if a function raises.
     """
-    pairs: list[Contact] = list(contacts) if isinstance(contacts, Sequence) else [contacts]
+    pairs: list[Contact] = given.items("contacts", [contacts] if _is_contact(contacts) else contacts, _is_contact, "a contact")
+    if not pairs:
+        raise InputError(given.sentence("contacts", contacts, "a contact or several"))
+    with agreed(pairs[0].config.comm):
+        shown = checked_window(1, window)
     found = [gather_contactors(contact, 0.0) for contact in pairs]
     file = BytesIO()
     with _panel(file if picture is ... else picture, pairs[0].config.comm) as ax:
         if ax is not None:
             gdim = pairs[0].config.gdim
             along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))
-            curves = [(along(at), pressure) for at, _, pressure in found]
+            curves = [(_curve("along", along, at, len(at)), pressure) for at, _, pressure in found]
             pressed = np.concatenate([s[p > 0] for s, p in curves])
-            if window is None:
+            if shown is None:
                 lo, hi = (pressed.min(), pressed.max()) if len(pressed) else (0.0, 1.0)
                 lo = -hi if mirror else (0.0 if gdim == 3 else lo)
-                window = (lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo))
+                shown = np.array([[lo - 0.25 * (hi - lo) if lo < 0 or gdim == 2 else lo, hi + 0.25 * (hi - lo)]])
             if reference is not None:
-                s = np.linspace(*window, 1001)
-                ax.plot(s, reference(s), color="0.25", lw=1.2, label=reference_label, zorder=1)
+                s = np.linspace(shown[0, 0], shown[0, 1], 1001)
+                ax.plot(s, _curve("reference", reference, s, len(s)), color="0.25", lw=1.2, label=reference_label, zorder=1)
             for contact, (s, p) in zip(pairs, curves):
                 if mirror:
                     s, p = np.concatenate([-s, s]), np.concatenate([p, p])
                 ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else contact_label, zorder=2)
-            ax.set(xlim=window, xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
+            ax.set(xlim=shown[0], xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
             # room above pressures that are all the same
             ax.set_ylim(0.0, max(ax.get_ylim()[1], 1.05 * max(float(p.max(initial=0.0)) for _, p in curves)))
             ax.grid(alpha=0.25)
             ax.legend(frameon=False)
     return Picture(file.getvalue()) if picture is ... else None
+
+
+def _is_contact(one: Any) -> bool:
+    return isinstance(one, (Contact, GeneralContact))
+
+
+def _curve(what: str, f: Callable[[Array], Any], at: Array, n: int) -> Array:
+    """What a function of a user's tells of n points, which ``what`` names ``(n,)``; raises as ``plot_pressure``, on this rank."""
+    found = ask(what, f, at)
+    try:
+        values = np.asarray(found, dtype=float)
+    except (TypeError, ValueError):
+        raise InputTypeError(given.sentence(f"{what}(x)", found, f"{n} numbers")) from None
+    if values.shape != (n,):
+        raise InputError(f"{what}(x) has shape {values.shape}: expected {n} numbers")
+    return values

@@ -16,7 +16,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
-from uem_dolfinx.form_checks import check_expression
+from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.output.columns import Columns
 from uem_dolfinx.output.pair_tables import PairTables
@@ -345,7 +345,12 @@ def _check_fields(fields: Any, mesh: Any) -> None:
     for name, field in (fields or {}).items():
         given.name("the name of a field", name, "write _ for a blank")
         given.kind(f"fields[{name!r}]", field, hasattr(field, "ufl_shape"), "a UFL expression")
-        check_expression(f"fields[{name!r}]", field, mesh.ufl_domain(), "the displacement's mesh")
+        if len(field.ufl_shape) > 2 or any(n > 3 for n in field.ufl_shape):
+            raise InputError(
+                f"fields[{name!r}] has the shape {field.ufl_shape}: expected a scalar, a vector of up to 3 components or a tensor of up to "
+                "(3, 3), as files of results hold; write its components as fields of their own"
+            )
+        check_values(f"fields[{name!r}]", field, mesh.ufl_domain(), "the displacement's mesh")
 
 
 def clock(step: LoadStep | TimeStep | float) -> float:

@@ -18,10 +18,13 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
 
+#: In words, an item of ``State.motions()``.
+A_MOTION = "what motions() of a state returned: None, or where a rigid surface is, as a dict"
 #: Sides of a cell are fewer.
 #: [format; sides; -]
 MOST_SIDES = 8
@@ -170,7 +173,18 @@ class State(given.Sealed):
         return [None if m is None else {f.name: getattr(m, f.name).tolist() for f in fields(Motion)} for m in motions]
 
     def move(self, motions: list[dict[str, Any] | None]) -> None:
-        """Put the contacts' rigid surfaces where they were."""
+        """Put the contacts' rigid surfaces where they were.
+
+        Raises:
+            InputTypeError: for what ``motions`` does not return.
+            InputError: for those of another number of contacts.
+        """
+        names = {f.name for f in fields(Motion)}
+        given.items("motions", motions, lambda m: m is None or (isinstance(m, dict) and set(m) <= names), A_MOTION)
+        if len(motions) != len(self.contacts):
+            raise InputError(
+                f"motions has {len(motions)} items: expected one for each of the {len(self.contacts)} contacts of the state"
+            )
         for contact, motion in zip(self.contacts, motions):
             moved = None if motion is None else Motion(**{name: np.array(v) for name, v in motion.items()})
             contact.pair.target.motion = moved

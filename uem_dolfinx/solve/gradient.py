@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -17,9 +19,9 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.errors import InputError, InputTypeError
-from uem_dolfinx.form_checks import Control, check_functional, check_parts
+from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodySystem
@@ -61,7 +63,7 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
     with agreed(problem.comm):
         given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
-        check_functional("J", J)
+        check_functional("J", J, problem.config.mesh)
         check_parts("J", J, problem.u)
     pressing = _check_results(problem, J)
     from uem_dolfinx.solve.adjoint import Adjoint, Linearised
@@ -103,33 +105,46 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
         return motion.du if contact is None else linearised.pressed(contact, motion)
 
 
-def taylor_test(functional: Callable[[float], float], slope: float, size: float = 1e-2, halvings: int = 4) -> float:
-    """Order with which ``|J(h) - J(0) - h slope|`` vanishes with h: 2 if ``slope`` is the derivative of J, else 1.
+def taylor_test(
+    functional: Callable[[float], float], slope: float, size: float = 1e-2, halvings: int = 4, comm: MPI.Comm = MPI.COMM_WORLD
+) -> float:
+    """Order with which ``|J(h) - J(0) - h slope|`` vanishes with h: 2 if ``slope`` is the derivative of J, else 1 (collective).
 
     Args:
         functional: J(h), as of controls that have been changed by h in one direction and a problem that was solved anew with them.
         slope: the derivative of J by h at 0, as from :func:`gradient`.
         size: the first h.
         halvings: how often it is halved.
+        comm: communicator of the ranks that call this: an error on one of them is raised on all.
 
     Returns:
         The least order of all halvings.
 
     Raises:
+        InputTypeError: if J is no number.
         InputError: if J or the slope is not finite, or nothing is left of J at some h, which has no order.
+        UserFunctionError: if the functional raises an error.
     """
     given.kind("functional", functional, callable(functional), "a function of h that returns a number")
     slope, size = given.number("slope", slope, given.Range("a number", lambda x: True)), given.number("size", size)
     halvings = given.count("halvings", halvings)
-    first = functional(0.0)
-    left = np.array([abs(functional(size / 2**k) - first - size / 2**k * slope) for k in range(halvings + 1)])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        order = float(np.log2(left[:-1] / left[1:]).min())
-    if not np.isfinite(left).all() or np.isnan(order):
-        raise InputError(
-            f"taylor_test: |J(h) - J(0) - h slope| = {left} for h from {size} on has no order: expected a finite J and slope, and a J that "
-            "is not linear in h"
-        )
+
+    def J(h: float) -> float:
+        """Its value, a number on all ranks."""
+        value = ask_together(comm, f"functional({h:g})", functional, h)
+        with agreed(comm):
+            return given.number(f"functional({h:g})", value, given.Range("a number", lambda x: True))
+
+    first = J(0.0)
+    left = np.array([abs(J(size / 2**k) - first - size / 2**k * slope) for k in range(halvings + 1)])
+    with agreed(comm):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            order = float(np.log2(left[:-1] / left[1:]).min())
+        if not np.isfinite(left).all() or np.isnan(order):
+            raise InputError(
+                f"taylor_test: |J(h) - J(0) - h slope| = {left} for h from {size} on has no order: expected a finite J and slope, and a J "
+                "that is not linear in h"
+            )
     return order
 
 
@@ -200,6 +215,8 @@ def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
                 raise InputError(
                     f"{what}[{i}] holds '{control.name}', a result of a contact: expected what the problem is made of"
                 )
+            if isinstance(control, (fem.Function, ufl.SpatialCoordinate)):
+                check_expression(f"{what}[{i}]", control, problem.config.mesh.ufl_domain(), "the displacement's mesh")
             if isinstance(control, ufl.SpatialCoordinate):
                 _check_shape(problem)
             if isinstance(control, ContactParameter):

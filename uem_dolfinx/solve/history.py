@@ -200,7 +200,7 @@ class History(given.Sealed):
                 if functional is not None:
                     what = "J" if one else f"J[{k}]"
                     given.kind(what, functional, not functional.empty(), "a UFL form with an integral")
-                    check_functional(what, functional)
+                    check_functional(what, functional, problem.config.mesh)
                     refuse_results(functional)
                     self._refuse_unknown(what, functional)
         # the same form in several steps stays the same
