@@ -12,6 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
+from deck_scenes import deck, with_middles
 from dolfinx import fem
 from helpers import refused
 
@@ -22,28 +23,6 @@ from uem_dolfinx.geometry.simplices import divided
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD
-#: Types of CalculiX' elements by kinds.
-TYPES = {
-    "quad": "CPS4", "triangle": "CPS3", "quad8": "CPE8R", "triangle6": "CPS6", "hexahedron": "C3D8I", "wedge": "C3D6", "pyramid": "C3D5",
-    "tetra": "C3D4", "hexahedron20": "C3D20R", "wedge15": "C3D15", "pyramid13": "C3D13", "tetra10": "C3D10",
-}  # fmt: skip
-
-
-def deck(folder, name, points, blocks, more=""):
-    """An input file of blocks, each of a kind and its cells; numbers of nodes and elements are ten times those from 1."""
-    lines, count = ["*HEADING", "cells", "*NODE, NSET=all"], 0
-    lines += [", ".join([str(10 * n), *(f"{x:.17g}" for x in p)]) for n, p in enumerate(points, 1)]
-    for kind, cells in blocks.items():
-        lines.append(f"*Element, type={TYPES[kind]}, ELSET={kind}")
-        for cell in np.atleast_2d(cells):
-            count += 1
-            numbers = [str(10 * (n + 1)) for n in cell]
-            lines += [", ".join([str(10 * count), *numbers[:10]]) + ("," if numbers[10:] else "")]
-            lines += [", ".join(numbers[10:])] if numbers[10:] else []
-    if COMM.rank == 0:
-        (folder / name).write_text("\n".join(lines) + "\n" + more, encoding="utf-8")
-    COMM.barrier()
-    return folder / name
 
 
 def measure(mesh, dx):
@@ -53,25 +32,6 @@ def measure(mesh, dx):
 def outside(mesh):
     """Volume, and measure of all exterior facets, which holds those that do not fit each other."""
     return measure(mesh, ufl.dx(domain=mesh)), measure(mesh, ufl.ds(domain=mesh))
-
-
-def with_middles(points, blocks):
-    """The same cells with nodes in the middle of edges."""
-    edges = {}
-    x, found = list(points), {}
-    for kind, cells in blocks.items():
-        rows = []
-        for cell in cells:
-            middles = []
-            for edge in KINDS[kind].edges:
-                ends = tuple(sorted(cell[i] for i in edge))
-                if ends not in edges:
-                    edges[ends] = len(x)
-                    x.append((x[ends[0]] + x[ends[1]]) / 2)
-                middles.append(edges[ends])
-            rows.append([*cell, *middles])
-        found[f"{kind}{len(rows[0])}"] = rows
-    return np.array(x), found
 
 
 def serendipity_volume(x):
@@ -234,7 +194,16 @@ def test_refused(folder):
     for text, words in (
         ("*SURFACE, NAME=a\n10, S5\n", ("surface 'a'", "S1 to S4")),
         ("*ELSET, ELSET=a\nnobody\n", ("ELSET", "no set 'nobody'")),
-        ("*NSET, NSET=a\n999\n", "no node 999"),
+        ("*NSET, NSET=a\n999\n", ("no node 999", "set of nodes 'a'")),
+        ("*NSET, NSET=a, GENERATE\n10, 60, 10\n", ("no node 60", "set of nodes 'a'")),
+        ("*ELEMENT, TYPE=CPS3\n20, 10, 20, 999\n", ("no node 999", "element 20")),
+        ("*ELSET, ELSET=a\n10, 99\n", ("no element 99", "set of elements 'a'")),
+        ("*ELSET, ELSET=a, GENERATE\n10, 30, 10\n", ("no element 20", "set of elements 'a'")),
+        ("*ELSET, ELSET=a, GENERATE\n20, 10, 10\n", ("ELSET=a", "GENERATE from 20 to 10")),
+        ("*NSET, NSET=a, GENERATE\n10, 20, 0\n", ("NSET=a", "GENERATE from 10 to 20 by 0")),
+        ("*SURFACE, NAME=a\n99, S1\n", ("no element 99", "surface 'a'")),
+        ("*SURFACE, NAME=a\n99,\n", ("no element 99", "surface 'a'")),
+        ("*SURFACE, NAME=a, TYPE=NODE\n999\n", ("no node 999", "surface 'a'")),
         ("*NODE\n10, 5.0, 5.0\n", "two nodes 10"),
         ("*NGEN\n1, 2\n", ("NGEN", "write them out")),
         ("*PART, NAME=a\n*PART, NAME=b\n", "one flat input file"),
@@ -245,7 +214,10 @@ def test_refused(folder):
     crooked = deck(folder, "crooked.inp", points[[1, 4, 3, 0]], {"quad": [[3, 0, 1, 2]]})
     refused(uem.MeshError, ("inside out", "too distorted"), lambda: uem.read_mesh(crooked, COMM, cells="simplices"))
     refused(uem.InputError, "simplices", lambda: uem.read_mesh(crooked, COMM, cells="tetrahedra"))
-    text = "*ELEMENT, TYPE=SPRINGA, ELSET=s\n90, 10, 20\n*PART, NAME=a\n*INSTANCE, NAME=a-1, PART=a\n*END INSTANCE\n"
-    beside = deck(folder, "beside.inp", points, quad, text)
-    mesh, _ = uem.read_mesh(beside, COMM)
+    text = "*ELEMENT, TYPE=SPRINGA, ELSET=s\n90, 10, 20\n*ELEMENT, TYPE=U1, ELSET=user\n91, 10, 20,\n10, 30\n"
+    text += "*ELSET, ELSET=every\ns, user, 10\n*SURFACE, NAME=side\nevery, S1\n"
+    text += "*PART, NAME=a\n*INSTANCE, NAME=a-1, PART=a\n*END INSTANCE\n"
+    mesh, tags = uem.read_mesh(deck(folder, "beside.inp", points, quad, text), COMM)
     assert reduced(COMM, mesh.topology.index_map(2).size_local) == 1
+    assert measure(mesh, uem.dx(tags["every"])) == pytest.approx(1.0) == measure(mesh, uem.ds(tags["side"]))
+    assert "user" not in tags

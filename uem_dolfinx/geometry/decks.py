@@ -52,7 +52,7 @@ class Deck:
         elements: kinds, and numbers of nodes.
         nsets: names and numbers of nodes, by the name in capitals; ``elsets`` likewise of elements.
         surfaces: names, whether of elements, and pairs of a member and a side.
-        left_out: how many elements of each type are no part of a body.
+        left_out: how many elements of each type are no part of a body; ``others`` are the numbers of these elements.
         parts: how many parts there are, and instances of them.
     """
 
@@ -62,6 +62,7 @@ class Deck:
     elsets: dict[str, tuple[str, list[int]]] = field(default_factory=dict)
     surfaces: dict[str, tuple[bool, list[list[str]]]] = field(default_factory=dict)
     left_out: dict[str, int] = field(default_factory=dict)
+    others: set[int] = field(default_factory=set)
     parts: dict[str, int] = field(default_factory=dict)
 
 
@@ -146,13 +147,21 @@ def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str
         for row in rows:
             values = [value for value in row if value]
             if "GENERATE" in options:
-                first, last, step = (*map(int, values), 1)[:3]
-                members.extend(range(first, last + 1, step))
+                members.extend(_generated(*map(int, values)))
             else:
                 members.extend(number for value in values for number in _members(sets, value))
     elif keyword == "SURFACE":
         of_elements = options.get("TYPE", "ELEMENT").upper() == "ELEMENT"
         deck.surfaces[options["NAME"]] = (of_elements, [[*row, ""][:2] for row in rows])
+
+
+def _generated(first: int, last: int, step: int = 1) -> range:
+    """Numbers from the first to the last one."""
+    if last < first or step < 1:
+        raise ValueError(
+            f"GENERATE from {first} to {last} by {step} gives no number: expected first <= last, and a step of 1 or more"
+        )
+    return range(first, last + 1, step)
 
 
 def _once(known: dict[int, Any], what: str, number: int, value: Any) -> None:
@@ -187,6 +196,12 @@ def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> No
         if re.fullmatch(BESIDE, name) is None:
             raise ValueError(f"the element type {name} is not known")
         deck.left_out[name] = deck.left_out.get(name, 0) + len(lines)
+        # elements go on in the next line after a comma
+        firsts = [line[0] for before, line in zip([[], *lines], lines) if before[-1:] != [""]]
+        numbers = [int(number) for number in firsts if number.isdigit()]
+        deck.others.update(numbers)
+        if "ELSET" in options:
+            _named(deck.elsets, options["ELSET"]).extend(numbers)
         return
     width, numbers = NODES_OF[kind] + 1, [int(value) for line in lines for value in line if value]
     if len(numbers) % width:
@@ -207,33 +222,47 @@ def _found(deck: Deck) -> Found:
     kinds = list(dict.fromkeys(kind for kind, _ in deck.elements.values()))
     of_kind = {kind: np.array([n for n, (k, _) in deck.elements.items() if k == kind], dtype=np.int64) for kind in kinds}
     cells = [
-        Block(kind, _places(numbers, np.array([deck.elements[n][1] for n in own.tolist()]), "node"))
+        Block(kind, _places_of_cells(numbers, own, np.array([deck.elements[n][1] for n in own.tolist()])), own)
         for kind, own in of_kind.items()
     ]
+    elements = np.array(sorted({*deck.elements, *deck.others}), dtype=np.int64)
+    for name, members in deck.elsets.values():
+        _places(elements, np.array(members, dtype=np.int64), "element", f"the set of elements '{name}' holds")
     cell_sets = {
         name: [np.flatnonzero(np.isin(own, members)) for own in of_kind.values()] for name, members in deck.elsets.values()
     }
-    point_sets = {name: _places(numbers, np.unique(members), "node") for name, members in deck.nsets.values()}
+    point_sets = {
+        name: _places(numbers, np.unique(members).astype(np.int64), "node", f"the set of nodes '{name}' holds")
+        for name, members in deck.nsets.values()
+    }
     found = Found(np.array([deck.nodes[n] for n in numbers.tolist()]), cells, cell_sets, point_sets)
     sides = _Sides(found, of_kind)
     for name, (of_elements, rows) in deck.surfaces.items():
         if of_elements:
-            found.sides[name] = sides.of(
-                name, [(np.array(_members(deck.elsets, who), dtype=np.int64), side.upper()) for who, side in rows]
-            )
+            own = [(np.array(_members(deck.elsets, who), dtype=np.int64), side.upper()) for who, side in rows]
+            for some, _ in own:
+                _places(elements, some, "element", f"the surface '{name}' holds")
+            found.sides[name] = sides.of(name, own)
         else:
             nodes = [number for who, _ in rows for number in _members(deck.nsets, who)]
-            point_sets[name] = _places(numbers, np.unique(nodes), "node")
+            point_sets[name] = _places(numbers, np.unique(nodes).astype(np.int64), "node", f"the surface '{name}' holds")
     return found
 
 
-def _places(numbers: Ints, wanted: Ints, what: str) -> Ints:
-    """Places of numbers of the file among those that there are, ascending."""
+def _places(numbers: Ints, wanted: Ints, what: str, by: str) -> Ints:
+    """Places of numbers of the file among those that there are, ascending; ``by`` says what names them."""
     place = np.minimum(np.searchsorted(numbers, wanted), max(len(numbers) - 1, 0))
     missing = wanted[numbers[place] != wanted] if len(numbers) else wanted
     if missing.size:
-        raise ValueError(f"there is no {what} {missing.ravel()[0]}")
+        raise ValueError(f"there is no {what} {missing.ravel()[0]}, which {by}: expected only {what}s of the file; mend the deck")
     return place
+
+
+def _places_of_cells(numbers: Ints, cells: Ints, nodes: Ints) -> Ints:
+    """Places of the nodes ``(n, k)`` of elements with these numbers ``(n,)``."""
+    missing = ~np.isin(nodes, numbers)
+    first = cells[int(missing.any(axis=1).argmax())]
+    return _places(numbers, nodes, "node", f"element {first} has")
 
 
 class _Sides:

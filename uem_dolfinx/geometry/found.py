@@ -81,10 +81,12 @@ class Block:
     Attributes:
         type: meshio's name, as ``"hexahedron20"``.
         data: nodes of each, in VTK's order ``(n, k)``.
+        numbers: of the cells in the file ``(n,)``, if it has any.
     """
 
     type: str
     data: Ints
+    numbers: Ints | None = None
 
     @property
     def base(self) -> str:

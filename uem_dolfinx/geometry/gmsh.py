@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import Indices
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
+from uem_dolfinx.geometry.cells import check_edges, check_nodes, check_volumes
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
@@ -313,7 +314,9 @@ def _extract(model: Any, gdim: int | None, label: str) -> RawMesh:
         else:
             rows = _vertex_rows(model, dim, members, node_tags)
         result.append(Group(name, number, dim, rows.astype(np.int64)))
-    return RawMesh(cell, degree, _points(model, node_tags, tdim, label), cells.astype(np.int64), result)
+    raw = checked(cell, degree, _points(model, node_tags), cells.astype(np.int64), label)
+    raw.groups.extend(result)
+    return raw
 
 
 def _elements(model: Any, dim: int, entity: int) -> dict[int, npt.NDArray[np.int64]]:
@@ -332,18 +335,35 @@ def _vertex_rows(model: Any, dim: int, entities: list[int], node_tags: npt.NDArr
     return np.concatenate(rows) if rows else np.empty((0, dim + 1), dtype=np.int64)
 
 
-def _points(model: Any, node_tags: npt.NDArray[np.int64], tdim: int, label: str) -> npt.NDArray[np.float64]:
-    """Coordinates of the nodes used, shape ``(n_nodes, tdim)``."""
+def _points(model: Any, node_tags: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Coordinates of the nodes used, shape ``(n_nodes, 3)``."""
     tags, x, _ = model.mesh.getNodes()
     order = np.argsort(tags)
-    return points_of(np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)], tdim, label)
+    return np.asarray(x).reshape(-1, 3)[order][np.searchsorted(np.asarray(tags)[order], node_tags)]
 
 
-def points_of(points: npt.NDArray[np.float64], tdim: int, label: str) -> npt.NDArray[np.float64]:
-    """Coordinates ``(n_nodes, tdim)`` of nodes ``(n_nodes, 3)``; those of a 2D body must be in a plane ``z = constant``."""
+def checked(cell: str, degree: int, points: Array, cells: Ints, label: str, numbers: Ints | None = None) -> RawMesh:
+    """The mesh of cells, still without groups.
+
+    Args:
+        cell: name of the cell.
+        degree: of the geometry.
+        points: places of all nodes ``(n_nodes, 3)``; those of a 2D body must be in a plane ``z = constant``.
+        cells: nodes of each cell in Gmsh's order ``(n, m)``.
+        label: of the file or the model, for messages.
+        numbers: of the cells in the file ``(n,)``.
+
+    Raises:
+        MeshError: for cells that are none (``check_nodes``, ``check_edges``, ``check_volumes``), or a surface that is not plane.
+    """
+    check_nodes(cell, cells, points, label, numbers)
+    tdim = len(forms.reference_topology(cell)) - 1
     if tdim == 2 and np.ptp(points[:, 2]) > FLAT * np.ptp(points[:, :2], axis=0).max():
         raise MeshError(f"{label} is a surface that leaves the plane z = constant: a 2D body must be plane")
-    return np.ascontiguousarray(points[:, :tdim])
+    ordered = compat.from_gmsh(cell, cells)
+    check_edges(cell, ordered, points, label, numbers)
+    check_volumes(cell, degree, ordered, points, label, numbers)
+    return RawMesh(cell, degree, np.ascontiguousarray(points[:, :tdim]), cells, [])
 
 
 # ---------------------------------------------------------------------------------------------- on every rank

@@ -13,11 +13,10 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.found import KINDS, Found, from_meshio
-from uem_dolfinx.geometry.gmsh import Group, RawMesh, distributed, points_of, read_gmsh
-from uem_dolfinx.geometry.nodes import described
+from uem_dolfinx.geometry.gmsh import Group, RawMesh, checked, distributed, read_gmsh
 from uem_dolfinx.geometry.serendipity import completed
 from uem_dolfinx.geometry.tags import Tags
 from uem_dolfinx.log import logger
@@ -102,46 +101,19 @@ def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
         raise MeshError(f"{path} has cells of dimension {dim}, not {gdim}: read it with gdim={dim}")
     cell, degree = MESHIO_CELLS[kinds[0]]
     data = np.concatenate([block.data for block in found.bodies])
-    check_cells(data, found.points, str(path))
     nodes, numbered = np.unique(data, return_inverse=True)
     points = np.zeros((len(nodes), 3))
     points[:, : found.points.shape[1]] = found.points[nodes]
     place = np.full(len(found.points), -1)
     place[nodes] = np.arange(len(nodes))
     numbered = compat.gmsh_nodes(cell, numbered.reshape(data.shape).astype(np.int64))
-    raw = RawMesh(cell, degree, points_of(points, dim, str(path)), numbered, [])
+    known = [block.numbers for block in found.bodies if block.numbers is not None]
+    numbers = np.concatenate(known) if len(known) == len(found.bodies) else None
+    raw = checked(cell, degree, points, numbered, str(path), numbers)
     sets = [*_sets_of_cells(found, place), *_surfaces(found, place), *_sets_of_nodes(found, place, raw)]
     for number, (name, of_dim, rows) in enumerate(sets, 1):
         raw.groups.append(Group(name, number, of_dim, rows.astype(np.int64)))
     return raw
-
-
-def check_cells(cells: Ints, points: Array, path: str) -> None:
-    """Refuse cells that are none, before a mesh is made of them.
-
-    Args:
-        cells: nodes of each cell ``(n, m)``, rows of ``points``.
-        points: places of nodes.
-        path: of the file.
-
-    Raises:
-        MeshError: for a cell that has a node twice, has all nodes of another one, or a node that is nowhere.
-    """
-    ordered = np.sort(cells, axis=1)
-    by_nodes = np.lexsort(ordered.T)
-    same = (ordered[by_nodes[1:]] == ordered[by_nodes[:-1]]).all(axis=1)
-    bad = (
-        ("a node twice", (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)),
-        ("a node whose coordinates are not finite", ~np.isfinite(points)[cells].all(axis=(1, 2))),
-        ("the nodes of another cell", np.isin(np.arange(len(cells)), by_nodes[1:][same])),
-    )
-    for what, rows in bad:
-        if rows.any():
-            first = int(np.argmax(rows))
-            raise MeshError(
-                f"{path}: {int(rows.sum())} of {len(cells)} cells have {what}; the first is cell {first + 1} of the bodies in the file, "
-                f"with a node at {described(points[cells[first, 0]])}: mend the mesh"
-            )
 
 
 def _found(path: Path) -> Found:

@@ -8,6 +8,8 @@ cell has the very same shape:
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from uem_dolfinx.arrays import Ints
@@ -43,7 +45,7 @@ def completed(found: Found) -> tuple[Found, int]:
                 points.append((x[own[:, kind.vertices :]].sum(axis=1) - x[own[:, : kind.vertices]].sum(axis=1)) / 4.0)
                 data.append(count + np.arange(n)[:, None])
                 count += n
-            block = Block(SERENDIPITY[block.type], np.concatenate(data, axis=1))
+            block = replace(block, type=SERENDIPITY[block.type], data=np.concatenate(data, axis=1))
         cells.append(block)
     return found.with_cells(np.concatenate(points), cells), count - len(x)
 

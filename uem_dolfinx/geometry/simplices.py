@@ -46,7 +46,7 @@ def divided(found: Found, label: str) -> tuple[Found, dict[str, int]]:
         data, of = _simplices(block, order)
         if block.dim == found.dim and len(data) > len(block.data):
             _check(found.points, data, of, found.dim, label)
-        cells.append(Block(SIMPLICES[block.dim][order - 1], data))
+        cells.append(Block(SIMPLICES[block.dim][order - 1], data, None if block.numbers is None else block.numbers[of]))
         origin.append(of)
     if len(orders) > 1:
         raise MeshError(

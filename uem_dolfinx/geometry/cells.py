@@ -1,0 +1,147 @@
+"""Cells that a file or a model has, before a mesh is made of them: those that enclose nothing, or are there twice, are errors by name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
+from uem_dolfinx.errors import MeshError
+from uem_dolfinx.geometry.nodes import described
+
+#: A cell whose thickness is less than this is flat.
+#: [convention; size of the cell; test_cells.py::test_how_thin_a_cell_may_be]
+FLAT_CELL = 1e-10
+#: Cells whose volumes are computed at a time.
+#: [heuristic; number; -]
+VOLUMES_AT_ONCE = 20_000
+
+
+def check_nodes(cell: str, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
+    """Refuse cells whose nodes make none.
+
+    Args:
+        cell: name of the cell, e.g. ``"triangle"``.
+        cells: nodes of each cell ``(n, m)``, vertices first, rows of ``points``.
+        points: places of nodes ``(n_nodes, 2 or 3)``.
+        label: of the file or the model, for messages.
+        numbers: of the cells in the file ``(n,)``; None where messages count them.
+
+    Raises:
+        MeshError: for a cell that has a node twice, a node that is nowhere, all vertices of another cell, or the vertex of another cell
+            between its own vertices.
+    """
+    ordered, n_vertices = np.sort(cells, axis=1), len(forms.reference_topology(cell)[0])
+    _refuse("a node twice", ordered[:, 1:], np.equal(ordered[:, 1:], ordered[:, :-1]), points, label, numbers)
+    lost = ~np.asarray(np.isfinite(points).all(axis=1), dtype=bool)
+    _refuse("a node whose coordinates are not finite", cells, lost[cells], points, label, numbers)
+    vertices = np.sort(cells[:, :n_vertices], axis=1)
+    order = np.lexsort(vertices.T)
+    again: Bools = np.zeros(cells.shape, dtype=bool)
+    again[order[1:], 0] = (vertices[order[1:]] == vertices[order[:-1]]).all(axis=1)
+    _refuse("the vertices of another cell", cells, again, points, label, numbers)
+    hanging = np.isin(cells[:, n_vertices:], vertices)
+    what = "the vertex of another cell in the middle of an edge"
+    _refuse(what, cells[:, n_vertices:], hanging, points, label, numbers)
+
+
+def check_edges(cell: str, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
+    """Refuse edges of cells of degree 2 that have two nodes in the middle, or the one of another edge.
+
+    Args:
+        cell: as of ``check_nodes``, and so are all others.
+        cells: nodes of each cell in DOLFINx's order ``(n, m)``.
+        points: places.
+        label: of the file.
+        numbers: of the cells.
+
+    Raises:
+        MeshError: naming a cell with such an edge.
+    """
+    topology = forms.reference_topology(cell)
+    n_vertices, edges = len(topology[0]), np.array(topology[1])
+    if cells.shape[1] == n_vertices:
+        return
+    middles = cells[:, n_vertices : n_vertices + len(edges)]
+    ends, middle = np.sort(cells[:, edges], axis=2).reshape(-1, 2), middles.ravel()
+    for what, same, differ in (
+        ("an edge with another node in the middle than in a neighbour", ends, middle[:, None]),
+        ("a node in the middle of an edge that another edge has, too", middle[:, None], ends),
+    ):
+        order = np.lexsort((*differ.T, *same.T))
+        one, next_one = order[:-1], order[1:]
+        bad = (same[one] == same[next_one]).all(axis=1) & (differ[one] != differ[next_one]).any(axis=1)
+        at: Bools = np.zeros(middle.shape, dtype=bool)
+        at[next_one[bad]] = True
+        _refuse(what, middles, at.reshape(middles.shape), points, label, numbers)
+
+
+def check_volumes(cell: str, degree: int, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
+    """Refuse flat cells.
+
+    Args:
+        cell: as of ``check_nodes``.
+        degree: of the geometry.
+        cells: nodes of each cell in DOLFINx's order ``(n, m)``.
+        points: as of ``check_nodes``.
+        label: likewise.
+        numbers: likewise.
+
+    Raises:
+        MeshError: for a cell whose volume vanishes by its size.
+    """
+    flat: Bools = np.zeros(cells.shape, dtype=bool)
+    flat[:, 0] = flat_cells(cell, degree, cells, points)
+    what = "no area" if len(forms.reference_topology(cell)) == 3 else "no volume"
+    _refuse(f"{what} (they are flat)", cells, flat, points, label, numbers)
+
+
+def _refuse(what: str, nodes: Ints, bad: Bools, points: Array, label: str, numbers: Ints | None) -> None:
+    """Raise the error for the cells of which any of the ``nodes (n, k)`` is ``bad (n, k)``, if there are any."""
+    if not bad.any():
+        return
+    rows = np.asarray(bad.any(axis=1), dtype=bool)
+    first = int(rows.argmax())
+    name = f"cell {first + 1} of the bodies" if numbers is None else f"element {numbers[first]}"
+    place = described(points[nodes[first, bad[first].argmax()]])
+    raise MeshError(
+        f"{label}: {int(rows.sum())} of {len(rows)} cells have {what}; the first is {name}, at the node {place}: mend the mesh"
+    )
+
+
+def flat_cells(cell: str, degree: int, cells: Ints, points: Array) -> Bools:
+    """Which cells have no volume, with the arguments of ``check_volumes`` ``(n,)``.
+
+    The thickness of a cell is its volume over the product of its extents ``s_1 >= s_2 (>= s_3)`` but for the smallest, with ``s_i``
+    the root mean square of what its nodes are off their mean along principal axes; slender cells are not thin by their length.
+    """
+    dim = len(forms.reference_topology(cell)) - 1
+    flat: Bools = np.zeros(len(cells), dtype=bool)
+    tables, weights = _map(cell, degree, dim)
+    for first in range(0, len(cells), VOLUMES_AT_ONCE):
+        x = points[cells[first : first + VOLUMES_AT_ONCE], :dim]
+        volume = np.abs(_volumes(x, tables, weights))
+        # extents are less than the size of the whole, so that few cells are left whose own are needed
+        few = np.flatnonzero(volume <= FLAT_CELL * np.linalg.norm(np.ptp(x, axis=1), axis=1) ** dim)
+        if len(few):
+            own = x[few] - x[few].mean(axis=1, keepdims=True)
+            extent = np.linalg.svd(own, compute_uv=False) / np.sqrt(x.shape[1])
+            flat[first + few] = volume[few] <= FLAT_CELL * extent[:, 0] * extent[:, :-1].prod(axis=1)
+    return flat
+
+
+def _map(cell: str, degree: int, dim: int) -> tuple[Array, Array]:
+    """Derivatives of the shape functions at the points of a rule that is exact for volumes ``(dim, n_points, m)``, and its weights."""
+    products = cell in ("quadrilateral", "hexahedron")
+    points, weights = forms.quadrature_rule(cell, dim * degree - 1 if products else dim * (degree - 1))
+    return np.ascontiguousarray(forms.create_lagrange_element(cell, degree).tabulate(1, points)[1:, :, :, 0]), weights
+
+
+def _volumes(x: Array, tables: Array, weights: Array) -> Array:
+    """Integrals of the determinant of the map of cells with nodes ``x (n, m, dim)``, negative for those inside out ``(n,)``."""
+    J = np.einsum("dqm,nmg->dnqg", tables, x, optimize=True)
+    if len(J) == 2:
+        det = J[0, ..., 0] * J[1, ..., 1] - J[0, ..., 1] * J[1, ..., 0]
+    else:
+        det = np.einsum("nqg,nqg->nq", J[0], cross_products(J[1], J[2]))
+    return det @ weights
