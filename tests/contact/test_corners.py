@@ -95,6 +95,46 @@ def test_friction_in_a_vertex():
         assert np.linalg.norm(rest) == pytest.approx(0.3 * pressed[0]) and abs(rest @ n[0]) <= 1e-14
 
 
+@pytest.mark.parametrize("slope", [1e-6, 0.1, 0.7])
+def test_rubbing_into_a_corner(slope):
+    """A contactor came over one facet with all that pushes it along that facet's normal, friction aside."""
+    c = corner_of_two_facets(slope)
+    none = np.zeros((len(c.which), 2))
+    for first, other in ((0, 1), (1, 0)):
+        n, way = c.normals[:, first], -0.3 * c.away[:, first]
+        force = 2.0 * n + 3.0 * c.normals[:, other]
+        place = np.full(len(c.which), first)
+        expected = 0.3 * (2.0 + 3.0 * np.cos(np.arctan(slope)))
+        assert np.allclose(c.rubbing(force, none, way, place), expected, rtol=1e-12)
+        assert np.allclose(c.rubbing(force - 0.4 * way, -0.4 * way, way, place), expected, rtol=1e-12)
+        # a way into the other facet is none along the first
+        assert np.allclose(c.rubbing(force, none, way - 0.1 * n, place), expected, rtol=1e-12)
+        assert np.allclose(c.rubbing(-force, none, way, place), 0.0)
+
+
+def test_rubbing_along_edges():
+    """Along an edge both facets that meet there are slid over; a third one, met at its end, is not."""
+    walls = vertex_of_three_facets(np.sqrt(2.0))
+    n = walls.normals[0]
+    assert np.allclose(n @ n.T, np.eye(3))
+    force, none, first = (2 * n[0] + 3 * n[1] + 5 * n[2])[None], np.zeros((1, 3)), np.array([0])
+    assert walls.rubbing(force, none, -0.1 * n[2:], first)[0] == pytest.approx(0.1 * (2 + 3))
+    assert walls.rubbing(force, none, -0.1 * n[1:2], first)[0] == pytest.approx(0.1 * (2 + 5))
+    # over the first facet alone, not along an edge: the other two have a part of the way each
+    way = -0.1 * (n[1] + n[2])[None]
+    assert walls.rubbing(force, none, way, first)[0] == pytest.approx(2 * 0.1 * np.sqrt(2) + 0.1 * (3 + 5))
+
+
+def test_which_facet_a_contactor_came_over():
+    """The one that it was on; from farther away the one that leads there."""
+    c = corner_of_two_facets(0.7)
+    facets = np.tile([4, 7], (len(c.which), 1))
+    for first in (0, 1):
+        way = -c.away[:, first]
+        for before, expected in ((4, 0), (7, 1), (9, first), (-1, first)):
+            assert (c.slid_over(np.full(len(way), before), facets, way) == expected).all()
+
+
 @pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), pytest.param(2, 0.0, marks=pytest.mark.slow)])
 def test_a_concave_edge_that_ends_with_its_target(degree, friction):
     """A ridge is pushed along a groove and out of it: contactors that have passed its end carry nothing, moments balance."""

@@ -185,8 +185,7 @@ def test_steps_that_wear_too_much(caplog):
 
 def test_the_law():
     """The mean of force times way at both ends; tension wears nothing."""
-    one = np.ones(3)
-    found = worn_volume(2.0 * one, np.array([1.0, -1.0, 0.0]), np.array([3.0, 1.0, 2.0]), 0.5 * one, np.array([0.5, 0.5, 0.25]))
+    found = worn_volume(2.0 * np.ones(3), np.array([0.5, -0.5, 0.0]), np.array([1.5, 0.5, 0.5]))
     np.testing.assert_allclose(found, [2.0, 0.5, 0.5], rtol=1e-15)
 
 

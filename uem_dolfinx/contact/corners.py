@@ -152,6 +152,45 @@ class Corners:
             shares[alone] = np.where(place[alone], push[alone, None], 0.0)
         return np.asarray(force - np.einsum("kr,krg->kg", np.maximum(shares, 0.0), np.where(here[:, :, None], self.normals, 0.0)))
 
+    def slid_over(self, before: Ints, facets: Ints, way: Array) -> Ints:
+        """Which facet each contactor came over ``(k,)``: the one it was on, or, from farther away, the one that its way lies along best.
+
+        Args:
+            before: facets that the contactors were on at the start of the step ``(k,)``.
+            facets: of the corners, -1 beyond ``count`` ``(k, gdim)``.
+            way: of the contactors past the target in the step ``(k, gdim)``.
+        """
+        here = np.arange(facets.shape[1])[None, :] < self.count[:, None]
+        same = (facets == before[:, None]) & here
+        against = np.where(here, np.einsum("kjg,kg->kj", self.away, way), np.inf)
+        return np.where(same.any(axis=1), np.argmax(same, axis=1), np.argmin(against, axis=1))
+
+    def rubbing(self, force: Array, tau: Array, way: Array, first: Ints) -> Array:
+        """Forces of facets along their normals times the ways along them, summed over the facets of each corner ``(k,)``.
+
+        A contactor slides into a corner over its first facet, whose force on the way is all that it is pushed with along that facet's
+        normal: a part of what another pushes with that is the cosine c of the angle between both. The rest of it, ``1 - c``, acts on
+        the way along the edge between them alone, and on that way there is no friction across the edge.
+
+        Args:
+            force: on the contactors ``(k, gdim)``.
+            tau: friction's part in it ``(k, gdim)``.
+            way: past the target ``(k, gdim)``.
+            first: which facet each came over ``(k,)``.
+        """
+        n = self.normals[np.arange(len(first)), first]
+        over = np.linalg.norm(way - np.einsum("kg,kg->k", way, n)[:, None] * n, axis=1)
+        pushed, push = (np.einsum("kg,kg->k", f, n) for f in (force, force - tau))
+        if way.shape[1] == 2:
+            return np.asarray(np.maximum(push * over, 0.0))
+        edges = cross_products(n[:, None], self.normals)
+        size = np.linalg.norm(edges, axis=2)
+        along = np.abs(np.einsum("kjg,kg->kj", edges, way)) / np.where(size > 0, size, 1.0)
+        shares = np.einsum("kgj,kg->kj", np.linalg.pinv(self.normals), force)
+        rest = shares * (1.0 - np.einsum("kjg,kg->kj", self.normals, n))
+        longest = along.max(axis=1)
+        return np.asarray(np.maximum(push * (over - longest) + pushed * longest + (rest * along).sum(axis=1), 0.0))
+
     def hessians(self, force: Array) -> Array:
         """Second derivatives of the gaps times their forces: it is the direction of the force that stays on an edge."""
         size = np.linalg.norm(force, axis=1)
@@ -167,7 +206,7 @@ class Corners:
         return size[:, None, None] * H
 
 
-def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Array) -> Array:
+def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Array, way: Array) -> Array:
     """Friction's part in the forces on contactors that corners hold ``(n, gdim)``; zero for others.
 
     Args:
@@ -175,13 +214,19 @@ def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Arr
         state: of the pair.
         before: facets that the contactors were on at the start of the step ``(n,)``, which they came over.
         mu: coefficients of friction ``(n,)``.
+        way: of the contactors past the target in the step ``(n, gdim)``.
     """
     tau = np.zeros(state.force.shape)
     if corners is not None:
         i = corners.which
-        first = np.argmax(np.column_stack([state.facet[i], state.held[i]]) == before[i, None], axis=1)
-        tau[i] = corners.friction(state.force[i], mu[i], first)
+        tau[i] = corners.friction(state.force[i], mu[i], first_over(corners, state, before, way))
     return tau
+
+
+def first_over(corners: Corners, state: PairState, before: Ints, way: Array) -> Ints:
+    """Which facet those that corners hold came over ``(k,)``; arguments as those of ``friction_in``."""
+    i = corners.which
+    return corners.slid_over(before[i], np.column_stack([state.facet[i], state.held[i]]), way[i])
 
 
 def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints, facets: Ints) -> Corners | None:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact import friction
+from uem_dolfinx.contact import friction, rubbing
 from uem_dolfinx.contact.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.anchors import anchored, anchors_of, way_since
 from uem_dolfinx.contact.corners import friction_in
@@ -417,19 +417,19 @@ class Sliding:
         slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
         self._last, worn = None, f.worn
         if self.wear is not None:
-            ways = (np.linalg.norm(self.frame.along(way), axis=1) for way in (start, end))
-            worn = worn + self.wear.depths(committed.lam, state.lam, *ways)
+            slid = rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, (start, end))
+            worn = worn + self.wear.depths(*slid)
         now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
         return replace(state, friction=now)
 
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
         """Friction at a step's end, ways for a unit of it at start and end ``(n, gdim)``, and the work it takes ``(n,)`` (collective)."""
         share, held, (_, slope) = kinematics.force_per_multiplier[:, None], self.frame.cornered[:, None], self._cone(state)
-        # a contactor that changes facets slides over both
-        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope) * share, _of(state).tau)
         # one that has stuck all along is where its anchor is, whatever rounding says
         stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
+        # a contactor that changes facets slides over both
+        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
         return tau, start, end, friction.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
     def forget(self) -> None:

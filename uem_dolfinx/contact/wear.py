@@ -76,9 +76,9 @@ class Wear:
         """Values at the contactors ``(n,)`` at the nodes of this rank's facets ``(m, nn)`` (collective)."""
         return self._config.from_owners(self._nodes, values[:, None], self._dofs.ravel()).reshape(self._dofs.shape)
 
-    def depths(self, start: Array, end: Array, way_from: Array, way_to: Array) -> Array:
+    def depths(self, start: Array, end: Array) -> Array:
         """Depths at nodes that a step wears off ``(n,)``; arguments as of ``worn_volume`` (collective)."""
-        volume = worn_volume(self.k, start, end, way_from, way_to)
+        volume = worn_volume(self.k, start, end)
         nodal = self._at_facets(volume / self._integrals) @ self._to_nodes.T
         return np.asarray(self._config.to_owners(self._dofs.ravel(), nodal.ravel())[self._nodes] / self._count)
 
