@@ -68,6 +68,10 @@ class ConflictError(UEMError, ValueError):
     """A Dirichlet condition and a uniting equation, or two uniting equations, ask different things of one node."""
 
 
+class OverdeterminedError(ConflictError):
+    """Contacts ask more of some nodes than these and their targets can give: an equation was left out, and is missed at the end."""
+
+
 class FloatingBodyError(UEMError, RuntimeError):
     """A body moves as a rigid body under its loads, and neither conditions nor contacts can hold it."""
 

@@ -23,6 +23,12 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import gathered, reduced
 
+#: A weight that exceeds one by more extrapolates: the contactor is past an end of the target.
+#: [bound; weight; test_dependent.py::test_rows_past_an_end_are_left_out_first]
+EXTRAPOLATED = 1e-9
+#: Ranks of equations, of which the first are the last to be left out.
+FIRM, WITHIN, PAST_END = 0, 1, 2
+
 
 @dataclass(frozen=True)
 class Group:
@@ -183,6 +189,8 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> li
     from scipy.sparse.csgraph import connected_components
 
     links = coo_matrix((np.ones(m + len(rows.row)), (np.concatenate([np.arange(m), rows.row]), place)), shape=(m, len(node)))
+    weight = np.einsum("kg,kg->k", rows.coefficients, rows.direction[rows.row])
+    past = np.bincount(rows.row, weight > 1.0 + EXTRAPOLATED, m) > 0
     count, label = connected_components(links @ links.T, directed=False)
     groups = []
     for k in range(count):
@@ -192,7 +200,8 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> li
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
-        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, firm[which]))
+        rank = np.where(firm[which], FIRM, np.where(past[which], PAST_END, WITHIN))
+        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, rank))
     return groups
 
 
@@ -230,14 +239,15 @@ def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Boo
     return rank[label]
 
 
-def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, firm: Bools | None = None) -> Group:
+def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: Ints | None = None) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
     Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which
     pivots do not change; it is then left out, and the others go on.
 
     In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
-    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those that are ``firm (m,)`` come first.
+    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those of lowest ``rank (m,)`` come first:
+    ``FIRM`` ones, then those that follow places ``WITHIN`` facets, then those that follow places ``PAST_END``.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
@@ -247,11 +257,11 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, firm: B
     A, h, across = A / scale[:, None, None], h / scale, movable / scale[:, None]
     order: list[int] = []
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
-    first = np.zeros(m, dtype=bool) if firm is None else firm
-    least = np.where(first, MOSTLY_PRESCRIBED, DEPENDENT)
+    rank = np.full(m, WITHIN) if rank is None else rank
+    least = np.where(rank == FIRM, MOSTLY_PRESCRIBED, DEPENDENT)
     while (rest := rest & (np.linalg.norm(across, axis=1) > least)).any():
         size = np.linalg.norm(A * free, axis=2)
-        among = rest & first if (rest & first).any() else rest
+        among = rest & (rank == rank[rest].min())
         i, t = np.unravel_index(np.argmax(np.where(among[:, None], size, -1.0)), size.shape)
         q = across[i] / np.linalg.norm(across[i])
         across -= (across @ q)[:, None] * q

@@ -17,7 +17,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.active_set import TOUCHING
 from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.errors import ConflictError, PenetrationError, SpaceError
+from uem_dolfinx.errors import ConflictError, OverdeterminedError, PenetrationError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
@@ -83,6 +83,7 @@ def check_prescribed(pair: Interface) -> None:
 
     Raises:
         ConflictError: naming the deepest or farthest such node of the first rank that has one.
+        OverdeterminedError: likewise, if the node and its target may move and other contacts alone fight its equation.
     """
     if pair.kinematics.idle:
         return
@@ -92,10 +93,18 @@ def check_prescribed(pair: Interface) -> None:
     error = None
     if inside.any():
         i = int(np.argmin(np.where(inside, pair.projection.gap, np.inf)))
-        error = ConflictError(
-            f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is prescribed to be "
-            f"{-pair.projection.gap[i]:.4g} inside the target, where a Dirichlet condition or another contact fights the uniting "
-            "equation and neither body can give way: release the condition along the normal, or drop one of the contacts"
+        where = f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))}"
+        by = f"{-pair.projection.gap[i]:.4g} inside the target"
+        error = (
+            OverdeterminedError(
+                f"{where} ends {by}: other contacts and conditions of these nodes leave no freedom for its equation; take shorter "
+                "steps or finer surfaces there, release a Dirichlet condition, or drop one of several contacts"
+            )
+            if pair.movable[i]
+            else ConflictError(
+                f"{where} is prescribed to be {by}, where a Dirichlet condition or another contact fights the uniting equation and "
+                "neither body can give way: release the condition along the normal, or drop one of the contacts"
+            )
         )
     torn = pair.torn()
     if torn.max(initial=0.0) > LEFT_OUT * pair.config.size:

@@ -24,7 +24,7 @@ REMAINDER = 1e-9
 #: What a shorter step may mend.
 MENDABLE = (
     errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
-    errors.TunnellingError, errors.EnergyGivenError, errors.ThrownBodyError,
+    errors.TunnellingError, errors.EnergyGivenError, errors.ThrownBodyError, errors.OverdeterminedError,
 )  # fmt: skip
 
 
