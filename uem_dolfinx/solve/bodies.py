@@ -92,6 +92,8 @@ class Bodies:
             dynamics.hold(~self.free[: config.n_owned])
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
+        #: The same as the last step left it, with which the next begins.
+        self.stiffness_at_start: Array | None = None
         #: State of the values of K that it is of.
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
@@ -320,6 +322,18 @@ class Bodies:
 
     # -- checkpoints ---------------------------------------------------------------------------------------------------
 
+    def commit(self) -> None:
+        """Keep what materials remember, and the diagonal of K, with the present displacement."""
+        for material in self.materials:
+            material.commit()
+        self.stiffness_at_start = self.stiffness
+
+    def restore(self) -> None:
+        """Go back to what was kept, where the displacement is that of then again."""
+        for material in self.materials:
+            material.update()
+        self.stiffness, self._stiffness_of = self.stiffness_at_start, -1
+
     def to_checkpoint(self, u: fem.Function) -> bool:
         """Write the diagonal of K into a Function: whether it is known yet (collective)."""
         if self.stiffness is None:
@@ -332,6 +346,7 @@ class Bodies:
         """Go on from a diagonal of K that was kept, None if none was known."""
         n = self.config.n_owned * self.config.block
         self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.block)
+        self.stiffness_at_start = self.stiffness
 
 
 def configured(u: fem.Function, displacement: int | None) -> Configuration:

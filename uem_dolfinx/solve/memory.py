@@ -27,6 +27,7 @@ class Memory:
         motions: of the pairs' rigid targets.
         pairs: what each pair remembers.
         histories: of the materials, values by name.
+        stiffness: diagonal of K ``(n_owned, block)``, from which contacts take directions before K is made anew; None at first.
         dynamics: what these remember, None in statics.
     """
 
@@ -35,6 +36,7 @@ class Memory:
     motions: list[Motion | None]
     pairs: list[Any]
     histories: list[dict[str, Array]]
+    stiffness: Array | None
     dynamics: Any
 
     @classmethod
@@ -46,6 +48,7 @@ class Memory:
             motions=problem.motions,
             pairs=[pair.memory() for pair in problem.interfaces],
             histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
+            stiffness=problem.bodies.stiffness_at_start,
             dynamics=None if problem.dynamics is None else problem.dynamics.memory(),
         )
 
@@ -56,6 +59,7 @@ class Memory:
         for material, kept in zip(problem.materials, self.histories):
             for name, values in kept.items():
                 material.history[name].x.array[:] = values
+        problem.bodies.stiffness_at_start = self.stiffness
         if problem.dynamics is not None:
             problem.dynamics.remember(self.dynamics)
         for pair, own in zip(problem.interfaces, self.pairs):

@@ -354,9 +354,10 @@ class UnitedProblem(given.Sealed):
                 pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on))
                 refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
         except UEMError as error:
+            stiffness = self.bodies.stiffness
             self.restore()
             if isinstance(error, MENDABLE):
-                self.watch.name_corner(self.bodies.stiffness, error)
+                self.watch.name_corner(stiffness, error)
             raise
         return history
 
@@ -375,8 +376,7 @@ class UnitedProblem(given.Sealed):
             self.history.note(self._before, *self.led)
         self.committed = np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
-        for material in self.materials:
-            material.commit()
+        self.bodies.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
             if self.linear is not None:
@@ -391,8 +391,7 @@ class UnitedProblem(given.Sealed):
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
         self.u.x.array[:] = self.committed
-        for material in self.materials:
-            material.update()
+        self.bodies.restore()
         if self.dynamics is not None:
             self.dynamics.restore()
         for pair in self.interfaces:
