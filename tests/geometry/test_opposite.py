@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from body_scenes import all_facets
 from dolfinx import fem
 from helpers import at, box, scene
 
@@ -15,7 +16,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.geometry import opposite
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.opposite import find_opposite
+from uem_dolfinx.geometry.opposite import find_opposite, thickness
 from uem_dolfinx.geometry.overlaps import Planes, overlap
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import facet_shape
@@ -78,3 +79,17 @@ def test_candidates_against_all_pairs(monkeypatch, gap, angle):
     s = overlap(planes, (shape, x), (shape, y[every[1]]), -np.ones(len(x)), every[0])
     upon = np.unique(s.pair)
     assert len(upon) > len(x) and set(zip(*(a[upon] for a in every))) <= set(zip(i, f))
+
+
+@pytest.mark.parametrize("cell", ["triangle", pytest.param("hexahedron", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e3])
+def test_how_thick_a_plate_is(cell, unit):
+    """Whatever it is cut into, and no more than asked for; what is in front of facets, as another plate, counts for nothing."""
+    t, g = 0.01, 2 if cell == "triangle" else 3
+    body = [box(cell, [0.0] * (g - 1) + [z], [1.0] * (g - 1) + [z + t], [3] * (g - 1) + [2]) for z in (0.0, 1.5 * t)]
+    s = scene(MPI.COMM_WORLD, cell, body, pose=lambda x: unit * x)
+    config = Configuration(fem.Function(compat.function_space(s.mesh, 1, (g,))))
+    target = MeshTarget(TargetFacets(config, all_facets(s.mesh)))
+    ends = np.ptp(target.facets.x[:, :, -1], axis=1) > 1e-6 * t * unit
+    for most in (0.5 * t, 5 * t):
+        np.testing.assert_allclose(thickness(target, most * unit) / unit, np.where(ends, most, min(most, t)), rtol=1e-9)

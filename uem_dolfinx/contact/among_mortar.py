@@ -17,6 +17,7 @@ from uem_dolfinx.contact.state import PairState
 from uem_dolfinx.contact.weighted_gaps import MortarKinematics
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, heights
+from uem_dolfinx.geometry.opposite import thickness
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.skin import Apart, Skin
@@ -35,17 +36,19 @@ class Body(MeshTarget):
 
     def __init__(self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[Apart], overlap: float):
         super().__init__(facets)
-        self.skin, self.number, self._overlap = skin, body, overlap
+        self.skin, self.number = skin, body
         own = np.flatnonzero(skin.body == body)
         #: Numbers of its facets among those of all bodies, over all ranks ``(m,)``.
         self.numbers: Ints = skin.first[skin.config.comm.rank] + own
         #: Sets of nodes, and of all bodies' facets, that never touch facets of this body, with these.
         self._apart = [sets for a, f, b, h in apart for sets in ((a, f, h[own]), (b, h, f[own]))]
         self._planes = facets.middles(facets.x)
+        #: How far behind facets others may be: those farther behind than the body is thick look away from it.
+        self._overlap = thickness(self, overlap)
 
     def commit(self) -> None:
         """A step has been kept, or is gone back to."""
-        self._planes, self._overlap = self.facets.middles(self.facets.x), 0.0
+        self._planes, self._overlap = self.facets.middles(self.facets.x), np.zeros_like(self._overlap)
 
     def sets_of(self, surface: TargetFacets) -> Bools:
         """Which facets of a surface are in the sets that never touch some of this body's ``(m, s)``."""
@@ -63,7 +66,7 @@ class Body(MeshTarget):
         """See ``MeshTarget``; of contactor facets are told where their middles were, and their sets ``(k, gdim + s)``."""
         where, sets = np.split(told, [self.skin.config.gdim], axis=1)
         # facets of one side reach round it, below the planes of each other; those of the other side are behind the cells
-        may = heights(where, facet, self._planes) >= -np.maximum(self.facets.depth[facet], self._overlap)
+        may = heights(where, facet, self._planes) >= -np.maximum(self.facets.depth, self._overlap)[facet]
         for k, (_, _, facets) in enumerate(self._apart):
             may &= ~((sets[:, k] > 0) & facets[facet])
         return np.asarray(may)

@@ -11,7 +11,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.candidates import balls_that_meet
-from uem_dolfinx.geometry.overlaps import Planes
+from uem_dolfinx.geometry.overlaps import Planes, overlap
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import FacetShape
 from uem_dolfinx.log import timed
@@ -74,6 +74,20 @@ def find_opposite(
     i, f = _allowed(target, told, *_candidates(target, here, *arrived))
     found = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     return _facing(target.shape, planes, faced, *found)
+
+
+def thickness(target: MeshTarget, most: float) -> Array:
+    """How far behind this rank's facets the surface's other side is, at the least, no farther than ``most`` ``(m,)`` (collective)."""
+    shape, facets = target.shape, target.facets
+    x, thick = facets.x, np.full(len(facets.dofs), most)
+    planes = Planes.of(shape, x, facets.sign)
+    found = find_opposite(target, planes, x, thick)
+    s = overlap(planes, (shape, x), (shape, found.x), facets.sign, found.facet)
+    weight = np.bincount(s.pair, s.weight, minlength=len(found.facet))
+    mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(found.facet)) / np.where(weight > 0, weight, 1.0)
+    behind = (weight > 0) & (mean < 0)
+    np.minimum.at(thick, found.facet[behind], -mean[behind])
+    return thick
 
 
 def _allowed(target: MeshTarget, told: Array, facet: Ints, opposite: Ints) -> tuple[Ints, Ints]:
