@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 
@@ -26,8 +27,17 @@ from uem_dolfinx.parallel import gathered, reduced
 #: A weight that exceeds one by more extrapolates: the contactor is past an end of the target.
 #: [bound; weight; test_dependent.py::test_rows_past_an_end_are_left_out_first]
 EXTRAPOLATED = 1e-9
-#: Ranks of equations, of which the first are the last to be left out.
-FIRM, WITHIN, PAST_END = 0, 1, 2
+
+
+class Rank(IntEnum):
+    """Ranks of equations, of which the first are the last to be left out."""
+
+    #: Those that are never left out for others.
+    FIRM = 0
+    #: Of contactors in front of a facet.
+    WITHIN = 1
+    #: Of contactors past an end of the target.
+    PAST_END = 2
 
 
 @dataclass(frozen=True)
@@ -200,7 +210,7 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> li
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
-        rank = np.where(firm[which], FIRM, np.where(past[which], PAST_END, WITHIN))
+        rank = np.where(firm[which], Rank.FIRM, np.where(past[which], Rank.PAST_END, Rank.WITHIN))
         groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, rank))
     return groups
 
@@ -247,7 +257,7 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
 
     In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
     ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those of lowest ``rank (m,)`` come first:
-    ``FIRM`` ones, then those that follow places ``WITHIN`` facets, then those that follow places ``PAST_END``.
+    see ``Rank``.
     """
     m, _, g = A.shape
     movable = (A * free).reshape(m, -1)
@@ -257,8 +267,8 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
     A, h, across = A / scale[:, None, None], h / scale, movable / scale[:, None]
     order: list[int] = []
     pivot, direction = np.zeros(m, np.int64), np.zeros((m, g))
-    rank = np.full(m, WITHIN) if rank is None else rank
-    least = np.where(rank == FIRM, MOSTLY_PRESCRIBED, DEPENDENT)
+    rank = np.full(m, Rank.WITHIN) if rank is None else rank
+    least = np.where(rank == Rank.FIRM, MOSTLY_PRESCRIBED, DEPENDENT)
     while (rest := rest & (np.linalg.norm(across, axis=1) > least)).any():
         size = np.linalg.norm(A * free, axis=2)
         among = rest & (rank == rank[rest].min())
