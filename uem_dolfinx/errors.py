@@ -12,9 +12,11 @@ if TYPE_CHECKING:
 class UEMError(Exception):
     """Root of every error this package raises on purpose."""
 
-    def amend(self, more: str) -> None:
-        """Say more at the end of the message, and no longer advise smaller steps, which do not help."""
+    def amend(self, more: str, instead: bool = False) -> None:
+        """Say more at the end of the message, ``instead`` of all advice, and no longer advise smaller steps, which do not help."""
         smaller = "take smaller (load )?steps"
+        if instead:
+            self.args = (re.sub("[:;] (take|raise) [^;]*", "", str(self)),)
         text = re.sub(f"[:;,] (or )?{smaller}$", "", str(self))
         text = re.sub(f"{smaller},? or (?=raise |give )", "", text)
         self.args = (f"{re.sub(f'{smaller},? or ', 'take ', text)}; {more}",)

@@ -339,3 +339,10 @@ def test_what_is_told(name, how, moved, monkeypatch):
     for factor, expected in moved.items():
         monkeypatch.setattr(target_corners, name, factor * value)
         assert len(problem.watch.corners_inside([contact], problem.bodies.stiffness)) == expected
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_corners_on_both_sides_are_not_swapped(both):
+    """Where the contactor has corners in contact, too, the other side does not see them either: mortar alone is advised."""
+    words = str(target_corners.CornerInside("(0, 0)", 0.1, 0.2, 0.3, both))
+    assert ("swap the two" in words) != both and "take coupling = 'mortar'" in words

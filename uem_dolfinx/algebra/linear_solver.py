@@ -321,7 +321,7 @@ class UnitedSolver:
         """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
         if self._on_condensed:
             return self._petrov_galerkin and self.condensed.negative
-        return self.tells_sign and mumps.is_negative(self.pc)
+        return self.tells_sign and not self._new and mumps.is_negative(self.pc)
 
     @property
     def indefinite(self) -> bool:

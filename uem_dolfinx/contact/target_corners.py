@@ -47,17 +47,22 @@ class CornerInside:
         depth: of this one, a length.
         part: of the facet's size that it is deep.
         lacking: force that the contact lacks by all of them, over the largest contact force so far.
+        both: whether contactors at corners or ends of their own surface press as well, and would not see facets were they the target.
     """
 
     place: str
     depth: float
     part: float
     lacking: float
+    both: bool = False
 
     def __str__(self) -> str:
+        remedy = "take coupling = 'mortar', as the contactor has corners in contact, too"
+        if not self.both:
+            remedy = "swap the two, or take coupling = 'mortar'"
         return (
             f"a convex corner of the target, at {self.place}, is {self.depth:.3g} inside a facet of the contactor, "
-            f"{100 * self.part:.2g} % of its size, between contactors, which do not see it: swap the two, or take coupling = 'mortar'"
+            f"{100 * self.part:.2g} % of its size, between contactors, which do not see it: {remedy}"
         )
 
 
@@ -169,8 +174,15 @@ class TargetCorners:
             # of equals the one that no rounding and no partition chooses
             deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
             size, place, deep = next(one for one in everywhere if one[1] == deepest)
-            told[int(k)] = CornerInside(place, deep, size, lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf)
+            missing = lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf
+            told[int(k)] = CornerInside(place, deep, size, missing, self._at_own_corners(int(k)))
         return told
+
+    def _at_own_corners(self, k: int) -> bool:
+        """Whether contactors of a contact at corners or ends of their own surface press (collective)."""
+        pair, config = self.pairs[k], self._config
+        corners = corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
+        return bool(reduced(config.comm, int(np.isin(pair.nodes[pair.trial.active], corners).sum())))
 
     def _near(self, asked: Bools) -> tuple[Indices, Ints]:
         """Corners in the box of the contactors that are no farther from the target than a facet is large, and contacts (collective)."""

@@ -14,6 +14,7 @@ from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.solve.limit_points import LimitPoint
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.newton import Iteration
@@ -122,12 +123,9 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         except UEMError as error:
             if progress.control.shorten(way.tried, error):
                 continue
+            limit = LimitPoint(problem, arc=not isinstance(way, ByLoad))
             take_back(problem, done)
-            if unstable is not None:
-                error.amend(
-                    f"at the load factor {unstable:.4g} the equilibrium was unstable, as the united matrix had negative eigenvalues: the "
-                    "bodies buckle or snap there, and no static path may go on; give them a mass and take time steps"
-                )
+            limit.name(error, done, unstable)
             raise
         progress.factor = factor
         if problem.solver.indefinite:

@@ -63,7 +63,7 @@ class StepControl:
         """
         mendable = isinstance(error, MENDABLE)
         if not mendable or 0.5 * length < SHORTEST_LENGTH * self.nominal:
-            if mendable and self._cuts:
+            if mendable:
                 error.amend(f"shorter steps, down to {length:.3g}, are no better")
             self.give_up()
             return False
