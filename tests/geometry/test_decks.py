@@ -209,6 +209,7 @@ def test_refused(folder):
         ("*PART, NAME=a\n*PART, NAME=b\n", "one flat input file"),
         ("*INSTANCE, NAME=a-1, PART=a\n1.0, 0.0, 0.0\n", "one flat input file"),
         ("*INCLUDE, INPUT=nowhere.inp\n", "nowhere.inp"),
+        ("*INCLUDE, INPUT=bad.inp\n", "includes 'bad.inp', which it is included by"),
     ):
         refused(uem.MeshError, words, lambda text=text: uem.read_mesh(deck(folder, "bad.inp", points, quad, text), COMM))
     crooked = deck(folder, "crooked.inp", points[[1, 4, 3, 0]], {"quad": [[3, 0, 1, 2]]})

@@ -91,8 +91,16 @@ def read_deck(path: Path) -> Found:
         raise MeshError(f"{path}: {error.args[0] if error.args else error}") from error
 
 
-def _keywords(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
-    """Keywords in capitals, their options likewise, and rows of what stands under them; files that are included in their place."""
+def _keywords(path: Path, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
+    """Keywords in capitals, their options likewise, and rows of what stands under them; files that are included in their place.
+
+    Args:
+        path: of the file.
+        around: files that it is included by.
+
+    Raises:
+        MeshError: if a file that is included is missing, or includes itself.
+    """
     keyword, options, rows = "", dict[str, str](), list[list[str]]()
     lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
     for line in lines:
@@ -109,7 +117,10 @@ def _keywords(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]
         keyword, rows = parts[0][0].strip().upper(), []
         options = {name.strip().upper(): value.strip().strip('"') for name, _, value in parts[1:]}
         if keyword == "INCLUDE":
-            yield from _keywords(_beside(path, options.get("INPUT", "")))
+            included, around_it = _beside(path, options.get("INPUT", "")), (*around, path.resolve())
+            if included.resolve() in around_it:
+                raise MeshError(f"{path} includes '{included.name}', which it is included by: leave that line out")
+            yield from _keywords(included, around_it)
     yield keyword, options, rows
 
 
