@@ -16,7 +16,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.form_checks import check_functional, check_values
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.geometry.tags import Part, Tag, as_tag
+from uem_dolfinx.geometry.tags import Part, Tag, as_tag, locate_dofs
 from uem_dolfinx.parallel import agreed
 
 
@@ -49,14 +49,13 @@ def dirichlet(
         value = _checked(V, component, value)
     tdim = mesh.topology.dim
     tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
-    mesh.topology.create_connectivity(tag.dim, tdim)
     part = compat.is_part(V)
     sub = V if component is None or V.num_sub_spaces < 2 else V.sub(int(component))
     if not isinstance(value, fem.Function):
-        return compat.dirichletbc(value, fem.locate_dofs_topological(sub, tag.dim, tag.entities), sub)
+        return compat.dirichletbc(value, locate_dofs(sub, tag), sub)
     if sub is V and not part:
-        return fem.dirichletbc(value, fem.locate_dofs_topological(V, tag.dim, tag.entities))
-    return compat.dirichletbc(value, fem.locate_dofs_topological((sub, value.function_space), tag.dim, tag.entities), sub)
+        return fem.dirichletbc(value, locate_dofs(V, tag))
+    return compat.dirichletbc(value, locate_dofs((sub, value.function_space), tag), sub)
 
 
 def _checked(V: Any, component: int | None, value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations, product
+
 from mpi4py import MPI
 
 import numpy as np
@@ -70,3 +72,24 @@ def two_cells(kind, order):
     points, blocks = with_middles(points, blocks) if order == 2 else (points, blocks)
     ((name, cells),) = blocks.items()
     return points, name, np.array(cells)
+
+
+def grid(kind, order, n=2):
+    """Nodes, name and cells of a unit square or cube of ``n`` cells along each axis, each of them divided for simplices."""
+    g = len(UNIT[kind][0])
+    corners = np.array(UNIT["quad" if g == 2 else "hexahedron"])
+    if kind in ("quad", "hexahedron"):
+        parts = corners[None]
+    else:
+        # Kuhn's: along the axes in every order
+        parts = np.array([np.vstack([np.zeros((1, g)), np.cumsum(np.eye(g)[list(p)], axis=0)]) for p in permutations(range(g))])
+    cells = [(part + at).astype(int) @ (n + 1) ** np.arange(g) for at in product(range(n), repeat=g) for part in parts]
+    points = np.array(list(product(range(n + 1), repeat=g)), dtype=float)[:, ::-1] / n
+    points, blocks = with_middles(points, {kind: np.array(cells).tolist()}) if order == 2 else (points, {kind: cells})
+    ((name, rows),) = blocks.items()
+    return points, name, np.array(rows)
+
+
+def node_sets(sets):
+    """Text of sets of nodes ``{name: nodes}``, which ``deck`` numbers."""
+    return "".join(f"*NSET, NSET={name}\n" + "".join(f"{10 * (n + 1)}\n" for n in nodes) for name, nodes in sets.items())

@@ -22,7 +22,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, reduced
 
@@ -134,7 +134,7 @@ def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -
     X.x.array[:] = config.X.ravel()
     straight.interpolate(X)
     curved = V.tabulate_dof_coordinates()[:, :g]
-    on = np.concatenate([fem.locate_dofs_topological(V, tag.dim, tag.entities) for tag in tags]).astype(np.int64)
+    on = np.concatenate([locate_dofs(V, tag) for tag in tags]).astype(np.int64)
     off = np.linalg.norm(curved[on] - straight.x.array.reshape(-1, g)[on], axis=1).max(initial=0.0)
     off = reduced(config.comm, float(off), op=MPI.MAX)
     if off > TOUCHING * config.size:

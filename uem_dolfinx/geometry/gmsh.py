@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +104,8 @@ def distributed(comm: MPI.Comm, read: Callable[[], RawMesh], label: Any) -> tupl
         cells = np.empty((0, nodes_per_cell), dtype=np.int64) if raw is None else raw.cells
         points = np.empty((0, gdim)) if raw is None else raw.points
         mesh = compat.create_mesh(comm, cells, points, cell, degree)
-        tags = [Tag(g.name, g.number, g.dim, mesh, _local_entities(mesh, g)) for g in groups]
-        sizes = np.array([len(tag.entities) for tag in tags], dtype=np.int64)
+        tags = [Tag(g.name, g.number, g.dim, mesh, _local_entities(mesh, g), _insides(mesh, cell, degree, g)) for g in groups]
+        sizes = np.array([tag.size for tag in tags], dtype=np.int64)
         result = Tags(tags, comm.allreduce(sizes))
     logger.info("%s: %d %s cells of degree %d, %r", label, comm.allreduce(len(cells)), cell, degree, result)
     # what locating d.o.f. of tags needs, and newer DOLFINx no longer builds by itself
@@ -123,13 +123,14 @@ class Group:
     """A physical group, or a set of another program.
 
     Its ``rows`` are, for the bodies, the input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
-    input node index, shape ``(n, n_vertices)``.
+    input node index, shape ``(n, n_vertices)``. Of a set of nodes its ``middles`` are those that are no vertices, shape ``(m,)``.
     """
 
     name: str | None
     number: int
     dim: int
     rows: npt.NDArray[np.int64]
+    middles: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True)
@@ -392,6 +393,24 @@ def _local_entities(mesh: Any, group: Group) -> Indices:
     rows = np.sort(nodes[vertices[near]], axis=1)
     number = np.unique(np.concatenate([group.rows, rows]), axis=0, return_inverse=True)[1].reshape(-1)
     return near[np.isin(number[len(group.rows) :], number[: len(group.rows)])].astype(np.int32)
+
+
+def _insides(mesh: Any, cell: str, degree: int, group: Group) -> tuple[Indices, ...]:
+    """Local edges, faces and cells, ghosts included, in whose middle a set of nodes has one; nothing of groups without any."""
+    if not len(group.middles):
+        return ()
+    topology, tdim = mesh.topology, mesh.topology.dim
+    listed = np.isin(np.asarray(mesh.geometry.input_global_indices)[compat.geometry_dofs(mesh)], group.middles)
+    found = []
+    for dim, inner in enumerate(forms.inner_nodes(cell, degree)[1:], 1):
+        topology.create_entities(dim)
+        topology.create_connectivity(tdim, dim)
+        entities = np.arange(len(listed), dtype=np.int32)[:, None]
+        if dim < tdim:
+            entities = compat.cell_table(topology.connectivity(tdim, dim), len(inner))
+        rows = [entities[listed[:, nodes].all(axis=1), i] for i, nodes in enumerate(inner) if nodes]
+        found.append(np.unique(np.concatenate([*rows, entities[:0, 0]])))
+    return tuple(found)
 
 
 def import_gmsh() -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,8 @@ def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cell
     Files of Gmsh, ``.geo`` and ``.msh``, are read as ``read_gmsh`` does; input files ``.inp`` of Abaqus and CalculiX with their sets and
     surfaces; all others by meshio: Exodus ``.e`` and ``.exo``, ``.vtu``, Nastran ``.bdf``, XDMF and more. Sets of cells and of facets
     become tags by their names, and so does every value of whole numbers that cells have, as ``"material 2"``. A set of nodes becomes a
-    tag of the exterior facets between them, or one of points where it has a node on none of these.
+    tag of exterior facets if it has all nodes of these and no others, and one of points otherwise, whose nodes are those of the set,
+    also in the middle of edges, faces and cells.
 
     Serendipity cells (``C3D20``, ``CPS8``, HEX20, QUAD8) are made complete: nodes are added in the middle of quadrilaterals and
     hexahedra, where the cells' own map takes these, so that they keep their shape.
@@ -110,9 +112,12 @@ def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
     known = [block.numbers for block in found.bodies if block.numbers is not None]
     numbers = np.concatenate(known) if len(known) == len(found.bodies) else None
     raw = checked(cell, degree, points, numbered, str(path), numbers)
-    sets = [*_sets_of_cells(found, place), *_surfaces(found, place), *_sets_of_nodes(found, place, raw)]
-    for number, (name, of_dim, rows) in enumerate(sets, 1):
-        raw.groups.append(Group(name, number, of_dim, rows.astype(np.int64)))
+    sets = [
+        *_sets_of_cells(found, place),
+        *_surfaces(found, place),
+        *_sets_of_nodes(found, place, raw, nodes < len(found.points) - added),
+    ]
+    raw.groups.extend(replace(group, number=number) for number, group in enumerate(sets, 1))
     return raw
 
 
@@ -136,8 +141,8 @@ def _found(path: Path) -> Found:
         raise MeshError(f"meshio cannot read {path}: {told}") from error
 
 
-def _sets_of_cells(found: Found, place: Ints) -> Iterator[tuple[str, int, Ints]]:
-    """Names, dimensions and rows, as of ``Group``, of sets of cells and of what is on their surfaces."""
+def _sets_of_cells(found: Found, place: Ints) -> Iterator[Group]:
+    """Sets of cells and of what is on their surfaces, without their numbers."""
     sets, dim = dict(found.cell_sets), found.dim
     for name, values in found.cell_data.items():
         for value in np.unique(np.concatenate(values)).tolist():
@@ -154,7 +159,7 @@ def _sets_of_cells(found: Found, place: Ints) -> Iterator[tuple[str, int, Ints]]
                 # vertices come first
                 rows.setdefault(block.dim, []).append(_in_bodies(block.data[which, : MESHIO_VERTICES[block.base]], place))
         for of_dim, parts in rows.items():
-            yield name, of_dim, np.concatenate(parts)
+            yield Group(name, 0, of_dim, np.concatenate(parts))
 
 
 def _in_bodies(rows: Ints, place: Ints) -> Ints:
@@ -163,30 +168,48 @@ def _in_bodies(rows: Ints, place: Ints) -> Ints:
     return vertices[(vertices >= 0).all(axis=1)]
 
 
-def _surfaces(found: Found, place: Ints) -> Iterator[tuple[str, int, Ints]]:
-    """Likewise of surfaces of sides."""
+def _surfaces(found: Found, place: Ints) -> Iterator[Group]:
+    """Likewise surfaces of sides."""
     for name, sides in found.sides.items():
         parts = [_in_bodies(rows, place) for rows in sides]
-        yield name, found.dim - 1, np.concatenate(parts) if parts else np.zeros((0, found.dim), np.int64)
+        yield Group(name, 0, found.dim - 1, np.concatenate(parts) if parts else np.zeros((0, found.dim), np.int64))
 
 
-def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh) -> Iterator[tuple[str, int, Ints]]:
-    """Names, dimensions and rows, as of ``Group``, of sets of nodes: of facets if all vertices among them are on some."""
-    topology = forms.reference_topology(raw.cell)
-    vertices = compat.from_gmsh(raw.cell, raw.cells)[:, : len(topology[0])]
+def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh, of_file: Bools) -> Iterator[Group]:
+    """Likewise sets of nodes.
+
+    They are of facets where all their nodes are on exterior facets of which they have all nodes, and of points where any is not. Nodes
+    that serendipity cells lack in the file may be on none: ``of_file`` are all others.
+    """
+    nodes, topology = compat.from_gmsh(raw.cell, raw.cells), forms.reference_topology(raw.cell)
+    of_side = _nodes_of_sides(raw.cell, raw.degree)
     is_vertex: Bools = np.zeros(len(raw.points), dtype=bool)
-    is_vertex[vertices] = True
-    for name, nodes in found.point_sets.items():
+    is_vertex[nodes[:, : len(topology[0])]] = True
+    for name, members in found.point_sets.items():
         inside: Bools = np.zeros(len(raw.points), dtype=bool)
-        own = place[nodes]
+        own = place[members]
         inside[own[own >= 0]] = True
-        inside &= is_vertex
-        sides = [vertices[:, side] for side in topology[found.dim - 1]]
-        rows, count = np.unique(
-            np.concatenate([np.sort(side[inside[side].all(axis=1)], axis=1) for side in sides]), axis=0, return_counts=True
-        )
-        rows = rows[count == 1]
-        if len(rows) and inside.sum() == len(np.unique(rows)):
-            yield name, found.dim - 1, rows
+        sides = np.concatenate([nodes[inside[nodes[:, side]].all(axis=1)][:, side] for side in of_side])
+        corners = np.sort(sides[:, : len(topology[-2][0])], axis=1)
+        rows, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
+        off = inside & of_file
+        off[sides[first[count == 1]]] = False
+        if (count == 1).any() and not off.any():
+            yield Group(name, 0, found.dim - 1, rows[count == 1])
         else:
-            yield name, 0, np.flatnonzero(inside)[:, None]
+            yield Group(name, 0, 0, np.flatnonzero(inside & is_vertex)[:, None], np.flatnonzero(inside & ~is_vertex))
+
+
+def _nodes_of_sides(cell: str, degree: int) -> list[list[int]]:
+    """Local nodes of every facet of a cell, its vertices first."""
+    topology, inner = forms.reference_topology(cell), forms.inner_nodes(cell, degree)
+    return [
+        [
+            node
+            for entities, nodes in zip(topology, inner)
+            for own, at in zip(entities, nodes)
+            if set(own) <= set(side)
+            for node in at
+        ]
+        for side in topology[-2]
+    ]

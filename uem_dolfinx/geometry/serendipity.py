@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uem_dolfinx.arrays import Ints
+from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.geometry.found import KINDS, Block, Found
 
 #: Cells of meshio with nodes on edges alone, but for those that have no quadrilaterals.
@@ -22,7 +22,8 @@ SERENDIPITY = {"quad8": "quad9", "hexahedron20": "hexahedron27", "wedge15": "wed
 def completed(found: Found) -> tuple[Found, int]:
     """The mesh with complete cells in place of serendipity ones, and how many nodes were added.
 
-    Cells that share a quadrilateral share its new node.
+    Cells that share a quadrilateral share its new node. Sets of nodes that have all nodes of a quadrilateral or of a hexahedron have its
+    new node, too.
     """
     asked = [block for block in found.cells if block.type in SERENDIPITY]
     if not asked:
@@ -34,6 +35,7 @@ def completed(found: Found) -> tuple[Found, int]:
     x = found.points
     middles = (2.0 * x[edges[first]].sum(axis=1) - x[corners[first]].sum(axis=1)) / 4.0
     points, count, start, cells = [x, middles], len(x) + len(middles), 0, []
+    around = [(len(x) + np.arange(len(middles)), np.concatenate([corners[first], edges[first]], axis=1))]
     for block in found.cells:
         if block.type in SERENDIPITY:
             kind, n = KINDS[block.base], len(block.data)
@@ -44,10 +46,19 @@ def completed(found: Found) -> tuple[Found, int]:
                 own = block.data
                 points.append((x[own[:, kind.vertices :]].sum(axis=1) - x[own[:, : kind.vertices]].sum(axis=1)) / 4.0)
                 data.append(count + np.arange(n)[:, None])
+                around.append((count + np.arange(n), own))
                 count += n
             block = replace(block, type=SERENDIPITY[block.type], data=np.concatenate(data, axis=1))
         cells.append(block)
-    return found.with_cells(np.concatenate(points), cells), count - len(x)
+    sets = {name: _with_new(nodes, count, around) for name, nodes in found.point_sets.items()}
+    return found.with_cells(np.concatenate(points), cells, point_sets=sets), count - len(x)
+
+
+def _with_new(nodes: Ints, count: int, around: list[tuple[Ints, Ints]]) -> Ints:
+    """Nodes of a set, and of so many those new ones that it has all nodes around of: new ones ``(n,)``, and nodes around ``(n, k)``."""
+    listed: Bools = np.zeros(count, dtype=bool)
+    listed[nodes] = True
+    return np.concatenate([nodes, *(new[listed[old].all(axis=1)] for new, old in around)])
 
 
 def _quads(block: Block) -> tuple[Ints, Ints]:

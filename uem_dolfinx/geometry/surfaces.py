@@ -10,7 +10,6 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
@@ -19,14 +18,13 @@ from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, facets_of, pairs_of_equals
 from uem_dolfinx.geometry.shapes import integrals
-from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.parallel import Exchange, agree, reduced
 
 
 def surface_nodes(config: Configuration, tag: Tag) -> Indices:
     """Owned nodes on the closure of a tag's facets, or at its points, sorted (collective)."""
-    config.mesh.topology.create_connectivity(tag.dim, config.tdim)
-    nodes = fem.locate_dofs_topological(config.V, tag.dim, tag.entities, True)
+    nodes = locate_dofs(config.V, tag)
     return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
 
 

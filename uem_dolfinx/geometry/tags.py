@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Indices
@@ -34,6 +35,8 @@ class Tag:
         dim: dimension of the entities.
         mesh: the mesh they belong to.
         entities: local indices of the entities on this rank, ghosts included, ascending, shape ``(n,)``.
+        insides: of a set of nodes, whose entities are vertices, also the edges, faces and cells in whose middle it has a node: likewise of
+            the dimensions 1, 2 ... each; empty for all other groups.
     """
 
     name: str | None
@@ -41,10 +44,16 @@ class Tag:
     dim: int
     mesh: Any = field(repr=False, compare=False)
     entities: Indices = field(repr=False, compare=False)
+    insides: tuple[Indices, ...] = field(default=(), repr=False, compare=False)
 
     def __str__(self) -> str:
         """Name where there is one, else number."""
         return f"'{self.name}'" if self.name else f"number {self.number}"
+
+    @property
+    def size(self) -> int:
+        """Number of entities on this rank, ghosts and those with a node in the middle included."""
+        return len(self.entities) + sum(map(len, self.insides))
 
 
 class Tags(Mapping[Key, Tag]):
@@ -153,10 +162,52 @@ def as_tag(part: Part, mesh: Any, dims: Sequence[int], role: str) -> Tag:
     tag = tags[0]
     if not isinstance(part, Tag):
         entities = compat.shared_by_ranks(mesh.topology.index_map(tag.dim), np.concatenate([t.entities for t in tags]))
-        tag = Tag(name_of(part), 0, tag.dim, mesh, entities)
-    if reduced(mesh.comm, len(tag.entities)) == 0:
+        insides = [
+            compat.shared_by_ranks(mesh.topology.index_map(dim), np.concatenate([t.insides[dim - 1] for t in tags if t.insides]))
+            for dim in range(1, 1 + max(len(t.insides) for t in tags))
+        ]
+        tag = Tag(name_of(part), 0, tag.dim, mesh, entities, tuple(insides))
+    if reduced(mesh.comm, tag.size) == 0:
         raise TagError(f"{role} '{name_of(part)}' holds no {_word(mesh, tag.dim)}: check the physical group in the gmsh model")
     return tag
+
+
+def locate_dofs(V: Any, tag: Tag) -> Any:
+    """D.o.f. at the nodes of a tag, ascending, as ``fem.locate_dofs_topological`` finds them (collective).
+
+    Args:
+        V: a space or a part of one, or one of these and the space of the values for it.
+        tag: of any dimension.
+
+    Returns:
+        Local d.o.f. ``(n,)``, or one such array for each of two spaces.
+
+    Raises:
+        SpaceError: if the tag has nodes in the middle of edges, faces or cells alone, and the space has none there.
+    """
+    parts, topology = [_on_closure(V, tag.dim, tag.entities)], tag.mesh.topology
+    for dim, entities in enumerate(tag.insides, 1):
+        topology.create_connectivity(dim, dim - 1)
+        sides = topology.connectivity(dim, dim - 1)
+        n = len(sides.offsets) - 1
+        bounds = np.unique(np.asarray(sides.array).reshape(n, len(sides.array) // max(n, 1))[entities])
+        whole, around = _on_closure(V, dim, entities), _on_closure(V, dim - 1, bounds.astype(np.int32))
+        parts.append(whole[:, ~np.isin(whole[0], around[0])])
+    found = np.concatenate(parts, axis=1)
+    found = np.ascontiguousarray(found[:, np.unique(found[0], return_index=True)[1]])
+    if tag.insides and reduced(tag.mesh.comm, found.shape[1]) == 0:
+        raise SpaceError(
+            f"the nodes of {tag} are in the middle of edges, faces or cells, where this space has none: take one of degree 2, or a set "
+            "that has vertices"
+        )
+    return list(found) if isinstance(V, (tuple, list)) else found[0]
+
+
+def _on_closure(V: Any, dim: int, entities: Indices) -> Indices:
+    """D.o.f. of one or of two spaces on entities and all that bounds them ``(1 or 2, n)`` (collective)."""
+    mesh = (V[0] if isinstance(V, (tuple, list)) else V).mesh
+    mesh.topology.create_connectivity(dim, mesh.topology.dim)
+    return np.atleast_2d(fem.locate_dofs_topological(V, dim, entities))
 
 
 def _read(part: Part, mesh: Any, dims: Sequence[int], role: str) -> list[Tag]:
