@@ -121,7 +121,10 @@ class AtPoints:
         config = self._config
         for one, nodes in self.parts:
             force, k = one.force_and_stiffness(config.gdim)
-            np.subtract.at(b, self._unknowns[nodes], force if k is None else -config.displacement[nodes] @ k)
+            here = self._unknowns[nodes]
+            # one value each: what NumPy makes of values that it has to repeat depends on its version
+            pulls = np.broadcast_to(force if k is None else -config.displacement[nodes] @ k, here.shape)
+            np.subtract.at(b, here.ravel(), pulls.ravel())
         for coupling in self._couplings:
             b[self._unknowns[coupling.nodes.nodes]] -= coupling.nodal_forces()
 
