@@ -167,11 +167,6 @@ def reference_topology(cell: str) -> list[list[list[int]]]:
     return [[list(entity) for entity in entities] for entities in basix.topology(getattr(basix.CellType, cell))]
 
 
-def inner_nodes(cell: str, degree: int) -> list[list[list[int]]]:
-    """Local nodes of a Lagrange cell in the inside of every sub-entity, not on its own edges and vertices: ``nodes[dim][i]``."""
-    return [[list(nodes) for nodes in entities] for entities in create_lagrange_element(cell, degree).entity_dofs]
-
-
 def sum_ghosts(u: Any) -> None:
     """Add the ghost entries of a Function to their owners and send the sums back (collective)."""
     vector = compat.petsc_vector(u)

@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from helpers import MESHES, at, blocks, box, clamp, highest, linear, modulus, refused, run, scene, st_venant
 
 import uem_dolfinx as uem
@@ -36,6 +36,23 @@ def test_forces_of_a_surface():
     run(uem.UnitedProblem(F, w, bcs=clamp(V, left), load={traction: (0.02, 0.04)}), 2)
     assert highest(COMM, np.abs(u.x.array - w.x.array)) <= 1e-12
     assert np.allclose(problem.reaction(left), (-0.02, -0.04), rtol=1e-9) and steps[-1].newton_iterations <= 5
+
+
+def test_several_nodes_at_once():
+    """A load and a spring on several nodes are one on each of them, held nodes included."""
+    s, V, u, left, _ = bar()
+    places = [(0.0, 0.5), (1.0, 0.5), (2.0, 0.0)]
+    near = [mesh.locate_entities(s.mesh, 0, lambda x, p=p: np.hypot(x[0] - p[0], x[1] - p[1]) < 1e-6) for p in places]
+    points = uem.Tag("points", 1, 0, s.mesh, np.unique(np.concatenate(near)).astype(np.int32))
+    force, k, found = (0.03, -0.01), (0.2, 0.4), []
+    for where in ([points], places):
+        u.x.array[:] = 0.0
+        loads = [one(at, value) for at in where for one, value in ((uem.PointLoad, force), (uem.PointSpring, k))]
+        problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(V, left), points=loads)
+        run(problem)
+        found.append((np.array(u.x.array), problem.reaction(left)))
+    assert highest(COMM, np.abs(found[0][0] - found[1][0])) <= 1e-14 and highest(COMM, np.abs(u.x.array)) > 0.03
+    assert np.allclose(found[0][1], found[1][1], rtol=1e-12)
 
 
 def test_a_body_on_springs():

@@ -107,7 +107,7 @@ class AtPoints:
         self, config: Configuration, declared: Sequence[PointLoad | PointSpring], couplings: Sequence[RigidCoupling] = ()
     ):
         self._config, self._couplings = config, list(couplings)
-        #: What was declared, each with its owned nodes.
+        #: What was declared, each with its owned nodes, all of which differ.
         self.parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
         with agreed(config.comm):
             for one, _ in self.parts:
@@ -121,10 +121,7 @@ class AtPoints:
         config = self._config
         for one, nodes in self.parts:
             force, k = one.force_and_stiffness(config.gdim)
-            here = self._unknowns[nodes]
-            # one value each: what NumPy makes of values that it has to repeat depends on its version
-            pulls = np.broadcast_to(force if k is None else -config.displacement[nodes] @ k, here.shape)
-            np.subtract.at(b, here.ravel(), pulls.ravel())
+            b[self._unknowns[nodes]] -= force if k is None else -config.displacement[nodes] @ k
         for coupling in self._couplings:
             b[self._unknowns[coupling.nodes.nodes]] -= coupling.nodal_forces()
 
@@ -132,7 +129,7 @@ class AtPoints:
         """Forces but those of springs, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         found = np.zeros((self._config.n_owned, self._config.gdim))
         for one, nodes in self.parts:
-            np.add.at(found, nodes, one.force_and_stiffness(self._config.gdim)[0])
+            found[nodes] += one.force_and_stiffness(self._config.gdim)[0]
         for coupling in self._couplings:
             found[coupling.nodes.nodes] += coupling.nodal_forces()
         return found

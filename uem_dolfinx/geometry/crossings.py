@@ -21,7 +21,7 @@ from uem_dolfinx.parallel import Exchange
 #: Halvings that find a time to the last bit.
 #: [bound; halvings; -]
 HALVINGS = 53
-#: Who leaves the plane of a facet by less than this part of the reach rides on it.
+#: A point that leaves the plane of a facet by less than this part of the reach moves with the facet.
 #: [bound; the reach; test_crossings.py::test_points_that_ride_on_facets]
 BY_ROUNDING = 1e-10
 

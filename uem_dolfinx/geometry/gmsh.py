@@ -402,7 +402,7 @@ def _insides(mesh: Any, cell: str, degree: int, group: Group) -> tuple[Indices, 
     topology, tdim = mesh.topology, mesh.topology.dim
     listed = np.isin(np.asarray(mesh.geometry.input_global_indices)[compat.geometry_dofs(mesh)], group.middles)
     found = []
-    for dim, inner in enumerate(forms.inner_nodes(cell, degree)[1:], 1):
+    for dim, inner in enumerate(forms.create_lagrange_element(cell, degree).entity_dofs[1:], 1):
         topology.create_entities(dim)
         topology.create_connectivity(tdim, dim)
         entities = np.arange(len(listed), dtype=np.int32)[:, None]

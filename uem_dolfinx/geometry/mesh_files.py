@@ -182,7 +182,8 @@ def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh, of_file: Bools) -> I
     that serendipity cells lack in the file may be on none: ``of_file`` are all others.
     """
     nodes, topology = compat.from_gmsh(raw.cell, raw.cells), forms.reference_topology(raw.cell)
-    of_side = _nodes_of_sides(raw.cell, raw.degree)
+    # of every facet its vertices first
+    of_side = forms.create_lagrange_element(raw.cell, raw.degree).entity_closure_dofs[-2]
     is_vertex: Bools = np.zeros(len(raw.points), dtype=bool)
     is_vertex[nodes[:, : len(topology[0])]] = True
     for name, members in found.point_sets.items():
@@ -198,18 +199,3 @@ def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh, of_file: Bools) -> I
             yield Group(name, 0, found.dim - 1, rows[count == 1])
         else:
             yield Group(name, 0, 0, np.flatnonzero(inside & is_vertex)[:, None], np.flatnonzero(inside & ~is_vertex))
-
-
-def _nodes_of_sides(cell: str, degree: int) -> list[list[int]]:
-    """Local nodes of every facet of a cell, its vertices first."""
-    topology, inner = forms.reference_topology(cell), forms.inner_nodes(cell, degree)
-    return [
-        [
-            node
-            for entities, nodes in zip(topology, inner)
-            for own, at in zip(entities, nodes)
-            if set(own) <= set(side)
-            for node in at
-        ]
-        for side in topology[-2]
-    ]

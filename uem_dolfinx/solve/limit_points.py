@@ -22,7 +22,7 @@ FAILURES = (ConvergenceError, InvertedElementError, NotFiniteError)
 #: What goes on where no static path does.
 IN_TIME = "give them a mass and take time steps"
 #: What follows a path on which the load falls.
-ALONG = "lead the bodies by a displacement, or by load_steps(..., arc_length=True); where they jump, give them a mass and take time steps"
+WAYS_ON = "lead the bodies by a displacement, or by load_steps(..., arc_length=True); where they jump, give them a mass and take time steps"
 
 
 class LimitPoint:
@@ -51,7 +51,7 @@ class LimitPoint:
         # an answer that is known takes the place of advice on meshes and numbers of iterations
         known = isinstance(error, ConvergenceError) and (unstable is not None or self.indefinite) and by_load
         if unstable is not None:
-            on = f"there: {ALONG}" if by_load else f"there, and no static path may go on; {IN_TIME}"
+            on = f"there: {WAYS_ON}" if by_load else f"there, and no static path may go on; {IN_TIME}"
             error.amend(
                 f"at the load factor {unstable:.4g} the equilibrium was unstable, as the united matrix had negative eigenvalues: the "
                 f"bodies buckle or snap {on}",
@@ -61,7 +61,7 @@ class LimitPoint:
             seen = ", and beyond it the united matrix has negative eigenvalues: it may be" if self.indefinite else "; if it is"
             error.amend(
                 f"{reached:.4g} is the last load factor with an equilibrium{seen} the largest that the bodies bear (a limit point)"
-                f"{': ' if self.indefinite else ', '}{ALONG}",
+                f"{': ' if self.indefinite else ', '}{WAYS_ON}",
                 instead=known,
             )
 
