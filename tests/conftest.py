@@ -14,6 +14,7 @@ import shutil
 import sys
 import tempfile
 import time
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,22 +60,38 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The number of cases of a parametrised test that are quick."""
-    parser.addoption("--cases", type=int, default=2, help="so many cases of each parametrised test are not marked slow (2)")
+    """How many cases of each parametrised test run, and which share of the tests."""
+    parser.addoption("--cases", type=int, default=1, help="so many cases of each parametrised test are not marked slow (1)")
+    parser.addoption("--most", type=int, help="at most so many cases of each parametrised test run, slow ones among them (all)")
+    parser.addoption("--every", type=int, default=1, help="every so many tests of each file run, its first among them (1)")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark as slow all but a few cases of each parametrised test, evenly spread over its list, the first and the last among them."""
-    quick, cases = config.getoption("--cases"), defaultdict[str, list[pytest.Item]](list)
+    """Mark as slow all but a few cases of each parametrised test, and leave out those that are not to run."""
+    quick, most, every = (config.getoption(name) for name in ("--cases", "--most", "--every"))
+    files = defaultdict[Path, dict[str, list[pytest.Item]]](dict)
     for item in items:
-        if item.get_closest_marker("slow") is None:
-            cases[item.nodeid.partition("[")[0]].append(item)
-    for several in cases.values():
-        kept = {round(k) for k in np.linspace(0, len(several) - 1, min(quick, len(several)))}
-        for k, item in enumerate(several):
-            if k not in kept:
-                item.add_marker("slow")
+        files[item.path].setdefault(item.nodeid.partition("[")[0], []).append(item)
+    runs = set()
+    for tests in files.values():
+        for cases in list(tests.values())[::every]:
+            first = _spread([item for item in cases if item.get_closest_marker("slow") is None], quick)
+            for item in cases:
+                if item not in first:
+                    item.add_marker("slow")
+            others = [item for item in cases if item not in first]
+            runs |= {*first, *_spread(others, len(others) if most is None else max(most - len(first), 0))}
+    config.hook.pytest_deselected(items=[item for item in items if item not in runs])
+    items[:] = [item for item in items if item in runs]
+
+
+def _spread(items: list[pytest.Item], number: int) -> list[pytest.Item]:
+    """So many of these, evenly spread over the list; where from hangs on the test's name, so that tests run different cases."""
+    if number >= len(items):
+        return items
+    start = zlib.crc32(items[0].nodeid.partition("[")[0].encode())
+    return [items[(start + len(items) * k // number) % len(items)] for k in range(number)]
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -104,14 +104,12 @@ from uem_dolfinx.errors import (
     UserFunctionError,
 )
 from uem_dolfinx.geometry.axisymmetry import axisymmetric, displacement_gradient
-from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
 from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlane, RigidSphere, RigidSurface
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
 from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -126,6 +124,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.parameters import ContactParameter
     from uem_dolfinx.contact.preload import Preload
+    from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
@@ -136,6 +135,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene, plot_setup
     from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
     from uem_dolfinx.output.surfaces import SurfaceWriter
+    from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
     from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
     from uem_dolfinx.solve.history import History, recording
     from uem_dolfinx.solve.modes import Vibrations, modes
@@ -145,6 +145,8 @@ if _TYPE_CHECKING:
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
+    "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
+    "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
     "RigidCoupling": "conditions.rigid_coupling",
