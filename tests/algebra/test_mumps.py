@@ -34,6 +34,7 @@ def pressed(comm, options, friction=0.0):
 
 
 @pytest.mark.parametrize("kind, friction", [("cholesky", 0.0), ("lu", 0.0), ("lu", 0.02)])
+@pytest.mark.slow
 def test_mumps_gets_the_workspace_it_asks_for(comm, kind, friction, caplog):
     """With too little workspace at first the state is that of a run with enough; with friction the sign of the determinant is told."""
     states = []

@@ -157,6 +157,7 @@ def test_saddle_point_is_indefinite():
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="condition numbers are taken on one rank")
+@pytest.mark.slow
 def test_condition_number():
     """Against a dense computation; the penalty's grows with its stiffness, the united one has none."""
     united, _, _ = pressed("united")

@@ -55,6 +55,7 @@ def sunk(law=linear, options=None, rtol=1e-8, sliding="small", way=0.05):
 # -- solves ------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_step_of_an_impact_is_one_solve():
     """While the contact of a linear bar stays, a step takes one solve, two of the bodies, with a factorisation that is there already."""
     bar = Bar(20)

@@ -303,6 +303,7 @@ def python(script: str, *options: str, **more: str) -> str:
 
 
 @serial
+@pytest.mark.slow
 def test_imports_nothing_heavy():
     """``import uem_dolfinx`` brings in nothing that only some scenes need and DOLFINx alone does not bring in."""
     script = "import mpi4py.MPI, {}; import json, sys; print(json.dumps(sorted(sys.modules)))"
@@ -359,6 +360,7 @@ except uem.UEMError as error:
 
 
 @serial
+@pytest.mark.slow
 def test_scene_without_gmsh_matplotlib_pyvista():
     """A scene that needs none of them runs where all are missing; what does need one says which."""
     optional = ["gmsh", "matplotlib", "pyvista", "vtk", "tqdm"]

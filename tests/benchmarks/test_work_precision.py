@@ -137,6 +137,7 @@ def test_energy_of_hertz_errors_does_not_reward_overlap():
     assert overlapping[2] == pytest.approx(united[1], rel=0.02)
 
 
+@pytest.mark.slow
 def test_bar_impact_converges_to_the_wave():
     coarse, fine = (measure.measure(bar_impact(10, cfl), "united", runs=0) for cfl in (2.0, 1.0))
     assert fine["error_pressure"] < 0.25 and fine["error_force"] < 0.05

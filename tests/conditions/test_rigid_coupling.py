@@ -292,6 +292,7 @@ def test_a_plate_that_spins(mass):
     assert np.allclose(momentum, [1.2, 0.0], atol=1e-12) and np.allclose(energy, energy[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_block_that_strikes():
     """A rigid block falls askew on one that flies free: momentum is kept to rounding, with friction, and the block stays rigid."""
     s = scene(

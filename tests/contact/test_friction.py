@@ -266,6 +266,7 @@ def test_a_moving_plane_takes_the_block_along():
             assert f[0] == pytest.approx(0.05 * f[1], rel=1e-10)
 
 
+@pytest.mark.slow
 def test_multigrid_between_stick_and_slip(comm):
     """Multigrid of the user's serves united matrices that are symmetric and unsymmetric by turns: the answer of a factorisation."""
 

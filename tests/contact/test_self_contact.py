@@ -88,6 +88,7 @@ def test_nothing_on_bodies_at_rest(cell):
 @pytest.mark.parametrize(
     ("cell", "more"), [("quadrilateral", 0.0), slow("triangle", 0.2), slow("quadrilateral", 0.2), slow("triangle", 0.0)]
 )
+@pytest.mark.slow
 def test_prongs_in_any_pose(cell, more):
     """In any pose, which decides which prong follows, the prongs close alike; none passes into the other."""
     found = []

@@ -17,6 +17,7 @@ C = np.sqrt(E / RHO)
 @pytest.mark.parametrize(("degree", "lumped", "coupling"), [
     (1, False, "node_to_surface"), slow(1, True, "mortar"), slow(2, False, "node_to_surface"),
 ])  # fmt: skip
+@pytest.mark.slow
 def test_rod_on_a_wall(degree, lumped, coupling):
     """A round rod without Poisson's effect: the wall bears rho c v A for 2 L / c, and the rod flies off as fast as it came."""
     s = Revolved(rectangle((0, 0), (R, L), (1, 30 // degree)), degree=degree)

@@ -186,6 +186,7 @@ def test_edges_that_coincide_do_not_slip_off(width, degree):
     assert max(past) > 1e-5
 
 
+@pytest.mark.slow
 def test_what_has_sunk_beside_the_end_does_not_come_back_with_a_blow(caplog):
     """The block juts out by a 1e-4 of a facet, its corners sink past the rod's, and the rod swells under them: they are left out."""
     landing = Landing(1.5, 1.5, width=(2, 3), nu=0.3, cells=8, wider=2e-6)

@@ -176,6 +176,7 @@ def test_linear_flight_assembles_once():
     assert bar.problem.bodies.tangent.number == 1
 
 
+@pytest.mark.slow
 def test_massy_contactors_warn(caplog):
     with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
         bar = Bar(20, contactors="massy")
@@ -202,6 +203,7 @@ def test_steps_that_give_massy_contactors_energy_are_told(caplog):
         assert len(told) < len(rows) / 2
 
 
+@pytest.mark.slow
 def test_massless_contactors_have_no_velocity_of_their_own():
     """In contact with the wall they are at rest, and after it they move with the bar."""
     bar = Bar(50)

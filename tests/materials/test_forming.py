@@ -126,6 +126,7 @@ def test_upset_by_a_block_with_friction(cell, coupling):
         assert np.abs(upset.s.gather(upset.u) - alone.s.gather(alone.u)).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_a_step_that_failed_leaves_no_trace():
     """Fields, history and dissipation of friction are those of a run without failures, which makes the same steps."""
     straight, troubled = Upset(), Upset()
@@ -143,6 +144,7 @@ def test_a_step_that_failed_leaves_no_trace():
 
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
+@pytest.mark.slow
 def test_impact_on_a_wall(coupling):
     """A body flies against a block that does not yield and flattens: momentum changes by the impulse, no energy is made."""
     law = Thrown(coupling)

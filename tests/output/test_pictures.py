@@ -88,6 +88,7 @@ def test_outside_of_the_bodies(cell, drawn, folder):
 
 
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
+@pytest.mark.slow
 def test_a_window_cuts_bodies(cell, drawn, folder):
     """Both cubes at x = 0.5, 1 by 1.9, and the field is drawn there."""
     need_pyvista()
@@ -142,6 +143,7 @@ def test_titles_of_frames():
     assert films.titles([("", 0.0)] * 2) == ["0", "0"]
 
 
+@pytest.mark.slow
 def test_pictures_of_bodies(folder):
     """Drawn in fact, into a file and into a panel: the scene is on it, in the colours of the colour map."""
     need_pyvista()

@@ -327,6 +327,7 @@ def test_drawn_in_the_plane(folder):
     refused(uem.InputTypeError, "arrows", lambda: uem.plot_setup(problem, folder / "a.png", arrows=[(1, 2)]))
 
 
+@pytest.mark.slow
 def test_drawn_in_space(folder):
     """Both contact surfaces are seen through the bodies, in their colours."""
     pytest.importorskip("pyvista")

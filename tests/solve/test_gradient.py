@@ -264,6 +264,7 @@ def test_taylor_tests_without_an_order(functional, slope):
 
 
 @pytest.mark.parametrize("axisymmetric", [False, True])
+@pytest.mark.slow
 def test_by_the_shape_from_a_cold_cache(axisymmetric):
     """Code that is compiled anew, by a step or by users' own forms, leaves coordinates in forms what they were."""
     mesh = dm.create_unit_square(COMM, 1, 1)

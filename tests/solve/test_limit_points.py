@@ -33,6 +33,7 @@ def pressed(load, size):
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e3])
+@pytest.mark.slow
 def test_beyond_the_largest_load(size):
     """Steps end at the limit load, and the error names it and the ways on, whatever the unit of length."""
     factors, words = pressed(2.0 * LIMIT, size)

@@ -71,6 +71,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("cell", "degree"), KINDS)
+@pytest.mark.slow
 def test_a_needle_does_not_pass_a_plate(cell, degree):
     """One solve would leave the plate unmoved above the tip: it is refused, with both places; steps that are cut push the plate down."""
     one = Needle(cell, degree)
