@@ -22,6 +22,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.algebra.dependent import IndependentEquations, _eliminate, _solve
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.rings import DEPENDENT
 from uem_dolfinx.geometry.configuration import Configuration
 
 COMM = MPI.COMM_WORLD
@@ -174,6 +175,42 @@ def test_rows_that_depend_nearly(part, depends):
     twin = np.sqrt(1 - part**2) * A[0] / np.linalg.norm(A[0]) + part * across
     group, _, _ = eliminated(np.concatenate([A, twin[None]]), np.zeros(5), free)
     assert group.redundant.sum() == depends
+
+
+def plain(A, h, free):
+    """Gauss-Jordan elimination of all rows at every pivot: the independent rows, in their order, and all that are left."""
+    movable = (A * free).reshape(len(A), -1)
+    length = np.linalg.norm(movable, axis=1)
+    A, h, across = A / length[:, None, None], h / length, movable / length[:, None]
+    rest, order = np.ones(len(A), dtype=bool), []
+    while (rest := rest & (np.linalg.norm(across, axis=1) > DEPENDENT)).any():
+        size = np.linalg.norm(A * free, axis=2)
+        i, t = np.unravel_index(np.argmax(np.where(rest[:, None], size, -1.0)), size.shape)
+        q, d = across[i] / np.linalg.norm(across[i]), A[i, t] * free[t] / size[i, t]
+        across -= (across @ q)[:, None] * q
+        A[i], h[i] = A[i] / size[i, t], h[i] / size[i, t]
+        factor = np.where(np.arange(len(A)) == i, 0.0, A[:, t] @ d)
+        A, h = A - factor[:, None, None] * A[i], h - factor * h[i]
+        rest[i] = False
+        order.append(int(i))
+    return order, A[order].reshape(len(order), -1), h[order]
+
+
+@pytest.mark.parametrize("m, copies", [(2, 0), (20, 5), (60, 40)])
+def test_only_what_is_left_is_eliminated(m, copies):
+    """Passing over zeros, and over rows that are chosen already, chooses the same rows and leaves the same of them."""
+    rng = np.random.default_rng(m)
+    A, free = rows(rng, m, np.ones(m))
+    A = np.concatenate([A, A[rng.integers(0, m, copies)] * rng.uniform(0.5, 2.0, copies)[:, None, None]])
+    free[:] = True
+    h = np.einsum("ing,ng->i", A, rng.normal(size=A.shape[1:]))
+    group, C, _ = eliminated(A.copy(), h.copy(), free)
+    order, wanted, gaps = plain(A, h, free)
+    assert np.array_equal(np.flatnonzero(~group.redundant), np.sort(order))
+    assert np.allclose(C, wanted, rtol=0, atol=1e-9) and np.allclose(-group.independent.gap, gaps, atol=1e-9)
+    # forces of the given rows, the least that do: what the pseudoinverse says
+    S = np.linalg.pinv(A.reshape(len(A), -1).T) @ wanted.T
+    assert np.allclose(group.shares, S, rtol=0, atol=1e-9 * max(1.0, np.abs(S).max()))
 
 
 # -- two-pass ------------------------------------------------------------------------------------------------------------
