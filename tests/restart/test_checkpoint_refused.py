@@ -64,11 +64,11 @@ def test_another_format(folder):
     """Files of an older layout are refused, not misread."""
     uem.write_checkpoint(folder / "run", small())
     if COMM.rank == 0:
-        (folder / "run").write_bytes((folder / "run").read_bytes().replace(b"format 7", b"format 6", 1))
+        (folder / "run").write_bytes((folder / "run").read_bytes().replace(b"format 8", b"format 7", 1))
     COMM.barrier()
     raised(
         uem.CheckpointError,
-        "run has format 6: expected format 7; read it with",
+        "run has format 7: expected format 8; read it with",
         lambda: uem.read_checkpoint(folder / "run", small()),
     )
 

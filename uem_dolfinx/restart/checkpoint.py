@@ -33,7 +33,7 @@ from uem_dolfinx.restart.state import State
 
 #: Version of the file's layout and of the names in it.
 #: [format; -; test_checkpoint_refused.py::test_another_format]
-FORMAT = 7
+FORMAT = 8
 #: What a checkpoint begins with.
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.

@@ -54,6 +54,7 @@ from uem_dolfinx.solve.norms import ratio
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.rows import BodyState, Rows
 from uem_dolfinx.solve.system import CLOSED, BodySystem
+from uem_dolfinx.solve.taken import in_rows, wanted_by_step
 from uem_dolfinx.solve.tangent import curvature_of
 
 #: A residual this many times what steps leave is of other parameters than the step's.
@@ -97,15 +98,16 @@ class Linearised:
         P: restriction matrix of the active contactors.
         rows: their equations.
         multipliers: of all equations of contacts, and of users ``(m,)``.
-        ramp: how much of a change of its values a Dirichlet condition takes over.
+        ramp: share that Dirichlet values have of those that they are led to, in the rows of vectors ``(n_rows, gdim)``.
     """
 
     P: Restriction
     rows: Rows
     multipliers: Array
 
-    def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None):
-        self.problem, self.config, self.ramp = problem, problem.config, 1.0
+    def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None, held: Array | float | None = None):
+        self.problem, self.config = problem, problem.config
+        self.ramp = in_rows(problem, problem.progress.taken.held if held is None else held)
         self.K = self._K_back = problem.bodies.tangent.K
         # of the displacement's components here, which are the first of vectors
         self._n = problem.config.n_owned * problem.config.gdim
@@ -149,8 +151,8 @@ class Linearised:
         largest, found = np.maximum(state.scale, problem.largest_forces), ""
         if np.any(state.norm > MORE_THAN_LEFT * np.maximum(problem.rtol * largest, state.rounding)):
             found = f"forces are not in equilibrium, with a residual of {ratio(state.norm, largest):.1g} of the forces at work"
-        if problem.progress.ramp == 0 or problem.progress.factor == 1.0:
-            compat.set_bc_values(bodies.wanted, bodies.bcs)
+        if (wanted := wanted_by_step(problem)) is not None:
+            bodies.wanted[:] = wanted
             if not bodies.dirichlet_met():
                 found = "the displacement has other values than Dirichlet conditions prescribe"
             bodies.wanted[:] = problem.u.x.array
@@ -250,9 +252,10 @@ class Linearised:
         """``K' a`` (collective)."""
         return forms.product(self._K_back, a)
 
-    def share(self, m: Control) -> float:
-        """How much of a change of a control the state has seen: all of it, unless load steps lead there."""
-        return 1.0
+    def share(self, m: Control | ContactParameter) -> float:
+        """How much of a change of a control the state has seen: all of it, unless load steps lead it there."""
+        one = m.contact if isinstance(m, ContactParameter) and m.parameter == "offset" else m
+        return self.problem.progress.taken.of(one)
 
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
         """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).
@@ -294,18 +297,20 @@ class Linearised:
             if isinstance(m, ContactParameter):
                 for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):
                     opened, pushed = self.changes(m, entry)
-                    gaps += size * opened
-                    forces.array[: self._n] -= size * pushed.ravel()
+                    gaps += self.share(m) * size * opened
+                    forces.array[: self._n] -= self.share(m) * size * pushed.ravel()
                 continue
             if isinstance(m, ufl.SpatialCoordinate):
                 shape.x.array[:] += values_in(config.V, change)
                 if (form := forms.by_places(self.F, config.mesh, change)) is not None:
                     forces.array[:] -= self.assembled(form)
                 continue
+            if isinstance(m, fem.Constant):
+                change = self.share(m) * np.asarray(change, dtype=float)
             if (form := along(self.F, m, change)) is not None:
                 forces.array[:] -= self.assembled(form)
-            values = values_in(m.function_space, change) if isinstance(m, fem.Function) else np.asarray(change, dtype=float)
-            prescribed += self.prescribed_by(m, values)
+            values = values_in(m.function_space, change) if isinstance(m, fem.Function) else change
+            prescribed += self.ramp * self.prescribed_by(m, values)
         shape.x.scatter_forward()
         drawn = self.vector(shape.x.array[: self._n])
         forces.axpy(1.0, forms.product(self.K, drawn))
@@ -413,18 +418,18 @@ class Adjoint:
         a = self.config.of(self.a.x.array)[: self.config.n_owned]
         for entry in np.ndindex(found.shape):
             opened, pushed = self.at.changes(m, entry)
-            found[entry] = self.by_gaps @ opened - (a * pushed).sum()
+            found[entry] = self.at.share(m) * (self.by_gaps @ opened - (a * pushed).sum())
         return np.asarray(reduced(self.config.comm, found))
 
     def _by_constant(self, m: fem.Constant) -> Array:
         """An array of its shape."""
-        found = np.asarray(self.at.share(m) * self.at.derivatives.by_constant(self.terms, m))
+        found = np.asarray(self.at.derivatives.by_constant(self.terms, m))
         for entry in np.ndindex(found.shape):
             unit = np.zeros(found.shape)
             unit[entry] = 1.0
-            work = float((self.by_values * self.at.prescribed_by(m, unit)).sum())
-            found[entry] += self.at.ramp * float(reduced(self.config.comm, work))
-        return found
+            work = float((self.by_values * self.at.ramp * self.at.prescribed_by(m, unit)).sum())
+            found[entry] += float(reduced(self.config.comm, work))
+        return np.asarray(self.at.share(m) * found)
 
     def _by_function(self, m: fem.Function) -> fem.Function:
         """A Function of its space."""
@@ -432,7 +437,7 @@ class Adjoint:
         # conditions that take its values tell which
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own = which > 0.5
-        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, self.at.ramp * self.by_values[own])
+        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, (self.at.ramp * self.by_values)[own])
         forms.sum_ghosts(added)
         found.x.array[:] += added.x.array
         return found

@@ -30,6 +30,7 @@ from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.records import Record, Records
 from uem_dolfinx.solve.sweep import Sweep
+from uem_dolfinx.solve.taken import Taken, led_by, uniform
 
 
 class History(given.Sealed):
@@ -46,6 +47,8 @@ class History(given.Sealed):
         self._records = Records(folder)
         #: What a motion begins with; None in statics.
         self._start: Record | None = None
+        #: What steps have led, so that it keeps its id.
+        self._led: list[Any] = []
         #: Laws with history, of which there are slopes.
         self._laws: list[Any] = problem.materials
         F = problem.bodies.F
@@ -60,7 +63,7 @@ class History(given.Sealed):
         """How many steps it has."""
         return f"History({len(self)} steps)"
 
-    def note(self, before: Memory, start: Array | None, factor: float, arc: bool) -> None:
+    def note(self, before: Memory, arc: bool) -> None:
         """Keep the step that the problem is about to commit, in place of the last one if that is taken again."""
         problem = self.problem
         if arc:
@@ -68,15 +71,17 @@ class History(given.Sealed):
                 "the steps of an arc depend on each other by their lengths, of which there are no derivatives: record steps of given load"
             )
         self._records.cut(problem.progress.steps - self._first - 1)
-        # values that a ramp began with: of the step before, or of that before the first step of the ramp
-        began = self._records.ramp_before(None if start is None else problem.progress.ramp)
-        self._records.add(self._record(before, factor, factor + (1.0 - factor) * began))
+        taken = problem.progress.taken
+        self._led += [one for one, *_ in taken.led if all(one is not other for other in self._led)]
+        held = uniform(problem, taken.held)
+        self._records.add(self._record(before, taken.by_id(), taken.held if held is None else held))
 
     def note_start(self) -> None:
         """Keep what a motion begins with, and its first acceleration."""
-        self._start = self._record(Memory.of(self.problem), 1.0, 1.0)
+        led = Taken().with_led(led_by(self.problem, self.problem.dynamics.time))
+        self._start = self._record(Memory.of(self.problem), led.by_id(), 1.0)
 
-    def _record(self, before: Memory, factor: float, ramp: float) -> Record:
+    def _record(self, before: Memory, shares: dict[int, float], held: Array | float) -> Record:
         """The problem as it is, at the end of a step that began so."""
         problem, dynamics = self.problem, self.problem.dynamics
         return Record(
@@ -87,9 +92,8 @@ class History(given.Sealed):
             values=[np.array(forms.values_of(m)) for m in self._inputs],
             friction=[None if pair.friction is None else pair.friction.value for pair in problem.pairs],
             offsets=[pair.discretisation.offset for pair in problem.pairs],
-            call=problem.progress.ramp,
-            factor=factor if dynamics is None else dynamics.time + dynamics.dt * dynamics.moving,
-            ramp=ramp,
+            shares=shares,
+            held=held,
             dt=0.0 if dynamics is None else dynamics.dt,
         )
 

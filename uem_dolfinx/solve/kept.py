@@ -8,6 +8,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx.restart.state import State
+from uem_dolfinx.solve.taken import from_checkpoint, to_checkpoint
 
 
 def state_of(problem: Any) -> State:
@@ -44,6 +45,8 @@ def state_of(problem: Any) -> State:
         problem.system.forget()
         state.numbers |= {"largest forces": np.asarray(problem.largest_forces).tolist(), "stiffness known": known}
         state.numbers |= problem.progress.to_checkpoint(ramped)
+        if ramped:
+            state.numbers["shares of Dirichlet values"] = to_checkpoint(problem)
         if ramped and problem.progress.ramp:
             config.fill(starts, problem.progress.start)
             released = problem.progress.carried
@@ -70,6 +73,8 @@ def state_of(problem: Any) -> State:
         problem.bodies.from_checkpoint(stiffness if state.numbers["stiffness known"] else None)
         at_start = (config.values_of(starts), config.values_of(carried)) if ramped else (None, None)
         problem.progress.from_checkpoint(state.numbers, *at_start)
+        if ramped:
+            problem.progress.take_shares(*from_checkpoint(problem, state.numbers["shares of Dirichlet values"]))
         if problem.dynamics is not None:
             problem.dynamics.from_checkpoint(state.numbers)
             problem.step_control.from_checkpoint(state.numbers)

@@ -37,6 +37,7 @@ from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.system import BodySystem
+from uem_dolfinx.solve.taken import taken_by
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
@@ -365,7 +366,7 @@ class UnitedProblem(given.Sealed):
         """Keep the present displacement and contact state."""
         from uem_dolfinx.solve.memory import Memory
 
-        self._before = Memory.of(self)
+        self._before, self.progress.taken = Memory.of(self), taken_by(self)
         forget_load(self)
         self.progress.steps += 1
         self.keep()
@@ -373,7 +374,7 @@ class UnitedProblem(given.Sealed):
     def keep(self) -> None:
         """Make the present state the committed one; what the step began with stays what it was (collective)."""
         if self.history is not None:
-            self.history.note(self._before, *self.led)
+            self.history.note(self._before, self.led[2])
         self.committed = np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
         self.bodies.commit()

@@ -28,9 +28,8 @@ class Record:
         motions: of the pairs' rigid targets.
         values: of what the residual is made of.
         friction, offsets: of the pairs' contactors ``(n,)`` each; None without.
-        call: of ``load_steps`` that it was made in.
-        factor: part of the loads and of the Dirichlet values that it was led to; of a step in time the time at its end.
-        ramp: how much of a change of its values a Dirichlet condition takes over.
+        shares: that it has of values that its load leads Constants to, by the ids of these.
+        held: of Dirichlet values, ghosts included ``(n,)``, or of all.
         dt: length of a step in time; 0 in statics.
     """
 
@@ -41,9 +40,8 @@ class Record:
     values: list[Array]
     friction: list[Array | None]
     offsets: list[Array | None]
-    call: int
-    factor: float
-    ramp: float
+    shares: dict[int, float]
+    held: Array | float
     dt: float
 
 
@@ -59,8 +57,8 @@ class Records:
 
     def __init__(self, folder: Path | None = None):
         self._file: Any = None if folder is None else tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
-        #: Of every step what is kept of it, of its values one by one, and its call and ramp.
-        self._steps: list[tuple[Any, list[Any], int, float]] = []
+        #: Of every step what is kept of it, and of its values one by one.
+        self._steps: list[tuple[Any, list[Any]]] = []
         #: Values of the last step.
         self._last: list[Array] = []
 
@@ -69,7 +67,7 @@ class Records:
 
     def __getitem__(self, k: int) -> Record:
         """A record, read from the file where there is one."""
-        record, values, _, _ = self._steps[k]
+        record, values = self._steps[k]
         found: Record = self._get(record)
         return replace(found, values=[self._get(value) for value in values])
 
@@ -88,11 +86,7 @@ class Records:
         same = [np.array_equal(a, b) for a, b in zip(self._last, record.values)] or [False] * len(record.values)
         values = [kept[k] if same[k] else self._keep(value) for k, value in enumerate(record.values)]
         self._last = record.values
-        self._steps.append((self._keep(replace(record, values=[])), values, record.call, record.ramp))
-
-    def ramp_before(self, call: int | None) -> float:
-        """Ramp of the last step, or of the last one of another call than this."""
-        return next((ramp for _, _, other, ramp in reversed(self._steps) if call is None or other != call), 0.0)
+        self._steps.append((self._keep(replace(record, values=[])), values))
 
     def _keep(self, what: Any) -> Any:
         """What ``_get`` gives back: itself, or its place in the file."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -141,7 +141,11 @@ class Stage:
         if fresh:
             progress.step, progress.loads = step.name, starts
         else:
-            problem.set_load(progress.factor if progress.ahead == 0 else end, known=True)
+            at = progress.factor if progress.ahead == 0 else end
+            problem.set_load(at, known=True)
+            # earlier steps have been gone through before
+            progress.take_shares(replace(progress.began, led=progress.taken.now().led), progress.taken)
+            progress.take_shares(progress.began, progress.taken.with_led(self.led(at)))
             move_targets(problem, problem.motions)
             for pair in problem.interfaces:
                 settle(pair)
@@ -225,6 +229,14 @@ class Stage:
         for (bolt, force), follows in zip(bolts.items(), ramps[len(constants) :]):
             take_preload(bolt, None if force is None else follows, not fresh)
         return starts
+
+    def led(self, at: float) -> Iterator[tuple[Any, float]]:
+        """Constants, and contacts for their offsets, that it leads to given values, and the share that a load factor has of these."""
+        share, loads, began = self._share(at), self.step.loads, self._problem.progress.began
+        for constant, end in loads.items() if isinstance(loads, Mapping) else ():
+            yield constant, 1.0 if callable(end) else share + (1.0 - share) * began.began(constant)
+        for contact in self.step.offset:
+            yield contact, share + (1.0 - share) * began.began(contact)
 
     def take_load(self, at: float) -> None:
         """Release what was carried, and take offsets, as far as a load factor tells (collective)."""

@@ -23,6 +23,7 @@ from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption,
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
+from uem_dolfinx.solve.taken import Taken
 
 S = TypeVar("S", bound="ConvergedStep")
 
@@ -83,6 +84,8 @@ class Progress:
         carried: what it releases: forces at all unknowns at its beginning, ghosts included ``(n,)``; None for nothing.
         of_equations: multipliers of equations of users at the components that these eliminate, as a checkpoint has kept them
             ``(n_local, gdim)``.
+        taken: how much of a change of given values the committed state has taken.
+        began: likewise at the beginning of the call.
         left: load factors at which calls of several ``Step`` were left before their end, and none of their later steps begun, by the
             number of the call that each of these counts as.
         number: that tells the problem from others of this script, which its steps have as ``_of_problem``.
@@ -102,6 +105,8 @@ class Progress:
     loads: list[Any] = field(default_factory=list)
     carried: Array | None = None
     of_equations: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    taken: Taken = field(default_factory=Taken)
+    began: Taken = field(default_factory=Taken)
     left: dict[int, float] = field(default_factory=dict)
     number: int = field(default_factory=partial(next, count(1)))
     _calls: int = 0
@@ -136,11 +141,15 @@ class Progress:
         self._calls += 1
         if self._calls > self.ramp:
             self.ramp, self.factor, self.start = self._calls, 0.0, np.array(displacement)
-            self.reach = 0.0
+            self.reach, self.began = 0.0, self.taken.now()
             self.control = StepControl()
         if self._calls == self.ramp:
             self.control.begin(1.0 / steps)
         return self._calls == self.ramp
+
+    def take_shares(self, began: Taken, taken: Taken) -> None:
+        """Take shares at the beginning of the call, and now, of steps that were made before."""
+        self.began, self.taken = began, taken
 
     def check_signals(self, comm: MPI.Comm) -> None:
         """Raise ``InterruptedStepError`` on all ranks if any has got a signal since the stepping began (collective)."""

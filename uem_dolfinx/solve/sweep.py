@@ -14,7 +14,7 @@ accelerations, and the histories of laws.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -155,7 +155,7 @@ class Sweep:
         terms = [(self._derivatives.work, -1.0)]
         for k, m in enumerate(self._controls):
             if isinstance(m, fem.Constant):
-                self._add(k, share_of(problem, m, start.factor) * self._derivatives.by_constant(terms, m))
+                self._add(k, start.shares.get(id(m), 1.0) * self._derivatives.by_constant(terms, m))
             elif isinstance(m, fem.Function):
                 more = self._derivatives.by_function(terms, m)
                 if m is dynamics.start_velocity:
@@ -186,15 +186,15 @@ class LinearisedStep(Linearised):
     """
 
     def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
-        super().__init__(problem, derivatives)
-        self._factor, self.ramp, self._rates = record.factor, record.ramp, rates
+        super().__init__(problem, derivatives, record.held)
+        self._led, self._rates = record.shares, rates
         self._slopes: list[AnchorSlopes | None] = []
         #: Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping.
         self.damped: Array | float = 0.0
 
     def share(self, m: Any) -> float:
         """How much of a change of a control the step has seen."""
-        return share_of(self.problem, m, self._factor)
+        return self._led.get(id(m), 1.0)
 
     def _linearise(self) -> None:
         problem = self.problem
@@ -265,11 +265,6 @@ class LinearisedStep(Linearised):
             first += len(own)
             found.append(before if slopes is None else slopes.by_anchors(part, own, a) + before)
         return found
-
-
-def share_of(problem: UnitedProblem, m: Any, factor: float) -> float:
-    """How much of a change of a control a step has seen that was led to a factor, or a time."""
-    return factor if isinstance(problem.load, Mapping) and m in problem.load else 1.0
 
 
 def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) -> Array | float:
