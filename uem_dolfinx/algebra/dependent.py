@@ -323,7 +323,9 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
         h[others] -= factor * h[i]
         where[others] = size[others].argmax(axis=1)
         largest[others] = size[others, where[others]]
-        rows.append(i), nodes.append(t), directions.append(d)
+        rows.append(i)
+        nodes.append(t)
+        directions.append(d)
     k, pivot, direction = np.array(rows, np.int64), np.array(nodes, np.int64), np.reshape(directions, (len(rows), A.shape[2]))
     # each of them still follows what later ones eliminate
     later = np.einsum("ksg,sg->ks", A[k][:, pivot], direction)
