@@ -163,7 +163,7 @@ class OwnFile:
     def __init__(self, path: Path, *, new: bool = False, locked: bool = True):
         self.path = path
         self._descriptor = os.open(path, os.O_RDWR | (os.O_CREAT | os.O_EXCL if new else 0), 0o666)
-        #: Closes the file, once; also where nobody knows it any more.
+        #: Closes the file, once; also if no other object refers to it.
         self.close = weakref.finalize(self, os.close, self._descriptor)
         self._size = self.size
         if locked and not _lock(self._descriptor):
@@ -254,7 +254,7 @@ def in_use(path: Path) -> bool:
 
 
 def begin_file(path: Path) -> OwnFile:
-    """A new empty file of one's own, in place of one that nobody needs."""
+    """A new empty file of one's own, in place of an unused one."""
     path.unlink(missing_ok=True)
     return OwnFile(path, new=True)
 

@@ -124,7 +124,7 @@ def ask_together(comm: MPI.Comm, what: str, f: Callable[..., T], *args: Any) -> 
     """``ask`` on every rank; what it raises on one is raised on all (collective)."""
     with agreed(comm):
         return ask(what, f, *args)
-    raise AssertionError("an error that nobody raised")
+    raise AssertionError("an error that no rank raised")
 
 
 class _Meeting:

@@ -89,7 +89,7 @@ class Violations:
         return self
 
     def on_first_touch(self, gap: Array, depth: float) -> Violations:
-        """Those alone that enter by so much at least, a length, besides all that are released; ``gap (n,)`` decides on contact."""
+        """Those alone that enter by so much at least, a length, and all that are released; ``gap (n,)`` decides on contact."""
         return Violations(self.enter & (gap <= -depth), self.release, self.violation)
 
 

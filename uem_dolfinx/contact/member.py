@@ -1,4 +1,4 @@
-"""One of the contacts that are treated together: what users, results and checkpoints see of it, as if it stood alone."""
+"""One of the contacts that are treated together, with the interface of a single contact for users, results and checkpoints."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class Elimination:
         """What the derivatives of the gaps add to the ``plain`` rows, since normals and weights vary, over ``scale (n,)`` (collective).
 
         Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
-        they do: all others can be eliminated whoever is active.
+        they do: all others can be eliminated for any active set.
 
         Returns:
             Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.

@@ -37,7 +37,7 @@ class Offsets:
         self.worn: Array = np.zeros(len(pair.nodes))
 
     def set(self, offset: Field) -> None:
-        """Take an offset, besides what has been adjusted and worn; contactors are to be placed again (collective)."""
+        """Set an offset, in addition to adjusted and worn lengths; contactors are to be placed again (collective)."""
         config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
         self._given = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
         self._hand_over()

@@ -28,7 +28,7 @@ OF_FRICTION = "friction_"
 class FrictionState:
     """What friction remembers of ``n`` contactors; those that are active and do not stick slip.
 
-    The anchor is the point of the target that a contactor sticks to. It is where a contactor that is open or slips stood at the end of
+    The anchor is the point of the target that a contactor sticks to. For a contactor that is open or slips it is its position at the end of
     the last step, and stays where it is as long as the contactor sticks.
 
     Attributes:

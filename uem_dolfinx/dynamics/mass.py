@@ -111,7 +111,7 @@ class Mass:
 
         With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``, where S is diagonal and scales
         component c of node i by ``max(1 + p_c(X_i), sqrt(1 - b))``. The polynomials p_c, of degree 2 in each body, are such that
-        mass, first and second moments ``x_a' M x_b`` of each component are kept, hence the momentum and the energy of every
+        mass, first and second moments ``x_a' M x_b`` of each component are kept, and so the momentum and the energy of every
         motion whose velocity is linear in X, rigid ones among them. Nodes give up at most the part b of their own mass, and
         ``S M0 S`` is at least ``(1 - b) M0`` in its eigenvalues. For diagonal M this redistributes nodal masses, after Khenous,
         Laborde and Renard, "Mass redistribution method for finite element contact problems in elastodynamics", Eur. J. Mech.

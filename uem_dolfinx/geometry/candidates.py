@@ -49,7 +49,7 @@ def candidate_pairs(
 
         bound = cKDTree(middles).query(places)[0] * (1 + EQUALLY_NEAR)
         i, f = balls_that_meet(places, bound, middles, radius)
-    # a facet lies in a disc about its middle, as thick as it bulges: from afar many middles are near, few discs
+    # a facet lies in a disc about its middle, as thick as it bulges: from a distance many middles are near, few discs
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))

@@ -87,7 +87,7 @@ class TargetFacets:
         return np.append(0, np.cumsum(gathered(self.config.comm, len(self.dofs))))
 
     def owners(self, facet: Ints) -> Exchange:
-        """Exchange with the ranks that hold the facets numbered ``facet (n,)``; -1 is nobody's (collective)."""
+        """Exchange with the ranks that hold the facets numbered ``facet (n,)``; -1 is no facet (collective)."""
         return Exchange.to(self.config.comm, np.searchsorted(self.first, facet, side="right") - 1)
 
     def values_at(self, facet: Ints, values: AnyArray) -> Any:

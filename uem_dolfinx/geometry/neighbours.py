@@ -415,12 +415,12 @@ class Neighbour(MeshTarget):
         return np.column_stack([n.place[body], body, n.skin.config.to_global(nodes), n.sides[which]])
 
     def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` are of bodies that contactors follow, of whom this was ``told``."""
+        """Whether this rank's facets ``(k,)`` are of bodies that the contactors in ``told`` follow."""
         n = self.neighbours
         return np.asarray((n.place[n.skin.body[facet]] > told[:, 0]) & ~n.excluded(told[:, 3:] > 0, facet))
 
     def of_itself(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` are of contactors' own bodies, but do not meet at them, of whom this was ``told``."""
+        """Whether this rank's facets ``(k,)`` are of the own bodies of the contactors in ``told``, but do not meet at them."""
         n = self.neighbours
         others = (n.skin.body[facet] == told[:, 1]) & (n.skin.nodes[facet] != told[:, 2, None]).all(axis=1)
         return np.asarray(others & ~n.excluded(told[:, 3:] > 0, facet))

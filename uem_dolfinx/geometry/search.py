@@ -169,7 +169,7 @@ class MeshTarget:
         return np.zeros(len(which), np.int64)
 
     def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether contactors of whom this was ``told (k,)`` may touch this rank's facets ``(k,)``."""
+        """Whether the contactors of ``told (k,)`` may touch this rank's facets ``(k,)``."""
         return np.ones(len(told), bool)
 
     def allowed(self, told: Array, facet: Ints) -> Bools:

@@ -194,7 +194,7 @@ class NeoHooke(Elastic):
     """
 
     def _volume_change(self, u: Any) -> Any:
-        """``J^2 - 1``, from the strain itself lest small strains drown in rounding."""
+        """``J^2 - 1``, from the strain itself, so that small strains are not lost in rounding."""
         E = green_lagrange(u)
         second = (ufl.tr(E) ** 2 - ufl.inner(E, E)) / 2
         change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if E.ufl_shape == (3, 3) else 0)

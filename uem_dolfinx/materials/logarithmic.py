@@ -60,7 +60,7 @@ def logarithmic_return(
     """
     one, size, plastic = np.eye(3), plastic_strain.shape[1], to_tensors(plastic_strain)
     F = gradient + one
-    # from the strains themselves lest small ones drown in rounding
+    # from the strains themselves, so that small ones are not lost in rounding
     b = gradient + gradient.transpose(0, 2, 1) + gradient @ gradient.transpose(0, 2, 1)
     b -= 2 * F @ plastic @ F.transpose(0, 2, 1)
     lost = ~(np.isfinite(b).all(axis=(1, 2)) & (np.linalg.det(F) > 0))

@@ -1,4 +1,4 @@
-"""What a picture shows besides facets and cells of the mesh: sections through solids where a window cuts them, and rigid surfaces."""
+"""Parts of a picture other than facets and cells of the mesh: sections through solids where a window cuts them, and rigid surfaces."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Interruption:
                 signal.signal(number, before)
         asked, self._asked = self._asked, 0
         if asked:
-            # nobody has acted on it
+            # no rank has acted on it
             signal.raise_signal(asked)
 
     def _note(self, number: int, frame: FrameType | None) -> None:

@@ -79,7 +79,7 @@ def node_numbering(V: Any) -> Numbering:
     """Numbering of a space's owned nodes (blocks of d.o.f.), by the first cell of the input that has them (collective).
 
     A cell keeps the order of its vertices in every partition, and with it that of its nodes as long as no edge and no facet has
-    more than one of its own: their order would follow global numbers of vertices. Hence Lagrange of degree
+    more than one of its own: their order would follow global numbers of vertices. So Lagrange of degree
     1 or 2, discontinuous Lagrange and quadrature spaces alone, with values of any shape; a CheckpointError refuses others.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, compat.cell_dofs(V)

@@ -1,6 +1,6 @@
 """What a run goes on from: Functions, the states of contacts and numbers, each in the order of the mesh's input.
 
-Whoever leads a run collects its state here; checkpoints write and read it.
+The state of a run is collected here; checkpoints write and read it.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class State(given.Sealed):
         back: called on all ranks where a run ends by an error within a step, to return to the last step that is done. Without any, a
             loop of the script's own that ends by an error writes nothing.
         settings: what the run is made with, by name; a file of other settings is refused, unless there are none on either side.
-        by_default: names of settings that are what they are where nobody names them; a file that does not know of such is not refused.
+        by_default: names of settings that have their default value; a file without them is not refused.
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """
 

@@ -260,7 +260,7 @@ class Linearised:
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
         """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).
 
-        A rigid surface that moves by b(x) leaves bodies behind as if it stood still and these moved by -b, and turns its forces.
+        A rigid surface that moves by b(x) leaves bodies behind as if it were at rest and these moved by -b, and rotates its forces.
 
         Returns:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.

@@ -1,6 +1,6 @@
 """What a problem is handed, looked at before anything is made of it: residual, Dirichlet conditions and their values.
 
-Each check looks at this rank's part; whoever asks has the ranks agree.
+Each check looks at this rank's part; the caller has the ranks agree.
 """
 
 from __future__ import annotations

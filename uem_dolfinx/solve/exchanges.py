@@ -89,7 +89,7 @@ class Exchanges:
             leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
         frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
         held: whether limits of friction are held.
-        again: whether the linearised problem is to be solved with other limits of friction, whoever changes sides.
+        again: whether the linearised problem is to be solved with other limits of friction, even without changes of sides.
     """
 
     def __init__(self, pairs: Sequence[Interface]):

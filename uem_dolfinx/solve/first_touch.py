@@ -59,7 +59,7 @@ def touch_ahead(
 
 
 def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequence[Violations]) -> list[Violations]:
-    """Of contactors that would all enter at once, those deep enough to touch at first, besides all that are released (collective).
+    """Of contactors that would all enter at once, those deep enough to touch at first, and all that are released (collective).
 
     Args:
         pairs: of all contacts.

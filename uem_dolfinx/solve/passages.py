@@ -1,4 +1,4 @@
-"""Refusal of steps that lead contactors through a body: they end on its other side, in an equilibrium that nobody would reach.
+"""Refusal of steps that lead contactors through a body: they end on its other side, in an unreachable equilibrium.
 
 What counts is the converged step, not the iterates of Newton's method: the straight ways of contactors and target from the committed
 to the new configuration. A contactor passes if it enters the target in one place and leaves it in another that faces away from the

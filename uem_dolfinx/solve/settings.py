@@ -128,7 +128,7 @@ class Settings:
         return dict(comm.bcast(words))
 
     def by_default(self, words: Mapping[str, str]) -> set[str]:
-        """Names of settings that are, by these ``words``, what they are where nobody names them."""
+        """Names of settings that have, by these ``words``, their default values."""
         return {name for name, usual in self._usual.items() if words.get(name) == usual}
 
 

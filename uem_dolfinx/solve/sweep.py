@@ -124,7 +124,7 @@ class Sweep:
             self.found[k] = self.found[k] + more
 
     def begin(self, first: Record) -> None:
-        """Add derivatives by the anchors that the first step began with, where contactors stood before it (collective)."""
+        """Add derivatives by the anchors that the first step began with, the positions of contactors before it (collective)."""
         problem = self.problem
         if not any(pair.frictional for pair in problem.pairs):
             return
