@@ -101,6 +101,15 @@ def count(what: str, value: Any, remedy: str = "") -> int:
     return int(number(what, value, whole))
 
 
+def part_number(what: str, value: Any, of: str) -> int:
+    """Number of the part of a mixed space that is ``of`` something; InputTypeError for no whole number, InputError below 0."""
+    expected = f"the number of the part of the mixed space that is {of}, counted from 0"
+    kind(what, value, isinstance(value, (int, np.integer)) and not isinstance(value, bool), expected)
+    if value < 0:
+        raise InputError(sentence(what, value, expected))
+    return int(value)
+
+
 def flag(what: str, value: Any) -> bool:
     """True or False; InputTypeError for anything else."""
     if not isinstance(value, (bool, np.bool_)):

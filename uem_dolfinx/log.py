@@ -14,7 +14,8 @@ from mpi4py import MPI
 
 from dolfinx.common import Timer
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
+from uem_dolfinx.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -38,6 +39,14 @@ def say(line: str) -> None:
         print(line, flush=True)
 
 
+#: All stages that the package times.
+STAGES = (
+    "assemble mass", "assemble residual", "assemble tangent", "commit history", "compile forms", "condensed matrix", "contact curvature",
+    "corners of the target", "cross out prescribed components", "deflation", "eigenvalues", "factorisation or preconditioner set-up",
+    "first acceleration", "inertia forces", "linear solve", "projection", "read checkpoint", "read mesh", "redistribute mass",
+    "restriction matrix P", "return mapping", "search", "search and projection", "segments", "solve without the contact", "united matrix",
+    "united matrix P'KP", "united matrix Q'KP", "uniting equations", "write checkpoint", "write fields", "write surfaces", "write table",
+)  # fmt: skip
 #: Stages that have been timed so far, in the order of their first time.
 _stages: dict[str, None] = {}
 
@@ -71,7 +80,15 @@ def timings() -> Timings:
 
 
 def timing(stage: str) -> tuple[int, float]:
-    """How often a stage has been timed on this rank so far, and its wall time in seconds; names as in ``timed``."""
+    """How often a stage has been timed on this rank so far, and its wall time in seconds; names as ``timings`` has them.
+
+    Raises:
+        InputError, InputTypeError: for a name of no stage.
+    """
+    known = "the name of a stage, as print(uem.timings()) shows them"
+    given.kind("stage", stage, isinstance(stage, str), known)
+    if stage not in STAGES and stage not in _stages:
+        raise InputError(given.sentence("stage", stage, known, given.did_you_mean(stage, STAGES)))
     return compat.timing(f"~UEM: {stage}")
 
 

@@ -309,8 +309,8 @@ def test_interpolation_and_timing():
     assert uem.integrate(f * ufl.dx) == pytest.approx(1.0, abs=1e-12)
     uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom) + clamp(b.V, b.top))
     after = uem.timing("compile forms")
-    assert after[0] > before[0] and after[1] >= before[1] and uem.timing("no such stage") == (0, 0.0)
-    assert uem.timings()["compile forms"] == after and "no such stage" not in uem.timings()
+    assert after[0] > before[0] and after[1] >= before[1]
+    assert uem.timings()["compile forms"] == after
     rows = [line.split() for line in str(uem.timings()).splitlines()]
     seconds = [float(row[0]) for row in rows[1:]]
     assert rows[0][:2] == ["seconds", "times"] and seconds == sorted(seconds, reverse=True) and len(seconds) == len(uem.timings())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,11 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or hypre where PETSc has it.
 
     Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
+
+    Raises:
+        InputError, InputTypeError: for another word.
     """
+    given.word("amg", amg, ("hypre", "gamg", ""))
     amg = amg or ("hypre" if has_hypre() else "gamg")
     if amg == "gamg":
         # the smoother's bounds from CG, which finds the few large eigenvalues that stiff contactors make
@@ -107,7 +111,11 @@ def saddle_options(field: int = 1, amg: str = "") -> dict[str, Any]:
     Args:
         field: number of the pressure's part of the mixed space.
         amg: as of ``multigrid_options``.
+
+    Raises:
+        InputError, InputTypeError: for no number of a part, or another word.
     """
+    field = given.part_number("field", field, "the pressure")
     schur = {"type": "schur", "schur_fact_type": "lower", "schur_precondition": "selfp"}
     parts = {"u_ksp_type": "preonly", f"{field}_ksp_type": "preonly", f"{field}_pc_type": "jacobi"}
     parts |= {f"u_{key}": value for key, value in multigrid_options(amg).items()}
@@ -142,6 +150,31 @@ def check_options(options: Any, prefix: Any) -> None:
         if key in options and not _knows(of, value := options[key]):
             remedy = given.did_you_mean(value, _type_names(of))
             raise InputError(given.sentence(f"petsc_options[{key!r}]", value, f"a type that PETSc knows, as {example}", remedy))
+
+
+def check_fields(options: Any, names: Sequence[str]) -> None:
+    """Refuse options of field split for fields that there are not.
+
+    Args:
+        options: that users give, or None.
+        names: of the fields in PETSc's options, the displacement alone or it and others.
+
+    Raises:
+        InputError: naming the option.
+    """
+    known = ", ".join(repr(name) for name in names)
+    for key, value in (options or {}).items():
+        if len(names) == 1 and key == "pc_type" and value == "fieldsplit":
+            remedy = "take uem.multigrid_options(), or give the problem a mixed space"
+            raise InputError(
+                given.sentence(f"petsc_options[{key!r}]", value, "one for a displacement without other fields", remedy)
+            )
+        part = re.match(r"fieldsplit_([^_]+)_", key)
+        if part and part[1] not in names:
+            remedy = "as of uem.saddle_options(field=...), the number of the pressure's part"
+            raise InputError(
+                given.sentence(f"petsc_options[{key!r}]", value, f"an option of a field of the problem, {known}", remedy)
+            )
 
 
 def _type_names(of: Any) -> list[str]:

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.algebra.options import check_fields
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import NotFiniteError
@@ -22,7 +23,7 @@ from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import HistoryMaterial
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.norms import first
 from uem_dolfinx.solve.tangent import Inversions, Tangent
 
@@ -365,8 +366,12 @@ def configured(u: fem.Function, displacement: int | None) -> Configuration:
 
 def solver_of(config: Configuration, prefix: str, options: Any) -> UnitedSolver:
     """Solver of the united system, which knows of other fields where there are any; arguments as of ``UnitedSolver`` (collective)."""
+    kind: type[UnitedSolver] = UnitedSolver
     if config.unknowns.mixed:
         from uem_dolfinx.algebra.field_split import SolverOfFields
 
-        return SolverOfFields(config.unknowns, prefix, options)
-    return UnitedSolver(config.unknowns, prefix, options)
+        kind = SolverOfFields
+    solver = kind(config.unknowns, prefix, options)
+    with agreed(config.comm):
+        check_fields(options, config.unknowns.names if config.unknowns.mixed else ["u"])
+    return solver

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import ufl
@@ -22,6 +23,9 @@ from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
 from uem_dolfinx.parallel import agreed
+
+#: Laws with history that belong to problems, by their ids.
+_taken: WeakValueDictionary[int, Any] = WeakValueDictionary()
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
@@ -48,7 +52,7 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
     Raises:
         InputTypeError: if they are no list of laws with history.
         InputError: if one stands in the list twice, F is not made of it, or F holds fields of one that is not in the list.
-        SpaceError: if one is of another displacement.
+        SpaceError: if one is of another displacement, or belongs to another problem.
     """
     found: list[HistoryMaterial] = given.items(
         "materials", materials, is_history_material, "a material with history, as VonMises"
@@ -57,6 +61,11 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
         name = f"materials[{i}], {given.described(material)},"
         if any(material is other for other in found[:i]):
             raise InputError(f"{name} stands in the list before: expected each law once; make a law of its own for every body")
+        if _taken.get(id(material)) is material:
+            raise SpaceError(
+                f"{name} belongs to another problem, whose steps it remembers: expected a law of this problem's own; make new ones for "
+                "every problem"
+            )
         if getattr(material, "u", u) is not u:
             raise SpaceError(f"{name} is of another displacement: expected the problem's u; make it with that")
         if (part := getattr(material, "displacement", None)) != displacement:
@@ -74,6 +83,11 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
             "materials=[material], or F a copy of the field where that is meant"
         )
     return found
+
+
+def take_materials(materials: Sequence[HistoryMaterial]) -> None:
+    """Let laws with history belong to the problem that has been made of them."""
+    _taken.update({id(material): material for material in materials})
 
 
 def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:

@@ -21,8 +21,9 @@ from uem_dolfinx.contact.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.parallel import agreed, ask_together
+from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
+from uem_dolfinx.solve.loading import holds, set_by_load
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.system import BodySystem
 
@@ -66,6 +67,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
         check_functional("J", J, problem.config.mesh)
         check_parts("J", J, problem.u)
     pressing = _check_results(problem, J)
+    refuse_without_state(problem, [J], [problem.u, *(contact.pressure for contact in pressing)])
+    refuse_idle_controls(problem, "controls", some, [J])
     from uem_dolfinx.solve.adjoint import Adjoint, Linearised
 
     with Linearised(problem) as linearised:
@@ -92,6 +95,7 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
     """
     check_problem(problem, recorded=False)
     pairs, contact = check_controls(problem, "direction", direction), None
+    refuse_idle_controls(problem, "direction", [control for control, _ in pairs])
     if of is not None:
         pressures = [contact.pressure for contact in problem.contacts]
         with agreed(problem.comm):
@@ -113,7 +117,7 @@ def taylor_test(
     Args:
         functional: J(h), as of controls that have been changed by h in one direction and a problem that was solved anew with them.
         slope: the derivative of J by h at 0, as from :func:`gradient`.
-        size: the first h.
+        size: the first h, a positive number.
         halvings: how often it is halved.
         comm: communicator of the ranks that call this: an error on one of them is raised on all.
 
@@ -122,11 +126,14 @@ def taylor_test(
 
     Raises:
         InputTypeError: if J is no number.
-        InputError: if J or the slope is not finite, or nothing is left of J at some h, which has no order.
+        InputError: if ``size`` is not positive, or J or the slope is not finite, or nothing is left of J at some h, which has no order.
         UserFunctionError: if the functional raises an error.
     """
     given.kind("functional", functional, callable(functional), "a function of h that returns a number")
-    slope, size = given.number("slope", slope, given.Range("a number", lambda x: True)), given.number("size", size)
+    slope, size = (
+        given.number("slope", slope, given.Range("a number", lambda x: True)),
+        given.number("size", size, given.POSITIVE),
+    )
     halvings = given.count("halvings", halvings)
 
     def J(h: float) -> float:
@@ -215,7 +222,7 @@ def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
                 raise InputError(
                     f"{what}[{i}] holds '{control.name}', a result of a contact: expected what the problem is made of"
                 )
-            if isinstance(control, (fem.Function, ufl.SpatialCoordinate)):
+            if isinstance(control, Control):
                 check_expression(f"{what}[{i}]", control, problem.config.mesh.ufl_domain(), "the displacement's mesh")
             if isinstance(control, ufl.SpatialCoordinate):
                 _check_shape(problem)
@@ -244,6 +251,35 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
                     "and of forces take what they are made of, the displacement and the residual"
                 )
     return [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
+
+
+def refuse_without_state(problem: UnitedProblem, functionals: Sequence[ufl.Form], state: Sequence[fem.Function]) -> None:
+    """Refuse functionals none of which holds what the problem solves for (collective)."""
+    with agreed(problem.comm):
+        if not any(f is one for J in functionals for f in J.coefficients() for one in state):
+            raise InputError(
+                "J holds nothing that the problem solves for: expected problem.u, or pressures of its contacts; a displacement of another "
+                "problem is a field of given numbers here"
+            )
+
+
+def refuse_idle_controls(
+    problem: UnitedProblem, what: str, controls: Sequence[Any], functionals: Sequence[ufl.Form] = ()
+) -> None:
+    """Refuse Constants and Functions that neither the problem nor a functional is made of (collective)."""
+    forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials]
+    n, bcs = len(problem.u.x.array), problem.bodies.bcs
+    for i, m in enumerate(controls):
+        if not isinstance(m, (fem.Constant, fem.Function)):
+            continue
+        held = any(m is one for form in forms for one in (*form.constants(), *form.coefficients()))
+        held = held or holds(beside, m) or bool(set_by_load({m: 0.0}, bcs, n).any())
+        with agreed(problem.comm):
+            if not reduced(problem.comm, held, op=MPI.LOR):
+                raise InputError(
+                    f"{what}[{i}], {given.described(m)}, is in no form, Dirichlet condition or law of the problem, nor in J: expected "
+                    "what these are made of, by which there are derivatives"
+                )
 
 
 def refuse_results(J: ufl.Form) -> None:

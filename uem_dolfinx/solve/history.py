@@ -25,7 +25,15 @@ from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.materials.elastic import material_of
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.gradient import AnyControl, check_controls, check_problem, refuse_kept_projections, refuse_results
+from uem_dolfinx.solve.gradient import (
+    AnyControl,
+    check_controls,
+    check_problem,
+    refuse_idle_controls,
+    refuse_kept_projections,
+    refuse_results,
+    refuse_without_state,
+)
 from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.records import Record, Records
@@ -127,6 +135,9 @@ class History(given.Sealed):
         problem = self.problem
         some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
         functionals = self._functionals(J)
+        given_forms = [f for f in functionals if f is not None]
+        refuse_without_state(problem, given_forms, self._state())
+        refuse_idle_controls(problem, "controls", some, given_forms)
         self._check_controls(some)
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
@@ -210,6 +221,12 @@ class History(given.Sealed):
         # the same form in several steps stays the same
         whole = {id(f): revolved(f) for f in some if f is not None}
         return [None if f is None else whole[id(f)] for f in some]
+
+    def _state(self) -> list[fem.Function]:
+        """What functionals are of."""
+        dynamics = self.problem.dynamics
+        rates = [] if dynamics is None else [dynamics.velocity, dynamics.acceleration]
+        return [self.problem.u, *rates, *(law.stress_in_forms for law in self._laws)]
 
     def _refuse_unknown(self, what: str, J: ufl.Form) -> None:
         """Refuse a functional of fields that follow the displacement in a way of which there are no derivatives."""

@@ -176,7 +176,7 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
         if follows or any(c is one for one in in_forms):
             continue
         others = [value for constant, value in load.items() if constant is not c]
-        found = any(_holds(one, c, DEPTH, set()) for one in (parts, others, beside))
+        found = any(holds(one, c) for one in (parts, others, beside))
         if not reduced(problem.comm, found, op=MPI.LOR):
             now = given.shown(np.asarray(c.value).tolist())
             raise InputError(
@@ -186,8 +186,13 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
             )
 
 
-def _holds(one: Any, c: fem.Constant, depth: int, seen: set[int]) -> bool:
-    """Whether an object is a Constant, or holds it in its attributes, items, terms, or what a function reads."""
+def holds(one: Any, c: fem.Constant | fem.Function) -> bool:
+    """Whether an object is a Constant or a Function, or holds it in its attributes, items, terms, or what a function reads."""
+    return _holds(one, c, DEPTH, set())
+
+
+def _holds(one: Any, c: fem.Constant | fem.Function, depth: int, seen: set[int]) -> bool:
+    """Likewise, with objects within it up to a depth."""
     if one is c:
         return True
     if (
@@ -199,7 +204,7 @@ def _holds(one: Any, c: fem.Constant, depth: int, seen: set[int]) -> bool:
     seen.add(id(one))
     inside: list[Any] = []
     if isinstance(one, ufl.Form):
-        return any(c is part for part in one.constants())
+        return any(c is part for part in (*one.constants(), *one.coefficients()))
     if isinstance(one, Expr):
         return any(c is part for part in traverse_unique_terminals(one))
     if isinstance(one, Mapping):

@@ -29,7 +29,7 @@ from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
-from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values
+from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values, take_materials
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
 from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.norms import Norm
@@ -252,6 +252,7 @@ class UnitedProblem(given.Sealed):
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
         refuse_idle(self, self.load, self.bodies.bcs)
+        take_materials(self.materials)
 
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""

@@ -102,6 +102,5 @@ def _number(what: str, number: Any, within: given.Range) -> float | fem.Constant
 
 
 def part_number(field: Any) -> int:
-    """Which part of a mixed space is the temperature; InputTypeError for what is no whole number."""
-    whole = isinstance(field, (int, np.integer)) and not isinstance(field, bool)
-    return int(given.kind("field", field, whole, "the number of the part of the mixed space that is the temperature"))
+    """Which part of a mixed space is the temperature; raises as ``given.part_number``."""
+    return given.part_number("field", field, "the temperature")
