@@ -97,6 +97,71 @@ def test_moved_surface_against_moved_points(g, name):
     assert np.allclose(moved.hessians(which), Q @ still.hessians(which) @ Q.T, atol=1e-8)
 
 
+def waves(g, hessian, name):
+    """One surface by functions of places ``(3, n)`` in several ways to write them, or of points ``(n, gdim)``."""
+    up, along = np.eye(g)[-1], np.eye(g)[0]
+
+    def height(x):
+        return x[g - 1] - 0.1 * np.sin(3 * x[0])
+
+    def slope(x):
+        return np.stack([-0.3 * np.cos(3 * x[0]), *[0 * x[0]] * (g - 2), np.ones(x.shape[1])])
+
+    def bend(x):
+        return np.einsum("i,j,n->ijn", along, along, 0.9 * np.sin(3 * x[0]))
+
+    def padded(f):
+        return lambda x: np.pad(v := f(x), [(0, 3 - g)] * (v.ndim - 1) + [(0, 0)])
+
+    kinds = {
+        "places": (height, slope, bend),
+        "three components": (height, padded(slope), padded(bend)),
+        "rows of places": (height, lambda x: slope(x).T, lambda x: np.moveaxis(bend(x), -1, 0)),
+        "points": (lambda x: height(x.T), lambda x: slope(x.T).T, lambda x: np.moveaxis(bend(x.T), -1, 0)),
+        "elementwise": (
+            lambda x: (x @ up) - 0.1 * np.sin(3 * x @ along),
+            lambda x: slope(x.T).T,
+            lambda x: np.moveaxis(bend(x.T), -1, 0),
+        ),
+    }
+    return uem.RigidSurface(*kinds[name][: 3 if hessian else 2])
+
+
+@pytest.mark.parametrize("name", ["places", "three components", "rows of places", "points", "elementwise"])
+@pytest.mark.parametrize("hessian", [True, False])
+def test_functions_of_places(name, hessian):
+    """As friction's they get x of shape ``(3, n)``, however many places there are; of points ``(n, gdim)`` they are told apart."""
+    for g in (2, 3):
+        for n in (4, 3, 2, 1, 7):
+            points = np.random.default_rng(n).uniform(-1, 1, (n, g))
+            one, other = (waves(g, hessian, kind).move(np.ones(g), TURN[g]) for kind in (name, "points"))
+            assert np.array_equal(one.distance_of(points), other.distance_of(points))
+            found, known = one.project(points), other.project(points)
+            assert np.array_equal(found.gap, known.gap) and np.array_equal(found.normal, known.normal)
+            assert np.allclose(found.shape_operator, known.shape_operator, atol=1e-14)
+            assert one.project(points[:0]).gap.shape == (0,)
+
+
+def test_functions_of_places_in_a_problem():
+    """The same block under a floor of places and one of points, at every size."""
+    for size in (1.0, 1e-9, 1e3):
+        ends = []
+        for of_places in (True, False):
+            distance = (lambda x: 1.05 * size - x[1]) if of_places else (lambda x: 1.05 * size - x[:, 1])
+            down = (
+                (lambda x: np.tile([[0.0], [-1.0]], x.shape[1])) if of_places else (lambda x: np.tile([0.0, -1.0], (len(x), 1)))
+            )
+            s = scene(COMM, "triangle", [box("triangle", [0.0, 0.0], [size, size], [3, 3])])
+            V = compat.function_space(s.mesh, 1, (2,))
+            u = fem.Function(V)
+            bcs = clamp(V, s.tag("bottom", 0, at(1, 0.0)), value=(0.0, 0.1 * size))
+            contact = uem.Contact(s.tag("top", 0, at(1, size)), uem.RigidSurface(distance, down))
+            problem = uem.UnitedProblem(linear(u, modulus(s, 1.0)), u, bcs=bcs, contacts=[contact])
+            run(problem)
+            ends.append(contact.resultant().force[1] / size)
+        assert ends[0] == ends[1] != 0.0
+
+
 @pytest.mark.parametrize("g,name", NAMES)
 def test_hessian_of_a_moved_surface(g, name):
     """Normal and curvature of a moved surface are the first and second differences of its gap."""

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.rigid_functions import OfPoints
 from uem_dolfinx.parallel import ask
 
 
@@ -109,12 +110,16 @@ class RigidSurface(given.Sealed):
     """Rigid target of any shape, still or moved as a rigid body.
 
     The gap is ``distance / |gradient|``, which is the signed distance wherever it is zero; a gradient of constant direction
-    measures the gap along that direction. All functions are of points of the drawing, wherever the surface has been moved to.
+    measures the gap along that direction. All functions are of places of the drawing, wherever the surface has been moved to.
+
+    Functions get places x of shape ``(3, n)``, as DOLFINx's and those of friction do, z = 0 in 2D. Ones of points ``(n, gdim)``, with one
+    row for each point in what they return, are taken as well, all of a surface of the same kind: which kind it is, the shape of what
+    ``distance`` returns for five places or more tells.
 
     Args:
-        distance: of points ``(n, gdim)``, positive outside ``(n,)``, a length.
-        gradient: its gradient, pointing out of the target ``(n, gdim)``.
-        hessian: its second derivative ``(n, gdim, gdim)``; None takes differences of the gradient.
+        distance: of places ``(3, n)``, positive outside ``(n,)``, a length.
+        gradient: its gradient, pointing out of the target ``(gdim, n)``.
+        hessian: its second derivative ``(gdim, gdim, n)``; None takes differences of the gradient.
         name: for messages.
         reference: point about which it turns and its moment is taken ``(gdim,)``; None is the origin.
         stride: how far a contactor may move past it in a time step unseen, a length; infinite if it has no other side.
@@ -145,8 +150,11 @@ class RigidSurface(given.Sealed):
         self.stride = given.number(f"{name}: stride", stride, given.POSITIVE_OR_INFINITE)
         for what, f in (("distance", distance), ("gradient", gradient), ("hessian", hessian)):
             optional = f is None and what == "hessian"
-            given.kind(f"{name}: {what}", f, optional or callable(f), "a function of points (n, gdim)")
-        self.distance, self.gradient, self.hessian = distance, gradient, hessian
+            given.kind(f"{name}: {what}", f, optional or callable(f), "a function of places (3, n)")
+        # functions of points (n, gdim) from here on
+        points = OfPoints(distance)
+        self.distance, self.gradient = points.of(distance), points.of(gradient)
+        self.hessian = None if hessian is None else points.of(hessian)
         self.motion: Motion | None = None
         self._reference = None if reference is None else given.vector(f"{name}: reference", reference)
         #: Dimension that it is given in, None if its functions alone know.
@@ -280,7 +288,7 @@ class RigidSurface(given.Sealed):
         if values.shape != shape:
             raise InputError(
                 f"{self.name}: {what} returned the shape {values.shape} for points of the shape {points.shape}: expected {shape}, "
-                "one row for each point"
+                "one row for each point, or for places of the shape (3, n) one column"
             )
         return values
 
