@@ -118,7 +118,7 @@ def eliminated(A, h, free):
     D[np.arange(len(e)), e.node] = e.direction
     C = D.copy()
     np.add.at(C, (e.row, e.followed), -e.coefficients)
-    return group, C.reshape(len(e), -1), D.reshape(len(e), -1)
+    return group, C.reshape(len(e), free.size), D.reshape(len(e), free.size)
 
 
 @given(seed=st.integers(0, 10**6), m=st.integers(1, 7), copies=st.integers(0, 3), decades=st.sampled_from([0.0, 3.0]))
@@ -211,6 +211,15 @@ def test_only_what_is_left_is_eliminated(m, copies):
     # forces of the given rows, the least that do: what the pseudoinverse says
     S = np.linalg.pinv(A.reshape(len(A), -1).T) @ wanted.T
     assert np.allclose(group.shares, S, rtol=0, atol=1e-9 * max(1.0, np.abs(S).max()))
+
+
+@pytest.mark.parametrize("m", [0, 3])
+def test_rows_of_which_none_can_be_eliminated(m):
+    """All of them are left out, where every component is prescribed; no rows are none."""
+    A, free = rows(np.random.default_rng(1), m, np.ones(m))
+    free[:] = False
+    group, C, _ = eliminated(A, np.ones(m), free)
+    assert len(C) == 0 and group.redundant.all() and group.shares.shape == (m, 0)
 
 
 # -- two-pass ------------------------------------------------------------------------------------------------------------

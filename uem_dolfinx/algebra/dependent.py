@@ -259,17 +259,17 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
     ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those of lowest ``rank (m,)`` come first:
     see ``Rank``.
     """
-    m = len(A)
-    movable = (A * free).reshape(m, -1)
+    m, flat = len(A), (len(A), free.size)
+    movable = (A * free).reshape(flat)
     length = np.linalg.norm(movable, axis=1)
-    rest = length > MOSTLY_PRESCRIBED * np.linalg.norm(A.reshape(m, -1), axis=1)
+    rest = length > MOSTLY_PRESCRIBED * np.linalg.norm(A.reshape(flat), axis=1)
     scale = np.where(rest, length, 1.0)
     A, h, across = A / scale[:, None, None], h / scale, movable / scale[:, None]
     rank = np.full(m, Rank.WITHIN) if rank is None else rank
     k, pivot, direction = _pivots(A, h, across, free, rest, rank)
     shares: Array = np.zeros((m, 0))
     if len(k):
-        shares = _shares(movable, (A[k] * free).reshape(len(k), -1))
+        shares = _shares(movable, (A[k] * free).reshape(len(k), free.size))
     terms = A[k]
     # what is left of the pivot's own block is across the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot] -= direction
@@ -327,6 +327,8 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
         nodes.append(t)
         directions.append(d)
     k, pivot, direction = np.array(rows, np.int64), np.array(nodes, np.int64), np.reshape(directions, (len(rows), A.shape[2]))
+    if not rows:
+        return k, pivot, direction
     # each of them still follows what later ones eliminate
     later = np.einsum("ksg,sg->ks", A[k][:, pivot], direction)
     both = solve_triangular(later, np.column_stack([A[k].reshape(len(k), -1), h[k]]), unit_diagonal=True, check_finite=False)
