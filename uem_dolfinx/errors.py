@@ -23,11 +23,11 @@ class UEMError(Exception):
 
 
 class InputError(UEMError, ValueError):
-    """Something handed over is out of its range, or not what it is handed over as."""
+    """An argument is out of range or inconsistent."""
 
 
 class InputTypeError(InputError, TypeError):
-    """Something handed over is of another type than was expected."""
+    """An argument has another type than expected."""
 
 
 class UserFunctionError(UEMError, RuntimeError):
@@ -55,7 +55,7 @@ class SpaceError(UEMError, ValueError):
 
 
 class SurfaceError(UEMError, ValueError):
-    """A contact surface cannot be what it is asked to be."""
+    """A contact surface is unsuitable for its use."""
 
 
 class OrientationError(SurfaceError):
@@ -67,23 +67,23 @@ class PenetrationError(SurfaceError):
 
 
 class ConflictError(UEMError, ValueError):
-    """A Dirichlet condition and a uniting equation, or two uniting equations, ask different things of one node."""
+    """A Dirichlet condition and a uniting equation, or two uniting equations, require different displacements of one node."""
 
 
 class OverdeterminedError(ConflictError):
-    """Contacts ask more of some nodes than these and their targets can give: an equation was left out, and is missed at the end."""
+    """Contacts have more conditions at a node than can be satisfied: an equation was left out, and is violated at the end."""
 
 
 class FloatingBodyError(UEMError, RuntimeError):
-    """A body moves as a rigid body under its loads, and neither conditions nor contacts can hold it."""
+    """A body has an unrestrained rigid-body motion: neither conditions nor contacts can restrain it."""
 
 
 class ThrownBodyError(FloatingBodyError):
-    """A body that contact held has left it within a step and gone far, and nothing tells where it would come to rest."""
+    """A body held by contact has lost contact within a step and moved far, so that its position of rest is undetermined."""
 
 
 class MassError(UEMError, ValueError):
-    """A mass cannot be what it is asked to be."""
+    """A mass is unsuitable for its use."""
 
 
 class NotFiniteError(UEMError, ArithmeticError):
@@ -91,7 +91,7 @@ class NotFiniteError(UEMError, ArithmeticError):
 
 
 class PrecisionError(UEMError, ArithmeticError):
-    """Rounding of the stiffest parts hides whether the forces are in equilibrium."""
+    """Rounding errors of the stiffest parts exceed the tolerance of the residual."""
 
 
 class InvertedElementError(UEMError, ArithmeticError):
@@ -99,15 +99,15 @@ class InvertedElementError(UEMError, ArithmeticError):
 
 
 class EnergyGivenError(UEMError, ArithmeticError):
-    """Contacts would give the bodies energy within a time step, however short it is."""
+    """Contacts add energy to the bodies even in the shortest time step."""
 
 
 class TunnellingError(UEMError, ArithmeticError):
-    """A contactor passes through a target within a step, where no step ends: between two instants, or, in statics, two equilibria."""
+    """A contactor passes through a target within a step: between two instants, or, in statics, two equilibria."""
 
 
 class MissingBackendError(UEMError, ImportError):
-    """An optional library (gmsh, matplotlib, hypre, MUMPS, ...) was asked for and is not here."""
+    """An optional library (gmsh, matplotlib, hypre, MUMPS, ...) is required and not installed."""
 
 
 class LinearSolveError(UEMError, RuntimeError):
@@ -139,4 +139,4 @@ class ConvergenceError(UEMError, RuntimeError):
 
 
 class FrictionError(ConvergenceError):
-    """Friction leaves no answer, or more than one: stick and slip do not settle, or a slip runs against its own direction."""
+    """With friction there is no solution, or more than one: stick and slip do not converge, or slip reverses its direction."""

@@ -32,8 +32,8 @@ class PointLoad(given.Sealed):
             around the whole circle.
 
     Raises:
-        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place where no node is; then a TagError for
-            what is no tag of points.
+        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place where no node is; then a
+            TagError for a tag that is not of points.
     """
 
     SETTABLE: ClassVar = {"force": None}

@@ -22,7 +22,7 @@ from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 
 class RigidCoupling(given.Sealed):
-    """Nodes of a surface or a body that move with a point as one rigid body, or that share what acts at the point.
+    """Nodes of a surface or a body that move with a point as one rigid body, or to which the load of the point is distributed.
 
         uem.RigidCoupling(tags["end"], (10.0, 0.5), force=(0.0, -3.0), moment=12.0)
         uem.RigidCoupling(tags["wheel"], (0.0, 0.0), motion=(0.0, 0.0, None))               # on a bearing, free to turn
@@ -40,8 +40,8 @@ class RigidCoupling(given.Sealed):
         motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
             None where it is free: ``(u_x, u_y, angle)`` in the plane, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in space, with r the rotation
             vector in radians. Numbers are approached along with the Dirichlet values. None leaves all free.
-        mass: of a rigid body that is fixed to the part and has its centre at the point, beside what the part has by its density. It
-            counts in dynamics and its gravity, and in ``modes``; statics does without it.
+        mass: of a rigid body that is fixed to the part and has its centre at the point, in addition to the mass of the meshed part.
+            It counts in dynamics and its gravity, and in ``modes``; statics does without it.
         inertia: of that body about the point: a number in the plane, a number for all axes or a symmetric matrix ``(3, 3)`` in space, in
             the axes of the drawing; it turns with the part.
         distribute: the force and the moment are shared by the nodes and nothing is stiffened; the point has their mean motion.
@@ -52,8 +52,9 @@ class RigidCoupling(given.Sealed):
         point: as given ``(gdim,)``.
 
     Raises:
-        InputError, InputTypeError: for values of another form, an inertia that no body has, or a motion or a mass of what is distributed.
-            When the problem is made also a TagError for parts that are none, and a SurfaceError for nodes on one line.
+        InputError, InputTypeError: for values of another form, an impossible inertia, or a motion or a mass with
+            ``distribute=True``. When the problem is made also a TagError for parts that are none, and a SurfaceError for nodes on
+            one line.
     """
 
     def __init__(

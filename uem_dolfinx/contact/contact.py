@@ -67,36 +67,37 @@ class Contact(WatchedContact, given.Sealed):
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
-        thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper
-            than this lies behind the body, not in it. None takes the body to have no back.
-        friction: Coulomb's coefficient, a number, a function of place that is given points ``(3, n)`` of the reference configuration and
-            returns ``(n,)``, a function of place and of the load factor, in time steps of the time, that counts for the step that
-            ends there, or an ``OfTemperature``; or a law of friction, made with any of these: ``Coulomb`` with a limit, ``Tresca``,
-            ``Stribeck``. With 0 the contact is the one without friction. It may be set anew between steps, of a contact that was made with
-            friction, by the same law; all else but ``offset`` is settled once a problem has been made.
-        wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of place as of ``friction``: after every
-            step the contactor has lost the volume ``wear N s`` under the force N that slips by s, with friction or without, and gaps
-            are larger by its depth. :attr:`wear` and :attr:`worn_volume` tell it. The target does not wear.
-        heat: a ``Conductance``: heat that passes through the contact, where one of the fields beside the displacement is a temperature.
-        measure: what pressures and tractions are forces per area of: ``"reference"``, the undeformed surface, the only one that
-            small strains know, or ``"current"``, the surface as it is now, on which the true pressure acts. For both couplings.
-        tied: True unites contactors that are within reach of the target with it, in all components and for good: they never open and never
-            slip, whatever pulls; gaps are kept, and turn with the target. What is out of reach stays in contact. ``"after"`` is contact
-            until :meth:`tie` is called.
-        offset: a length, or a function of place as of ``friction``, by which both surfaces together are taken to be thicker than drawn:
-            gaps are less by so much. Where surfaces coincide a positive offset is an interference, a negative one a clearance. It may be
-            set anew between steps, or by the function of the load factor that a problem gets as ``load``.
-        adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``): contactors that are no
-            farther from the target at the start, or no deeper inside, are taken to touch it, free of stress. The mesh stays as it is:
-            each contactor's height is part of its offset from then on; :attr:`adjusted` tells the largest. What is tied keeps its
-            gap, and ``adjust`` is the reach of the tie, which is True without.
+        thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper than
+            this lies behind the body, not in it. None: the body is treated as infinitely thick.
+        friction: Coulomb's coefficient: a number, a function of points ``(3, n)`` of the reference configuration that returns
+            ``(n,)``, a function of these and of the load factor or time at the end of the step, or an ``OfTemperature``. Or a law
+            of friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the contact is
+            frictionless. If the contact was made with friction, it may be changed between steps, by the same law. Other settings,
+            except ``offset``, cannot be changed once a problem has been made.
+        wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of position as for ``friction``.
+            After every step the worn volume of the contactor is ``wear N s`` for the force N that slips by s, with friction or
+            without, and gaps are larger by the worn depth. Results are :attr:`wear` and :attr:`worn_volume`. The target does not
+            wear.
+        heat: a ``Conductance``: heat conduction through the contact, if one of the other fields of a mixed space is a temperature.
+        measure: area of pressures and tractions: ``"reference"``, of the undeformed surface, the only one in small strains, or
+            ``"current"``, of the deformed surface, on which the true pressure acts. For both couplings.
+        tied: True ties contactors within reach to the target permanently, in all components: they never open and never slip, and
+            gaps are kept and rotate with the target. Contactors out of reach remain in contact. ``"after"`` is contact until
+            :meth:`tie` is called.
+        offset: additional thickness of both surfaces together, a length or a function of position as for ``friction``: gaps are
+            smaller by it. If surfaces coincide, a positive offset is an interference, a negative one a clearance. It may be changed
+            between steps, or by a function of the load factor, ``load`` of the problem.
+        adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``): contactors with an
+            initial gap or penetration of at most this length are initially in contact, free of stress. No node is moved: the
+            initial gap of each contactor becomes part of its offset; :attr:`adjusted` is the largest. Tied contactors keep their
+            gap, and ``adjust`` is the reach of the tie, by default True.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
 
     Raises:
-        InputError, InputTypeError: for an unknown word, a bound or thickness out of its range, a rigid contactor; on all ranks where
-            a tag tells which they are. Also where an attribute is set that there is not, or that the problem would not take any more.
+        InputError, InputTypeError: for an unknown word, a bound or thickness out of its range, a rigid contactor; on all ranks if a
+            tag determines the communicator. Also if an attribute is set that does not exist, or that cannot be changed any more.
     """
 
     SETTABLE = dict.fromkeys(("friction", "offset"))
@@ -193,7 +194,7 @@ class Contact(WatchedContact, given.Sealed):
 
     @property
     def friction(self) -> Field | FrictionLaw:
-        """Coulomb's coefficient, or a law; set anew between steps it counts from the next step on (collective)."""
+        """Coulomb's coefficient, or a law; a change between steps is valid from the next step on (collective)."""
         return self._friction
 
     @friction.setter
@@ -255,7 +256,7 @@ class Contact(WatchedContact, given.Sealed):
 
     @property
     def offset(self) -> Field:
-        """By how much both surfaces together are taken to be thicker than drawn; set anew it counts from the next step on (collective)."""
+        """Additional thickness of both surfaces together; a change is valid from the next step on (collective)."""
         return self._offset
 
     @offset.setter
@@ -289,7 +290,7 @@ class Contact(WatchedContact, given.Sealed):
 
     @property
     def adjusted(self) -> float:
-        """The largest distance by which ``adjust`` has taken contactors to be nearer to the target, a length (collective).
+        """The largest initial gap or penetration that ``adjust`` has removed, a length (collective).
 
         Of tied contactors it is the largest gap that is kept.
         """
@@ -420,7 +421,7 @@ class Contact(WatchedContact, given.Sealed):
         )
 
     def tie(self) -> None:
-        """Unite what touches now with the target for good, where it is, from the next step on; what does not stays in contact.
+        """Tie active contactors permanently at their present position, from the next step on; others remain in contact.
 
         For contacts that were made with ``tied="after"``, between two steps (collective).
 

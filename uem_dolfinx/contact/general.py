@@ -41,21 +41,21 @@ if TYPE_CHECKING:
 class GeneralContact(OfProblem, given.Sealed):
     """Every surface against every other, and against rigid ones, by one declaration.
 
-    Surfaces are found from the mesh; what does not come near anything costs next to nothing. Between two bodies the nodes of the one
-    whose facets are smaller follow the other; of two parts of one body that meet, the nodes of one follow. Bodies are what cells connect.
+    Facets far from other surfaces cost almost nothing. Bodies are the connected components of the mesh. Between two bodies the
+    nodes of the one with smaller facets are contactors, between two parts of one body the nodes of one part.
 
     Args:
         surfaces: parts that may touch, named as for ``Contact``; None is all exterior facets.
         rigid: rigid surfaces that all of them may touch: one, or a list.
-        exclude: parts that touch nothing, and pairs of parts ``(one, other)`` that never touch each other, of facets or of cells. What
-            another ``Contact`` of the same problem names against each other is left to it; nodes that it ties touch nothing beside it.
+        exclude: parts without contact, and pairs of parts ``(one, other)`` without contact between them, of facets or of cells.
+            Surfaces paired by another ``Contact`` of the problem are left to it; its tied nodes have no contact next to the tie.
         order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer first.
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
         friction: as of ``Contact``, for all; or by pairs, ``{(one, other): value, ..., None: value of all others}``, with names of
-            bodies, or parts of facets or of cells, or one of the rigid surfaces, and values of one law. Of several pairs that hold the
-            first counts; what no pair names has none without ``None``.
+            bodies, or parts of facets or of cells, or one of the rigid surfaces, and values of one law. The first matching pair is
+            used; pairs that are not listed are frictionless unless the key ``None`` gives a default.
         coupling: ``"node_to_surface"``, or ``"mortar"``, for a few bodies on meshes that do not match: each body is then a target of its
             own that all others are compared with. No body touches itself.
         normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
@@ -132,7 +132,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return f"GeneralContact({self.name!r}, rigid surfaces: {len(self.rigid)})"
 
     def make_parts(self, config: Configuration, others: Sequence[Contact]) -> list[Contact]:
-        """The contacts that it consists of, in a problem with these ``others`` (collective).
+        """The single contacts of the general contact, in a problem with these ``others`` (collective).
 
         Raises:
             TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
@@ -264,7 +264,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def parts(self) -> list[Contact]:
-        """The contacts that it consists of: bodies with bodies, one for each that a node may touch at once, and with each rigid surface."""
+        """The single contacts: between bodies, one for each body that a node may touch at once, and with each rigid surface."""
         if not self._parts:
             raise not_attached(self.name)
         return self._parts
@@ -299,7 +299,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def heat_flux(self) -> fem.Function:
-        """Power per area that goes from contactors to what they touch, as a scalar field; 0 without ``heat`` (collective)."""
+        """Power per area from contactors to the opposite surface, as a scalar field; 0 without ``heat`` (collective)."""
         return self._sum("heat_flux")
 
     def heat_balance(self) -> float:
@@ -312,7 +312,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return self._of_all("gap", np.minimum)
 
     def resultant(self, about: npt.ArrayLike | None = None) -> Resultant:
-        """Force and moment that rigid surfaces exert on the bodies; what these exert on each other cancels (collective).
+        """Force and moment of rigid surfaces on the bodies; forces between bodies cancel (collective).
 
         Args:
             about: point that the moment is taken about ``(gdim,)``; None is the origin.
@@ -340,7 +340,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return [touch for touch, _ in self.forces_of_pairs()]
 
     def forces_of_pairs(self, about: npt.ArrayLike | None = None) -> list[tuple[Touch, Array]]:
-        """What ``touching`` tells, each with the moment on the first, a vector, in 2D ``(1,)`` (collective).
+        """The pairs of ``touching``, each with the moment on the first, a vector, in 2D ``(1,)`` (collective).
 
         Args:
             about: point that moments are taken about ``(gdim,)``; None is the origin.
@@ -358,7 +358,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
         Args:
             first: name of the body.
-            second: name of the other, of a rigid surface as ``touching`` tells it; None is all that touches it.
+            second: name of the other body, or of a rigid surface as in ``touching``; None is all bodies and surfaces in contact.
             about: point that the moment is taken about ``(gdim,)``; None is the origin.
 
         Raises:
@@ -367,7 +367,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return self._between(first, second, about)[0]
 
     def heat_power(self, first: str, second: str | None = None) -> float:
-        """Power that goes from a body to another one or to a rigid surface, the heat of friction aside; see ``between`` (collective)."""
+        """Power from a body to another one or to a rigid surface, without the heat of friction; see ``between`` (collective)."""
         return self._between(first, second, None)[1]
 
     def _between(self, first: str, second: str | None, about: Any) -> tuple[Resultant, float]:

@@ -31,12 +31,13 @@ class ContactParameter:
 
     Args:
         contact: of the problem.
-        parameter: ``"offset"``, what the contact's ``offset`` is more everywhere, a length; ``"place"``, by which a rigid target moves
-            in all directions ``(gdim,)``, a length; ``"turn"``, by which it turns about its present reference point, an angle in 2D,
-            a rotation vector ``(3,)`` in 3D; ``"friction"``, what the coefficient of Coulomb's law is more everywhere, for histories.
+        parameter: ``"offset"``, a uniform increment of the contact's ``offset``, a length; ``"place"``, by which a rigid target
+            moves in all directions ``(gdim,)``, a length; ``"turn"``, by which it turns about its present reference point, an angle
+            in 2D, a rotation vector ``(3,)`` in 3D; ``"friction"``, a uniform increment of the coefficient of Coulomb's law, for
+            histories.
 
     Raises:
-        InputError, InputTypeError: for what is no contact, an unknown word, or a target that is not rigid.
+        InputError, InputTypeError: for an argument that is no contact, an unknown word, or a target that is not rigid.
     """
 
     contact: Contact

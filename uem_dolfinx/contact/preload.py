@@ -26,9 +26,9 @@ from uem_dolfinx.parallel import agreed, ask_together
 class Preload(Contact):
     """A section of a bolt, between two facing surfaces of its parts, that carries a given force, or keeps the length found with it.
 
-    The surfaces are tied in all components but for an opening along the axis, which is one and the same all over the section. It is free
-    while the force is given: both parts draw up to each other, and past, until the section carries the force to rounding. ``lock`` keeps
-    the opening from then on, so that the bolt is a spring among others.
+    The surfaces are tied in all components except for an opening along the axis, which is uniform over the section. While the force
+    is prescribed, the opening is an unknown: the parts approach, and may overlap, until the section carries the force to rounding.
+    ``lock`` keeps the opening from then on, so that the bolt is an elastic part as others.
 
     It is a ``Contact`` with ``tied=True`` and has its results: ``force`` is the field of nodal forces on both faces, as of any contact,
     and ``carried`` the force across the section.
@@ -38,15 +38,15 @@ class Preload(Contact):
         target: the other, of a mesh; the two need not match.
         axis: direction of the bolt ``(gdim,)``, of any length and either sign; None is the section's mean normal. It stays as it is when
             bodies turn.
-        force: that the section carries, positive in tension: of what is modelled of it, so that half a bolt carries half of the force; on
-            axisymmetric meshes of the whole circle. A number acts in full from the first step on, a function of the load factor, in time
-            steps of the time, follows it.
+        force: force in the section, positive in tension: of the modelled part, so that half a bolt carries half of the force; on
+            axisymmetric meshes of the whole circle. A number acts in full from the first step on; a function is called with the
+            load factor, in time steps with the time.
         coupling: as of ``Contact``.
         measure: likewise.
         name: likewise.
 
     Raises:
-        InputError, InputTypeError: for an axis or a force that is none, or a rigid target.
+        InputError, InputTypeError: for an invalid axis or force, or a rigid target.
     """
 
     def __init__(
@@ -81,10 +81,10 @@ class Preload(Contact):
     # -- what users do with it -------------------------------------------------------------------------------------------
 
     def tighten(self, force: float | Callable[[float], float]) -> None:
-        """Give another force, from the next step on; a locked section is free again (collective).
+        """Prescribe another force, from the next step on; a locked section is unlocked (collective).
 
         Raises:
-            InputError, InputTypeError: for what is no force.
+            InputError, InputTypeError: for an invalid force.
         """
         section = self._section
         with agreed(self.config.comm):
@@ -106,12 +106,12 @@ class Preload(Contact):
 
     @property
     def opening(self) -> float:
-        """How much farther the faces are apart along the axis than drawn, a length; negative where the bolt is shortened (collective)."""
+        """Change of the distance between the faces along the axis, a length; negative if the bolt is shortened (collective)."""
         return self._section.find_opening()
 
     @property
     def carried(self) -> float:
-        """Force that the section carries in the last step, positive in tension, whether it is locked or not (collective)."""
+        """Force in the section in the last step, positive in tension, locked or not (collective)."""
         return self._section.carried(self.pair.committed)
 
     # -- in a problem ----------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class Preload(Contact):
 
     @property
     def sees_corners(self) -> bool:
-        """No: faces that are drawn past each other are inside the other part."""
+        """No: faces that overlap initially are inside the other part."""
         return False
 
     def take_load(self, at: float, known: bool = False) -> None:

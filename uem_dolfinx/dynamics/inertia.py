@@ -36,31 +36,33 @@ DynamicsMemory = tuple[float, float, float, Array, list[Array], list[list[Array]
 
 
 class Dynamics(given.Sealed):
-    """What a problem needs to move in time; hand it to ``UnitedProblem`` and step by ``time_steps``.
+    """Mass, initial velocity and time integration of a problem; pass it to ``UnitedProblem`` and solve by ``time_steps``.
 
     Args:
-        mass: of all bodies; bodies without mass are allowed where others or supports hold them.
+        mass: of all bodies; bodies without mass are allowed if others or supports restrain them.
         scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``.
         velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
-        gravity: acceleration of free fall ``(gdim,)``; every node weighs what its mass does, so that free fall strains nothing.
+        gravity: acceleration of free fall ``(gdim,)``; the weight of every node is its mass times gravity, so that free fall causes
+            no strain.
         damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual:
             ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
-        contactors: ``"massless"`` hands the mass of the contactors on to the nodes around [UEM, 5], and that of the nodes that they
-            follow in the bodies that can carry it, so that impact itself neither loses nor gives energy; ``"massy"`` leaves it.
+        contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and the mass of the target nodes
+            below them in bodies with fine enough meshes, so that impact itself neither dissipates nor adds energy; ``"massy"`` does
+            not move it.
         time: at the start.
 
     Attributes:
         velocity: a Function; at components without mass it is the mean over the last step.
         acceleration: a Function; zero at components without mass, at prescribed ones the mean over the last step.
         mean_velocity: a Function, increments of the last step over its length; at the start the velocity.
-        driven: what this rank's prescribed components have given its mass of kinetic energy by being prescribed.
+        driven: kinetic energy added by prescribed motion (this rank).
         time: of the committed state.
         start: time at the start.
-        accelerated: whether the acceleration fits the forces yet.
+        accelerated: whether the acceleration is consistent with the forces.
         moving: whether a step has begun that is neither kept nor left.
         massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
         held: owned components that are prescribed ``(n,)``.
-        past: what the velocity in the damping form is beside the displacement's share, a Function; there with damping alone.
+        past: velocity in the damping form minus its part from the displacement, a Function; only with damping.
         resumed: how often a checkpoint has been read into them.
         dt: length of the step that has begun last.
     """
@@ -269,13 +271,13 @@ class Dynamics(given.Sealed):
         self.past.x.scatter_forward()
 
     def memory(self) -> DynamicsMemory:
-        """What the next step begins with."""
+        """Initial state of the next step."""
         fields = self.velocity, self.acceleration, self.mean_velocity, self.forces
         kept, added = [np.array(field.x.array) for field in fields], [one.kept for one in self.added]
         return self.time, self._last, self.driven, self._u, kept, added
 
     def remember(self, memory: DynamicsMemory) -> None:
-        """Go on from what ``memory`` returned."""
+        """Restore the state that ``memory`` returned."""
         self.time, self._last, self.driven, displacement, kept, added = memory
         for field, values in zip((self.velocity, self.acceleration, self.mean_velocity, self.forces), kept):
             field.x.array[:] = values
@@ -399,7 +401,7 @@ class Dynamics(given.Sealed):
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
 
     def to_checkpoint(self) -> dict[str, Any]:
-        """Numbers that a run goes on from beside the Functions, by name."""
+        """Numbers of a checkpoint in addition to the Functions, by name."""
         kept = {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
         kept |= {} if self.damping is None else {"rate in damping": float(self._rate.value)}
         return kept | ({"masses at points": [np.array(one.kept).tolist() for one in self.added]} if self.added else {})

@@ -77,7 +77,7 @@ def generalised_alpha(rho_inf: float) -> Scheme:
     """Second-order rule that damps what the step cannot resolve (Chung and Hulbert, J. Appl. Mech. 60, 1993, 371-375).
 
     Args:
-        rho_inf: what a step leaves of the fastest motions, from 0 to 1 (none lost).
+        rho_inf: factor by which a step reduces the fastest motions, from 0 to 1 (no damping).
 
     Raises:
         InputError, InputTypeError: if ``rho_inf`` is not between 0 and 1.

@@ -127,7 +127,7 @@ class RigidSurface(given.Sealed):
     The functions are called on each rank with the contactors there, and not at all where there are none.
 
     Raises:
-        InputError, InputTypeError: naming what is no function, no finite point or no positive length.
+        InputError, InputTypeError: with the argument that is no function, no finite point or no positive length.
     """
 
     n_nodes = 0
@@ -186,7 +186,7 @@ class RigidSurface(given.Sealed):
             The surface itself.
 
         Raises:
-            InputError, InputTypeError: naming what is not finite, or not of the surface's dimension.
+            InputError, InputTypeError: with the argument that is not finite, or not of the surface's dimension.
         """
         t = given.vector(f"{self.name}: translation", translation, self.gdim)
         g = len(t)

@@ -32,11 +32,11 @@ class Energies:
         stored: in the bodies' strain.
         dissipated: by plastic flow.
         damped: by the damping form.
-        external: work of the external forces, of gravity and of what drives the Dirichlet conditions.
-        contact: work of the contact forces; zero but for friction, rounding, moving rigid targets, forces of preloads and the step in
-            which bodies meet.
-        friction: what friction has taken of that work, so that with still targets it and ``contact`` add up to zero but for rounding.
-        defect: what the sum of energies has gained beyond the work of the external and contact forces.
+        external: work of the external forces, of gravity and of the reactions of Dirichlet conditions.
+        contact: work of the contact forces; zero except for friction, rounding, moving rigid targets, forces of preloads and the
+            step of first contact.
+        friction: energy dissipated by friction; with fixed targets its sum with ``contact`` is zero to rounding.
+        defect: change of the sum of energies minus the work of the external and contact forces.
     """
 
     time: float
@@ -59,13 +59,13 @@ class EnergyBook(Closing, given.Sealed):
     Args:
         problem: with ``dynamics``.
         stored: energy of the bodies' strain as a UFL form; that of materials with history is added.
-        external: virtual work of the external forces as a UFL form, linear in a test function: what F has it with a minus. Loads and
-            springs at nodes, and linear equations, are known.
+        external: virtual work of the external forces as a UFL form, linear in a test function: the terms with a minus sign in F.
+            Loads and springs at nodes, and linear equations, are included by default.
         path: name of the CSV file; None writes none.
-        resume: keep what a file that is there says about the time up to now, and go on after it.
+        resume: keep the rows of an existing file up to the present time, and append to them.
 
     Raises:
-        InputError, InputTypeError: for what is no problem, or no form of its kind.
+        InputError, InputTypeError: for an argument that is no problem, or no form of the required kind.
         SpaceError: if the problem has no dynamics, or a form is of another displacement, space or mesh.
         CheckpointError, OSError: see ``CsvTable``.
     """

@@ -34,24 +34,25 @@ def animate(
 ) -> Iterator[T]:
     """Yield the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
 
-    All frames have the same window, colours and lengths of arrows, and a title with the load factor or time, with as many digits as
-    tell them apart::
+    All frames have the same window, colours and lengths of arrows, and a title with the load factor or time, with enough digits to
+    distinguish them::
 
         for step in uem.animate("out/snap.gif", problem, uem.load_steps(problem, 20), field=stress, label="stress"):
             ...
 
-    The film is written when the run has ended, also by an exception, a signal, or ``break``. What then goes wrong in writing it is a
-    warning, so that the exception stays what it is. Keep no name for the iterator that you leave by ``break``, or ``close()`` it.
+    The film is written when the run has ended, also by an exception, a signal, or ``break``. Errors while writing the film then
+    become warnings, so that the original exception is kept. If you leave the loop with ``break``, close the iterator or keep no
+    reference to it.
 
     Args:
         path: name of the film, which ends in ``.gif`` or ``.mp4``; its folder is made.
         problem: the scene.
-        steps: ``load_steps`` or ``time_steps`` of the problem, or whatever else brings it forward.
+        steps: ``load_steps`` or ``time_steps`` of the problem, or another iterator that solves steps.
         every: draw one of so many steps, beginning with the first.
         frames_per_second: how fast it is shown.
         size: width and height in inches, of 100 points each.
-        how: arguments of :func:`plot_scene`. A Function in an expression is read anew at each step; hand over a contact for its
-            pressure, which is.
+        how: arguments of :func:`plot_scene`. A Function in an expression is evaluated at each step; pass a contact to draw its
+            pressure at each step.
 
     Returns:
         An iterator over the same steps.

@@ -80,7 +80,7 @@ def figure(
         InputError, InputTypeError: for an argument out of its range, or a name whose ending is no format of matplotlib's.
         MissingBackendError: if matplotlib cannot be imported.
         OutputError: if the picture cannot be written.
-        Exception: what rank 0 raises in drawing, on all ranks.
+        Exception: any error of drawing on rank 0, on all ranks.
     """
     with agreed(comm):
         drawn = path is not None and comm.rank == 0
@@ -157,7 +157,7 @@ def plot_scene(
             alone, as ``surface``.
         cmap: colour map.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
-        surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or what a contact takes; 3D only.
+        surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or any surface of a contact; 3D only.
         percentiles: two of the values shown between which the colours lie, such as ``(1, 99)``, so that a few large values, as at
             corners, do not take them all; None takes all values.
         rigid: draw rigid targets.
@@ -200,25 +200,26 @@ def plot_setup(
     size: tuple[float, float] = (6.4, 4.8),
     dpi: float = 150,
 ) -> Picture | None:
-    """Draw what a problem declares: its undeformed bodies, where they are held, what moves and loads them, what meets what (collective).
+    """Draw what a problem declares: undeformed bodies, supports, prescribed motions, loads, contactors and targets (collective).
 
-    Each body has its grey. Contactors and targets have colours of their own, with their names; rigid targets are hatched, in 3D seen
-    through. What is held in all components is hatched, in 3D dark; a triangle, in 3D a cone, points along a component that is held from
-    outside. Arrows are prescribed displacements, motions of rigid surfaces, loads on surfaces and points, forces on bodies, gravity
-    and the velocity at the start; those of displacements and velocities are as long as they are large, the others tell directions.
+    Each body has its grey. Contactors and targets have colours of their own, with their names; rigid targets are hatched, in 3D
+    seen through. Supports in all components are hatched, in 3D dark; a triangle, in 3D a cone, is a support along one component,
+    drawn from outside. Arrows are prescribed displacements, motions of rigid surfaces, loads on surfaces and points, forces on
+    bodies, gravity and the velocity at the start; the length of arrows of displacements and velocities is their size, the others
+    show directions only.
 
     Args:
         problem: the scene.
         picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
             Jupyter shows it.
-        at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; then it
-            is asked for the present ones again. None is the full load in statics, and the present time in dynamics.
-        loads: find the loads that are terms of the residual: it is assembled without displacement, what it integrates over surfaces apart.
-        arrows: what else acts, such as what is prescribed later: places, directions ``(gdim,)`` and names.
+        at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; the
+            present values are restored. None is the full load in statics, and the present time in dynamics.
+        loads: find the loads in the residual: it is assembled at zero displacement, surface integrals separately.
+        arrows: further arrows, such as values that are prescribed later: positions, directions ``(gdim,)`` and names.
         cells: draw the edges of the cells.
         window: as of :func:`plot_scene`; nothing is cut.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
-        legend: name what is drawn.
+        legend: draw a legend.
         triad: draw the axes in a corner; 3D only.
         size: width and height in inches; of a panel it is that of :func:`figure`.
         dpi: points per inch; of a panel it is that of :func:`figure`.

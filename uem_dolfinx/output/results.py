@@ -34,27 +34,28 @@ class HistoryWriter(Closing, given.Sealed):
     """CSV file with one row per load step or time step, complete after every row.
 
     Columns: ``factor`` or ``time``, ``step`` (how many steps the problem has done), ``newton_iterations``, and for every contact
-    ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each followed
-    by the contact's name where there are several; then what is asked for, in this order::
+        ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each
+        followed by the contact's name where there are several; then further columns, in this order::
 
         uem.HistoryWriter("out/run.csv", problem, reaction=tags["foot"], columns={"heat": lambda: uem.integrate(q * ufl.dx)})
 
-    Of a ``GeneralContact`` the bodies that touch, with the forces between them, stand in ``run_pairs.csv`` beside it, a row for each pair.
+    For a ``GeneralContact`` the pairs of bodies in contact, with the forces between them, are written to ``run_pairs.csv``, a row
+    for each pair.
 
     Args:
         path: name of the file; its folder is made.
-        problem: what the rows are read from.
+        problem: source of the rows.
         reaction: part of the mesh whose reaction is written, ``reaction_x`` ..., as ``UnitedProblem.reaction`` takes it; or several
             by name, ``reaction_NAME_x`` ...
         columns: functions without arguments by the name of their column, called on all ranks once here and after every step; they
             return a number, or a vector, whose columns are ``NAME_x`` ... if it has as many components as the displacement, else
             ``NAME_0`` ...
-        resume: keep what a file that is there says about the steps up to now, and go on after them; False keeps it in a folder
-            beside, ``NAME.1`` or the next number, and begins anew.
+        resume: keep the rows of an existing file up to the present step, and append to them; False moves the file to a folder
+            ``NAME.1``, or the next number, and begins a new one.
 
     Raises:
         OutputError, CheckpointError, ValueError: see ``CsvTable``.
-        InputError, InputTypeError, UserFunctionError: if what is asked for cannot be had.
+        InputError, InputTypeError, UserFunctionError: if a column cannot be computed.
     """
 
     #: Whose table it is, for messages.
@@ -144,16 +145,16 @@ class TableOfResults(HistoryWriter):
 
 
 class ResultsWriter(Closing, given.Sealed):
-    """Time series of everything there is to see: fields for ParaView and the history.
+    """Time series of results: fields for ParaView and the history.
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` as ``HistoryWriter`` does, ``PATH_pairs.csv`` too, and where
-    DOLFINx has ADIOS2 ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as ``field_1``;
-    for every contact its pressure, gap, status and force, and the heat that passes; and whatever ``fields`` names. XDMF holds nodal
+    DOLFINx has ADIOS2 ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as
+    ``field_1``; for every contact its pressure, gap, status and force, and the heat flux; and those in ``fields``. XDMF holds nodal
     values at the nodes of the mesh only: a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
     ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
-    writes them goes on there, and keeps others from going on with them until it has closed them or ended::
+    writes them keeps writing there, and other runs cannot resume them until it has closed them or ended::
 
         with uem.Checkpoint("out/run.uem") as checkpoint:
             checkpoint.begin(problem.state())
@@ -168,15 +169,16 @@ class ResultsWriter(Closing, given.Sealed):
         reaction: see ``HistoryWriter``.
         columns: likewise.
         vtx: whether to write VTX; None does where DOLFINx can.
-        resume: go on with XDMF and CSV files that are there: the steps up to the checkpoint stay, later ones are replaced. VTX files
-            cannot be gone on with: new steps go to ``PATH_vectors.1.bp``, or the next number. Without files, or where no
-            checkpoint was read, begin anew.
+        resume: append to existing XDMF and CSV files: the steps up to the checkpoint are kept, later ones are replaced. VTX files
+            cannot be resumed: new steps are written to ``PATH_vectors.1.bp``, or the next number. Without files, or if no
+            checkpoint was read, new files are begun.
 
     Raises:
         InputError, InputTypeError: for no path, no problem, or fields that are no UFL expressions by name.
-        MissingBackendError: if VTX is asked for and DOLFINx was built without ADIOS2.
-        OutputError: if the files cannot be written, the steps before stay; or if another run writes those to go on with.
-        CheckpointError: if the files to go on with are of another run.
+        MissingBackendError: if ``vtx`` is True and DOLFINx was built without ADIOS2.
+        OutputError: if the files cannot be written (previous steps are kept), or if another run is still writing the files to
+            resume.
+        CheckpointError: if the files to resume are of another run.
     """
 
     def __init__(

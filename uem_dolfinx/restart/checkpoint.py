@@ -47,7 +47,7 @@ LEAVING = 30.0
 def write_checkpoint(path: str | Path, state: State) -> None:
     """Write a state so that the file is complete or not there, whenever the run is killed (collective).
 
-    It is written beside the file, to ``PATH.part``, and takes the file's place when it is on the disk.
+    It is written to ``PATH.part``, which replaces the file when it is on the disk.
 
     Args:
         path: name of the file; its folder is made.
@@ -111,7 +111,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         state: what is overwritten.
 
     Raises:
-        CheckpointError: naming the file, what was expected of it, what was found and what to do.
+        CheckpointError: with the file, the expectation, its contents and a remedy.
     """
     path, comm = _of_state(path, state)
     for hook in state.collect:
@@ -270,7 +270,7 @@ def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
 
 
 class Checkpoint(given.Sealed):
-    """Keeps a run's state in a file, so that the same script goes on where it was killed.
+    """Stores a run's state in a file, so that the same script resumes where it was killed.
 
     As a context manager, and while load or time steps run with it, it takes care of Ctrl-C and of SIGTERM, which batch systems send
     before they kill: whichever rank gets it, all finish the step, or the iteration where load and time steps are in one, write the last
@@ -280,8 +280,8 @@ class Checkpoint(given.Sealed):
             for step in uem.time_steps(problem, dt, end, checkpoint=checkpoint):
                 ...
 
-    Where the loop or the block is left before its end, by ``break``, ``return``, an error of the script's own or a step that fails, the
-    last converged step is written, if all ranks leave there. A second Ctrl-C ends the run at once, with what was written before.
+    If the loop or the block is left before its end, by ``break``, ``return``, an error of the script or a step that fails, the last
+    converged step is written, if all ranks leave there. A second Ctrl-C ends the run at once, with the previous file.
 
     Other loops call ``begin(state)`` before the first step, ``step()`` after each, and ``finish()`` at the end.
 
@@ -303,7 +303,7 @@ class Checkpoint(given.Sealed):
         self.interruption = Interruption(finishing=True)
 
     def begin(self, state: State) -> bool:
-        """Go on from the file if there is one, and remove what a killed run has left of another (collective).
+        """Resume from the file if it exists, and remove the incomplete file of a killed run (collective).
 
         Returns:
             Whether the state is that of the file now.
@@ -360,7 +360,7 @@ class Checkpoint(given.Sealed):
             self._write()
 
     def finish(self) -> None:
-        """Write the end state, from which the same script goes on if it is given a later end (collective).
+        """Write the final state, from which the same script continues with a later end (collective).
 
         Raises:
             CheckpointError: if it cannot be written; an earlier file stays.

@@ -102,7 +102,7 @@ class ContactEntry:
 
 @dataclass
 class State(given.Sealed):
-    """What a run goes on from; the order of the mesh's input is found when it is first written or read, and kept.
+    """State from which a run can continue; the order of the mesh's input is found when it is first written or read, and kept.
 
     Attributes:
         mesh: on which everything lives.
@@ -111,10 +111,10 @@ class State(given.Sealed):
         contacts: of a problem; their committed states are kept, and where their rigid surfaces are.
         numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
         collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
-        restore: called on all ranks after reading, to go on from them.
+        restore: called on all ranks after reading, to continue from them.
         back: called on all ranks where a run ends by an error within a step, to return to the last step that is done. Without any, a
             loop of the script's own that ends by an error writes nothing.
-        settings: what the run is made with, by name; a file of other settings is refused, unless there are none on either side.
+        settings: settings of the run, by name; a file of other settings is refused, unless there are none on either side.
         by_default: names of settings that have their default value; a file without them is not refused.
         steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
     """

@@ -287,8 +287,7 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
             ``VonMises``.
         scratch: folder for a file of each rank that holds the steps, which is gone with the history; None keeps them in memory.
 
-    Yields:
-        The history, which may be asked in the block and after it.
+    Yields: The history, which may be used in the block and after it.
 
     Raises:
         InputError, InputTypeError: for a problem that there are no such derivatives of: with mortar and friction, other laws with history

@@ -33,14 +33,14 @@ def load_steps(
     """Apply the load in steps, cut on failure, increased again after easy ones to the nominal length at most, with a progress bar.
 
     Args:
-        problem: what to load; its ``load`` follows the factor from 0 to 1 and its Dirichlet values are ramped.
+        problem: problem to solve; its ``load`` is evaluated at factors from 0 to 1 and its Dirichlet values are ramped.
         steps: nominal number of equal steps; after a cut they end again at multiples of their length. Or a list of ``Step``, each with a
             number of its own, between which conditions, loads, contacts and coefficients change: the load factor goes from 0 to 1 in each.
-        arc_length: make only the first step by its load, and all others as long as that one in displacement: the load factor follows,
-            up to limit points and down beyond them, until it comes to 1. Dirichlet values stay as they are.
-        checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
-            either here or, for writers that are to resume, already by ``checkpoint.begin(problem.state())``. Of several calls of
-            ``load_steps`` in a script those that the file is beyond yield nothing.
+        arc_length: prescribe the load of the first step only, and its length in displacement for all others: the load factor is an
+            unknown, which rises up to limit points and falls beyond them, until it is 1. Dirichlet values are not ramped.
+        checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
+            in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need. On restart, calls of ``load_steps``
+            that the checkpoint has already passed yield no steps.
 
     Returns:
         An iterator of converged steps.

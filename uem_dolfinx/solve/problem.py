@@ -58,22 +58,22 @@ class UnitedProblem(given.Sealed):
     Args:
         F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
             forces are added by ``dynamics``. On a mesh declared ``axisymmetric`` it is integrated over whole circles.
-        u: displacement, a Function of a vector Lagrange space; holds the solution. With ``displacement`` a Function of a mixed space.
-            Or a scalar field, as a temperature, whose contacts are ties of two meshes, and which ``equations`` are of then.
-        displacement: number of the part of the mixed space that is the displacement, as of a pressure or a temperature beside it; the
-            other parts are solved for as well, and contact leaves them alone.
+        u: displacement, a Function of a vector Lagrange space; holds the solution. With ``displacement`` a Function of a mixed
+            space. Or a scalar field: contacts are then ties of two meshes, and ``equations`` apply to the scalar.
+        displacement: number of the displacement's part of the mixed space; other parts, such as a pressure or a temperature, are
+            solved for as well, without contact conditions.
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
         equations: linear equations between displacements of nodes: of ``Equation`` and ``periodic``.
-        couplings: parts that move rigidly with a point, or share what acts there: of ``RigidCoupling``.
+        couplings: parts that move rigidly with a point, or distribute its load: of ``RigidCoupling``.
         points: forces and springs at nodes, as ``PointLoad`` and ``PointSpring``, which are no terms of F.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; none choose MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
             iterative solve is as accurate as its Newton iteration can use.
-        load: what drives the load steps: a ``fem.Constant`` set to the load factor while the Dirichlet values are ramped; several as
-            ``{constant: value}``, each with its value at the full load, a number or numbers like its own, to which it grows in
-            proportion, or a function of the factor that returns it; or one function of the factor that sets loads and Dirichlet
-            values itself. None ramps the Dirichlet values only. In time steps the time takes the place of the factor.
+        load: a ``fem.Constant`` that is set to the load factor while the Dirichlet values are ramped. Or several,
+            ``{constant: value}``, each with its value at the full load, to which it is ramped, or a function of the factor that
+            returns it. Or one function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values
+            only. In time steps the factor is replaced by the time.
         dynamics: mass, velocity and time integration; None is statics.
         materials: all laws with history that F is made of, such as ``VonMises``.
         newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
@@ -87,11 +87,11 @@ class UnitedProblem(given.Sealed):
         verbose: print one line per iteration.
 
     Raises:
-        InputError, InputTypeError: for what is of another type or out of its range, named with its value; on all ranks.
-        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, F does not depend on
-            it, a Dirichlet condition, the test function or a law with history is of another one, F holds what is of another mesh, or a
-            contact belongs to another problem.
-        MeshError: if a node's place is not finite, naming the node.
+        InputError, InputTypeError: for an argument of another type or out of its range, with its name and value; on all ranks.
+        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, F does not
+            depend on it, a Dirichlet condition, the test function or a law with history is of another one, F contains objects of
+            another mesh, or a contact belongs to another problem.
+        MeshError: if the coordinates of a node are not finite, with the node.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM meanwhile.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
@@ -295,9 +295,9 @@ class UnitedProblem(given.Sealed):
         and replaced, at its load factor or time, under loads, Dirichlet values and fields as they are now. Histories of friction and
         plasticity, and velocities, are those of one step, however often it is taken.
 
-        Arguments, return value and errors are those of :meth:`attempt`, with loads of the factor ``fraction``; they stay as they are with
-        a ``start``, or if ``set_load`` has set them since the last step. A step that fails when it is taken again stays what it was.
-        KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
+        Arguments, return value and errors are those of :meth:`attempt`, with loads of the factor ``fraction``; they stay as they
+        are with a ``start``, or if ``set_load`` has set them since the last step. If the repeated step fails, the previous result
+        is kept. KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
         """
         from uem_dolfinx.solve.memory import take_again, take_alone
 
@@ -402,7 +402,7 @@ class UnitedProblem(given.Sealed):
             pair.project()
 
     def state(self) -> State:
-        """What a checkpoint keeps of the problem; read back, the next step is the one that would have come (collective).
+        """Contents of a checkpoint of the problem; read back, the next step is the one that would have come (collective).
 
         Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
         added must differ from those here.

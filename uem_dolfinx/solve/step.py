@@ -20,30 +20,30 @@ from uem_dolfinx.solve.loading import check_load
 class Step:
     """One of the steps that a problem is taken through, each from where the one before has ended: ``load_steps(problem, [fit, turn])``.
 
-    What a step does not name stays as it is. In each its load factor s goes from 0 to 1, and with it, in proportion, Constants and
-    coefficients from their present values to those given, Dirichlet values from the present displacement to those of the conditions,
-    and what is released to nothing: conditions that a step no longer has, and contacts that it switches off, are replaced by the
-    forces with which they acted, times 1 - s.
+    A step lists only what changes relative to the previous step. Its load factor s runs from 0 to 1. Constants and coefficients are
+    ramped from their present values to the given ones, Dirichlet values from the present displacement to those of the conditions.
+    Removed conditions, and contacts that are switched off, are replaced by their forces, times 1 - s.
 
     Args:
         name: for messages and results.
         n: nominal number of load steps, cut on failure as those of ``load_steps``.
         bcs: all Dirichlet conditions of the step; None keeps those of the step before.
-        loads: as ``load`` of a ``UnitedProblem``: ``{constant: value}``, each value that at the step's end, to which it grows from what it
-            is, or a function of s; or one function of s that sets loads and Dirichlet values itself, which then are not ramped.
+        loads: as ``load`` of a ``UnitedProblem``: ``{constant: value}``, each with its value at the end of the step, to which it is
+            ramped from the present one, or a function of s; or one function of s that sets loads and Dirichlet values itself, which
+            then are not ramped.
         contacts: contacts that are switched on (True) or off (False). One that is switched on begins as at the start of a problem,
             where the bodies are by then.
         friction: of contacts that were made with friction, as of ``Contact``, by the same law: its coefficient, or other parameter, is
             ramped; a function of place and s is taken as it is.
         offset: of contacts, as of ``Contact``: a length or a function of place, ramped.
-        preload: of ``Preload`` sections: the force at the step's end, to which it grows from what the section carries, or a function of s;
-            None locks the section at its present length.
-        begin: called when the step begins, before anything else, on all ranks, as ``contact.tie``; not again by a run that goes on from a
-            checkpoint of this step or a later one, which has to know what it has done.
+        preload: of ``Preload`` sections: the force at the end of the step, to which it is ramped from the present one, or a
+            function of s; None locks the section at its present length.
+        begin: called when the step begins, before anything else, on all ranks, as ``contact.tie``. It is not called again after a
+            restart from a checkpoint of this step or a later one, which must contain its effect.
         ramp: False lets all of this act in full from the first load step on.
 
     Raises:
-        InputError, InputTypeError: for what is of another type or out of its range.
+        InputError, InputTypeError: for an argument of another type or out of its range.
     """
 
     name: str = ""

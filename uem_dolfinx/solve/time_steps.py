@@ -81,28 +81,28 @@ def time_steps(
 ) -> Iterator[TimeStep]:
     """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
 
-    A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would
-    give the bodies energy within it, and increased again after easy steps.
+    A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would add
+    energy to the bodies within it, and increased again after easy steps.
 
     Args:
         problem: with ``dynamics``; its ``load`` is called with the time.
         dt: nominal length of the steps.
         end: time to reach.
-        event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``: the step is parted there,
-            so that a step begins at the instant, unless rounding hides the forces of steps that short. None leaves steps as they are.
-        checkpoint: counts the steps, once the caller is done with each, and keeps the state; a file that is there is gone on from,
-            either here or, for writers that are to resume, already by ``checkpoint.begin(problem.state())``.
+        event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``. The step is divided there, so
+            that a step begins at the instant, unless rounding exceeds the forces of such short steps. None: steps are not divided.
+        checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
+            in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need.
 
     Returns:
         An iterator of converged steps.
 
     Raises:
-        InputError, InputTypeError: if ``dt`` is not positive, or too short to be told from rounding of the time, ``end`` before the
+        InputError, InputTypeError: if ``dt`` is not positive, or smaller than the rounding error of the time, ``end`` before the
             start or not finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
-        EnergyGivenError: if contacts give the bodies energy by a blow even in the shortest step.
+        EnergyGivenError: if impact adds energy to the bodies even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: likewise.
         KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
