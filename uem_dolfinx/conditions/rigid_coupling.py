@@ -126,8 +126,8 @@ class RigidCoupling(given.Sealed):
         sizes = np.linalg.eigvalsh(spread)
         if not sizes[-1] > 0 or (config.gdim == 3 and np.sqrt(max(sizes[-2], 0.0) / sizes[-1]) < DEPENDENT**2):
             raise SurfaceError(
-                f"the RigidCoupling of '{self.name}': its {self._set.count} nodes lie on a line or in one place, and do not tell how it "
-                "turns: expected at least two nodes in the plane, three that are not on a line in space"
+                f"the RigidCoupling of '{self.name}': its {self._set.count} nodes lie on a line or at one point, so that its "
+                "rotation is undetermined: expected at least two nodes in the plane, three that are not on a line in space"
             )
         return self._set
 

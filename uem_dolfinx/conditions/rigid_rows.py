@@ -398,8 +398,8 @@ class RigidRows:
                 across = _without(across, best[2 * g + 2 :])
         if len(chosen) + len(C) < across.shape[2]:
             raise SurfaceError(
-                f"the RigidCoupling of '{self.coupling.name}': its nodes do not tell its motion beside what is prescribed; give it more "
-                "nodes, or leave out components of its motion"
+                f"the RigidCoupling of '{self.coupling.name}': its nodes do not determine its motion, given the prescribed "
+                "components; give it more nodes, or leave out components of its motion"
             )
         table = np.array(chosen).reshape(-1, 2 * g + 2)
         node, component = table[:, g + 1].astype(np.int64), table[:, g].astype(np.int64)

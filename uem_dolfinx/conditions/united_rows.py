@@ -234,8 +234,8 @@ class UnitedRows:
             i = int(bad[np.argmax(apart[bad])])
             place = ", ".join(f"{x:.6g}" for x in X[np.searchsorted(left.row, i)])
             error = ConflictError(
-                f"an equation of the node at ({place}) is missed by {apart[i]:.4g}: it follows from other equations and Dirichlet "
-                "conditions but for its value, which contradicts theirs; give values that agree"
+                f"an equation of the node at ({place}) is missed by {apart[i]:.4g}: it is a combination of other equations and "
+                "Dirichlet conditions, but its value contradicts theirs; give values that agree"
             )
         agree(config.comm, error)
 

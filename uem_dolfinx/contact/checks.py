@@ -185,8 +185,9 @@ def warn_of_sagging_facets(pair: Interface) -> None:
     if facets > CONFORMING ** (pair.config.gdim - 1):
         worst = comm.allgather((float(np.abs(sag[close]).max(initial=0.0)), float(clearance[close].max(initial=0.0))))
         logger.warning(
-            "%s: the surfaces conform, but %d straight facets of the target sag by up to %.3g, more than the clearance of %.3g there: who "
-            "touches is up to the facets; refine the target, give both surfaces the same nodes, or take mesh and displacement of degree 2",
+            "%s: the surfaces conform, but %d straight facets of the target sag by up to %.3g, more than the clearance of %.3g there: "
+            "the contact zone depends on the facets; refine the target, give both surfaces the same nodes, or take mesh and displacement "
+            "of degree 2",
             pair.name, facets, *np.max(worst, axis=0),
         )  # fmt: skip
 
@@ -246,7 +247,7 @@ def check_new(contacts: Sequence[Any]) -> None:
     """
     for i, contact in enumerate(contacts):
         if contact.taken or any(contact is other for other in contacts[:i]):
-            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and stands in the list before"
+            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and occurs earlier in the list"
             raise SpaceError(f"contact '{contact.name}' {where}: expected new ones; make a new Contact for every problem")
 
 

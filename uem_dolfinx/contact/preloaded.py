@@ -81,7 +81,7 @@ class Preloaded(Tie):
         self.axis = axis / (np.linalg.norm(axis) or 1.0)
         united = super().unite(state, projection, off, which)
         if loose := int(reduced(self.config.comm, int((~self.tied).sum()))):
-            logger.warning("%s: %d contactors of the section lie beside the target, and stay loose", self.name, loose)
+            logger.warning("%s: %d contactors of the section are not opposite to the target, and are not tied", self.name, loose)
         return united
 
     def _within_reach(self, state: PairState) -> Bools:

@@ -128,7 +128,7 @@ def _beside(path: Path, name: str) -> Path:
     """A file that another one includes."""
     found = path.parent / name
     if not found.is_file():
-        raise MeshError(f"{path} includes '{name}', which is not beside it")
+        raise MeshError(f"{path} includes '{name}', which is not in its folder")
     return found
 
 

@@ -80,12 +80,12 @@ def _degree(config: Any, part: int, what: str) -> int:
     W = config.whole.function_space
     others = [i for i in range(W.num_sub_spaces) if i != config.part]
     if part not in others:
-        raise InputError(f"{what}: field = {part}: expected the number of a part beside the displacement, one of {others}")
+        raise InputError(f"{what}: field = {part}: expected the number of a part other than the displacement, one of {others}")
     V = W.sub(part)
     degree = compat.lagrange_degree(V)
     if V.num_sub_spaces or degree is None or degree > config.degree:
         raise SpaceError(
-            f"{what}: part {part} of the mixed space is no scalar Lagrange field of degree {config.degree} or less, which the contactors' "
-            "nodes tell: give the field such an element, or the displacement a higher degree"
+            f"{what}: part {part} of the mixed space is no scalar Lagrange field of degree {config.degree} or less, whose "
+            "values the contactors' nodes determine: give the field such an element, or the displacement a higher degree"
         )
     return degree

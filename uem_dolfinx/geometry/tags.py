@@ -230,7 +230,7 @@ def _read(part: Part, mesh: Any, dims: Sequence[int], role: str) -> list[Tag]:
             raise TagError(
                 f"{role} = {shown(part)}: expected a tag of read_gmsh, (meshtags, value), local indices of "
                 f"{_word(mesh, dims[0])}, or a list of these"
-                + (f"; a name alone tells no mesh: give tags[{part!r}]" if isinstance(part, str) else "")
+                + (f"; a name does not determine the mesh: give tags[{part!r}]" if isinstance(part, str) else "")
             )
         if len(local) and not 0 <= local.min() <= local.max() < n:
             raise TagError(f"{role} has the indices {local.min()} to {local.max()}: expected local ones, 0 to {n - 1}")

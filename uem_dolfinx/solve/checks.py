@@ -60,7 +60,7 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
     for i, material in enumerate(found):
         name = f"materials[{i}], {given.described(material)},"
         if any(material is other for other in found[:i]):
-            raise InputError(f"{name} stands in the list before: expected each law once; make a law of its own for every body")
+            raise InputError(f"{name} occurs earlier in the list: expected each law once; make a law of its own for every body")
         if _taken.get(id(material)) is material:
             raise SpaceError(
                 f"{name} belongs to another problem, whose steps it remembers: expected a law of this problem's own; make new ones for "

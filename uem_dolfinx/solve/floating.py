@@ -156,11 +156,11 @@ class FloatingBodies:
         if self.motions.share <= LOADED:
             return
         told = (
-            f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held where it is: its "
-            "contact does not tell its place"
+            f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held at its position: "
+            "its contact does not determine its equilibrium"
         )
         if self._bodies.dynamics is None:
-            raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest against a drag that fades")
+            raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest with a decaying drag")
         logger.warning(told)
 
     def _refuse_thrown(self) -> None:

@@ -172,23 +172,25 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
         ):
             if present and not recorded:
                 raise InputError(
-                    f"the gradient of {what} depends on all steps, of which the last alone is known: take the steps while "
-                    "uem.recording(problem) keeps them, and ask that history"
+                    f"the gradient of {what} depends on all steps, of which only the last is known: take the steps within "
+                    "uem.recording(problem), and use its history"
                 )
         if not recorded:
             refuse_kept_projections(problem, problem.progress.steps)
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.heat is not None for contact in problem.contacts):
-            raise InputError("gradients do not know heat that passes through a contact: expected contacts without heat")
+            raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
         if any(contact.tied for contact in problem.contacts):
-            raise InputError("gradients do not know how a tie changes with what it ties: expected contacts that are not tied")
+            raise InputError(
+                "gradients do not support ties, which depend on the tied surfaces: expected contacts that are not tied"
+            )
         if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
             raise InputError(
                 "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
             )
         if problem.linear is not None or problem.bodies.points is not None:
-            raise InputError("gradients do not know equations, forces and springs of nodes: expected a problem without them")
+            raise InputError("gradients do not support equations, forces and springs of nodes: expected a problem without them")
     from uem_dolfinx.solve.parted import part_contacts
 
     # derivatives are known of each contact

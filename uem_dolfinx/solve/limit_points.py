@@ -17,12 +17,12 @@ from uem_dolfinx.parallel import reduced
 if TYPE_CHECKING:
     from uem_dolfinx.solve.problem import UnitedProblem
 
-#: What a limit point may end in.
+#: Errors at a limit point.
 FAILURES = (ConvergenceError, InvertedElementError, NotFiniteError)
-#: What goes on where no static path does.
+#: The remedy where no static path continues.
 IN_TIME = "give them a mass and take time steps"
-#: What follows a path on which the load falls.
-WAYS_ON = "lead the bodies by a displacement, or by load_steps(..., arc_length=True); where they jump, give them a mass and take time steps"
+#: The remedy on a path on which the load falls.
+WAYS_ON = "prescribe a displacement, or use load_steps(..., arc_length=True); where the bodies jump, give them a mass and take time steps"
 
 
 class LimitPoint:

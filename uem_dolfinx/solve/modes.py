@@ -154,7 +154,7 @@ def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: 
         eps.solve()
     if eps.getConverged() < n:
         raise LinearSolveError(
-            f"SLEPc found {eps.getConverged()} of {n} modes (reason {eps.getConvergedReason()}): ask for fewer, or check that the mass "
+            f"SLEPc found {eps.getConverged()} of {n} modes (reason {eps.getConvergedReason()}): compute fewer, or check that the mass "
             "is not negative and the stiffness symmetric"
         )
     found = []

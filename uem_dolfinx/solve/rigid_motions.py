@@ -369,8 +369,8 @@ class RigidMotions:
         where = "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
         return FloatingBodyError(
             f"the body with its middle at {where} {' and '.join(ways)} under its loads and no contact stops it: "
-            "hold it by a Dirichlet condition, or give its surface a contact with what it is to come to rest on; what "
-            "swings or rolls comes to rest against a drag that fades"
+            "hold it by a Dirichlet condition, or give its surface a contact with the surface that is to stop it; "
+            "bodies that swing or roll come to rest with a decaying drag"
         )
 
     def thrown(self, ways: Array, most: float) -> ThrownBodyError:

@@ -55,9 +55,7 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
                 "steps are for statics: leave dynamics out, or take time_steps and change loads in the loop over these"
             )
         if problem.load is not None:
-            raise InputError(
-                "the problem has a load, which its steps do not know of: leave load out, and give the steps their loads"
-            )
+            raise InputError("the problem has a load, which its steps do not use: leave load out, and give the steps their loads")
         if problem.history is not None:
             raise InputError("the problem is being recorded, and Steps change what it is: record the load steps of one load")
         for i, step in enumerate(steps):
