@@ -248,7 +248,7 @@ def periodic(
             that returns them. Followed as ``b`` of ``Equation``.
 
     Returns:
-        What ``UnitedProblem(..., equations=[...])`` takes.
+        An entry of ``UnitedProblem(..., equations=[...])``.
 
     Raises:
         InputError, InputTypeError: as of ``Equation``; SurfaceError, when the problem is made, for surfaces that do not match.

@@ -88,7 +88,7 @@ class Mass:
 
     @property
     def centre(self) -> Array:
-        """Centre of all mass as the bodies are drawn, components taken together ``(gdim,)``; NaN without mass (collective)."""
+        """Centre of all mass in the reference configuration, of all components ``(gdim,)``; NaN without mass (collective)."""
         m = self._row_sums.sum(axis=1)
         sums = reduced(self.config.comm, np.append(m @ self._X, m.sum()))
         return self.config.of_circles(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
@@ -381,7 +381,7 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
     Raises:
         SpaceError: if V is no space of displacements.
         UserFunctionError: if the function raises.
-        MassError: naming what has the wrong shape, or a node whose mass is negative or not finite.
+        MassError: with the value of wrong shape, or the node whose mass is negative or not finite.
     """
     config = configuration_of(V)
     n, g = config.n_owned, config.gdim

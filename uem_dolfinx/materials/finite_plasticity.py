@@ -39,9 +39,9 @@ class FinitePlasticity(VonMises):
 
         q(2 mu dev(ln U_e) - 2/3 kinematic_hardening ln V_p) <= yield stress at peeq
 
-    with ``U_e^2 = F_e^T F_e`` and ``V_p^2 = F_p F_p^T``: Prager's rule, derived from an energy of ``V_p``. No plastic spin is assumed,
-    and beside ``peeq`` the plastic strain is all that the law remembers. In simple shear the back stress grows up to a shear of 3
-    and falls slowly beyond, as the logarithm of the stretch does, without oscillations. A table stands for layers that share F, as in
+    with ``U_e^2 = F_e^T F_e`` and ``V_p^2 = F_p F_p^T``: Prager's rule, derived from an energy of ``V_p``. No plastic spin is
+    assumed; the history variables are ``peeq`` and the plastic strain. In simple shear the back stress grows up to a shear of 3 and
+    falls slowly beyond, as the logarithm of the stretch does, without oscillations. A table stands for layers that share F, as in
     ``VonMises``, each with a plastic strain of its own: tension follows the table over the logarithmic plastic strain exactly, and
     cycles follow Masing's rule.
 

@@ -21,10 +21,10 @@ class Voce:
     Attributes:
         increase: of the yield stress in the end, a stress.
         strain: equivalent plastic strain by which it has come to 63 % of that.
-        slope: linear hardening beside it, a stress.
+        slope: linear hardening in addition, a stress.
 
     Raises:
-        InputError, InputTypeError: for what is no number, not positive, or a negative slope.
+        InputError, InputTypeError: for an argument that is no number, not positive, or a negative slope.
     """
 
     increase: float

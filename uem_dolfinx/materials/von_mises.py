@@ -95,10 +95,10 @@ class VonMises(given.Sealed):
             ``update``, the others committed; zero outside of ``cells``. With a table those of the layers, one after another
             (in plane stress with the components of plane strain); ``cell_averages`` give those of the body, by the layers' weights.
         history: the committed Functions by name, all that the material remembers.
-        handed: parameters as they were handed over, by name.
+        handed: parameters as passed, by name.
 
     Raises:
-        InputError, InputTypeError: for an unknown word, a parameter out of its range, or isotropic hardening beside a table.
+        InputError, InputTypeError: for an unknown word, a parameter out of its range, or isotropic hardening together with a table.
         SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or the mesh of ``cells`` is another.
         TagError: if ``cells`` are not cells, or none on any rank.
     """
@@ -357,7 +357,7 @@ class VonMises(given.Sealed):
         return self._layers is None and not self._modulus.any()
 
     def begins_with(self) -> tuple[Array, ...]:
-        """What the return at the present displacement begins with: strain, committed history and parameters, in its order."""
+        """Initial values of the return at the present displacement: strain, committed history and parameters, in its order."""
         elastic = (self._E, self._nu) if self.kind == "plane_stress" else (self._mu,)
         return self._points.evaluate(self._strain), *self._committed(), *elastic, *self._curve.parameters.values()
 
@@ -403,8 +403,8 @@ class VonMises(given.Sealed):
     def dissipation(self) -> float:
         """Plastic work done since the start, as committed, less that against the back stress (collective).
 
-        What isotropic hardening stores is part of it; the work against the back stress comes back, and is part of ``energy``. It
-        follows from ``peeq`` alone.
+        The energy stored by isotropic hardening is part of it; the work against the back stress comes back, and is part of
+        ``energy``. It follows from ``peeq`` alone.
         """
         return self._points.integrate(self._mean(self._curve.work(self._committed()[1])))
 

@@ -79,7 +79,7 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]], of: fem.Function | None = None) -> fem.Function:
     """How the displacement, or a contact pressure, changes with parameters of the problem, by one solve (collective).
 
-    Among other fields the displacement and these are told, as one Function of the mixed space.
+    With other fields the result contains all of them, as one Function of the mixed space.
 
     Args:
         problem: as of :func:`gradient`.

@@ -69,7 +69,7 @@ class Conductance(given.Sealed):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What it was made with, by name."""
+        """Its parameters, by name."""
         return dict(vars(self))
 
     def conductances(self, comm: MPI.Comm, name: str, p: Array, g: Array, closed: Bools) -> Array:

@@ -37,5 +37,5 @@ class OfTemperature(given.Sealed):
         return self.f(x, t, T)
 
     def at(self, t: float) -> OfTemperature:
-        """What it is at a load factor or time, from then on."""
+        """Its value at a load factor or time, from then on."""
         return OfTemperature(lambda x, _, T: self.f(x, t, T), field=self.field)
