@@ -175,7 +175,7 @@ def test_conductances_are_functions_of_no_negative_pressure(coupling):
     assert bars.contact.heat_power == pytest.approx(bars.ends()[1], rel=1e-7)
     state = pair.trial
     pair.trial = replace(state, lam=-state.lam)
-    assert highest(COMM, pair.heat.conductances()) == 0.0 == min(least)
+    assert highest(COMM, pair.heats[0].conductances()) == 0.0 == min(least)
     pair.trial = state
 
 
@@ -186,7 +186,7 @@ def test_the_tangent_is_the_residuals_derivative(coupling, degree, of_heat):
     """By temperatures, in which heat is linear: differences are exact. It is symmetric, and a constant makes no heat."""
     bars = Bars(5.0, n=4, coupling=coupling, degree=degree, of_heat=of_heat, pose=lambda x: x + 0.1 * np.sin(2.0 * x[:, ::-1]))
     run(bars.problem)
-    heat, unknowns, w = bars.contact.pair.heat, bars.problem.config.unknowns, bars.f.w
+    heat, unknowns, w = bars.contact.pair.heats[0], bars.problem.config.unknowns, bars.f.w
     H, held = slip_terms(bars.problem.pairs, unknowns.vector())
     assert held is None and H.isSymmetric(1e-12 * H.norm())
     before, start = np.array(w.x.array), heat.residual()
@@ -209,13 +209,13 @@ def test_the_tangent_by_gaps_and_pressures():
     ):
         bars = Bars(h, gap=gap, coupling="mortar", n=4)
         run(bars.problem)
-        heat, c = bars.contact.pair.heat, bars.contact
+        heat, c = bars.contact.pair.heats[0], bars.contact
         g, p = c.pair.projection.gap, c.pressures
         slopes = wanted(p, np.where(c.pair.united, 0.0, g)) * heat.jump() * heat.passage.areas
         assert highest(COMM, np.abs(heat._slopes() / slopes - 1.0)) < 2.5e-8
     bars = Bars(lambda p, g: 0.05 / (0.01 + g), gap=0.1, n=4, coupling="mortar")
     run(bars.problem)
-    heat, unknowns, w = bars.contact.pair.heat, bars.problem.config.unknowns, bars.f.w
+    heat, unknowns, w = bars.contact.pair.heats[0], bars.problem.config.unknowns, bars.f.w
     assert bars.contact.n_active == 0
     H, _ = slip_terms(bars.problem.pairs, unknowns.vector())
     # across the gap: weights do not change

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -16,6 +15,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
+from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of
 from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
@@ -79,6 +79,7 @@ class Contact(WatchedContact, given.Sealed):
             without, and gaps are larger by the worn depth. Results are :attr:`wear` and :attr:`worn_volume`. The target does not
             wear.
         heat: a ``Conductance``: heat conduction through the contact, if one of the other fields of a mixed space is a temperature.
+            Or a list, for instance of heat and electric current; each of them gets the whole pressure.
         measure: area of pressures and tractions: ``"reference"``, of the undeformed surface, the only one in small strains, or
             ``"current"``, of the deformed surface, on which the true pressure acts. For both couplings.
         tied: True ties contactors within reach to the target permanently, in all components: they never open and never slip, and
@@ -122,7 +123,7 @@ class Contact(WatchedContact, given.Sealed):
         chords: bool = False,
         friction: Field | FrictionLaw = 0.0,
         wear: Field = 0.0,
-        heat: Conductance | None = None,
+        heat: Conductance | Sequence[Conductance] | None = None,
         measure: str = "reference",
         name: str | None = None,
     ):
@@ -140,7 +141,7 @@ class Contact(WatchedContact, given.Sealed):
                 thickness = given.number("thickness", thickness, THICKNESS)
             chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
-            given.kind("heat", heat, heat is None or hasattr(heat, "conductances"), "a Conductance, or None")
+            self.heats = conductances_of(heat)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
@@ -246,7 +247,7 @@ class Contact(WatchedContact, given.Sealed):
         if isinstance(law.field, OfTemperature):
             from uem_dolfinx.contact.sides import mean_temperatures
 
-            T = mean_temperatures(self.config, nodes, law.field.field, self.name, self._pair, self.heat)
+            T = mean_temperatures(self.config, nodes, law.field.field, self.name, self._pair, self.heats)
         return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at, T)
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
@@ -328,7 +329,7 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, heat=None if self.heat is None else [given.described(p) for p in self.heat.parameters.values()],
+            wear=self._wear, heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -358,12 +359,10 @@ class Contact(WatchedContact, given.Sealed):
                 lower=self._offsets_of_pair().wear,
                 name=self.name,
             )
-        if self.heat is not None:
-            from uem_dolfinx.contact.heat import Heat
+        if self.heats:
+            from uem_dolfinx.contact.heat import heats_of
 
-            self._pair.heat = Heat(self._pair, self.heat, self)
-            if self.heat.perfect:
-                self._pair.trial = self._pair.committed = replace(self._pair.committed, heat=np.zeros(len(nodes)))
+            self._pair.heats = heats_of(self._pair, self.heats, self)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 

@@ -21,7 +21,7 @@ def density(config: Configuration, tag: Tag, nodes: Indices, amounts: Array, are
         tag: facets of the contactor.
         nodes: owned contactor nodes ``(n,)``.
         amounts: at these ``(n,)``, which belong to shape functions, at degree 2 to Bernstein's functions.
-        areas: integrals of the shape functions ``(n,)``.
+        areas: integrals of these functions ``(n,)``.
     """
     whole, own = np.zeros((2, config.n_owned))
     whole[nodes], own[nodes] = amounts, areas
@@ -29,16 +29,12 @@ def density(config: Configuration, tag: Tag, nodes: Indices, amounts: Array, are
         return _over(whole, own)
     surface, every = facets_of(config, tag, "contactor"), np.arange(config.n_owned)
     dofs, to_nodes = surface.dofs.ravel(), np.linalg.inv(basis_of(surface.shape).T)
-
-    def at_facets(values: Array) -> Array:
-        return config.from_owners(every, values[:, None], dofs).reshape(surface.dofs.shape)
-
-    def at_nodes(values: Array) -> Array:
-        return config.to_owners(dofs, values.ravel())[: config.n_owned]
-
-    count = at_nodes(np.ones(surface.dofs.shape))
-    coefficients = _over(whole, at_nodes(at_facets(_over(own, count)) @ to_nodes))
-    return _over(at_nodes(at_facets(coefficients) @ to_nodes.T), count)
+    coefficients = config.from_owners(every, _over(whole, own)[:, None], dofs).reshape(surface.dofs.shape)
+    values, count = (
+        config.to_owners(dofs, part.ravel())[: config.n_owned]
+        for part in (coefficients @ to_nodes.T, np.ones(surface.dofs.shape))
+    )
+    return _over(values, count)
 
 
 def _over(values: Array, by: Array) -> Array:

@@ -15,27 +15,26 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general_parts import AmongContact, MortarContact, RigidContact
+from uem_dolfinx.contact.general_surface import as_part, is_pair, touching_surface, where, with_border
+from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.contact.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.errors import InputError, SurfaceError
-from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import surface_nodes
-from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of
-from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
+from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.pair_friction import FrictionOfPairs
-    from uem_dolfinx.geometry.skin import Apart, Skin
+    from uem_dolfinx.geometry.skin import Apart
 
 
 class GeneralContact(OfProblem, given.Sealed):
@@ -62,7 +61,7 @@ class GeneralContact(OfProblem, given.Sealed):
         max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
         measure: as of ``Contact``.
         name: for messages and files.
-        heat: as of ``Contact``: heat that passes where surfaces touch; with a ``temperature`` through rigid surfaces, too.
+        heat: as of ``Contact``: heat that passes where surfaces touch; with a ``temperature`` through rigid surfaces, too. Or a list.
 
     Raises:
         InputError, InputTypeError: for an unknown word, or numbers out of their range.
@@ -83,7 +82,7 @@ class GeneralContact(OfProblem, given.Sealed):
         max_penetration: float | None = None,
         measure: str = "reference",
         name: str = "general contact",
-        heat: Conductance | None = None,
+        heat: Conductance | Sequence[Conductance] | None = None,
         tied: None = None,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
@@ -105,9 +104,9 @@ class GeneralContact(OfProblem, given.Sealed):
             if max_penetration is not None:
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
-            given.kind("heat", heat, heat is None or hasattr(heat, "conductances"), "a Conductance, or None")
+            self.heats = conductances_of(heat)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
-            if heat is not None and heat.temperature is not None and not self.rigid:
+            if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
         self.surfaces, self.bodies, self.friction, self.heat = surfaces, dict(bodies or {}), friction, heat
         self.max_penetration, self.name, self.self_contact = max_penetration, name, self_contact
@@ -141,13 +140,13 @@ class GeneralContact(OfProblem, given.Sealed):
         from uem_dolfinx.geometry.skin import Skin
 
         self.taken, self._attached = True, config
-        alone = [one for one in self.exclude if not _is_pair(one)]
-        pairs = [one for one in self.exclude if _is_pair(one)]
+        alone = [one for one in self.exclude if not is_pair(one)]
+        pairs = [one for one in self.exclude if is_pair(one)]
         others = [c for c in others if not hasattr(c.target, "project")]
         pairs += [(c.contactor, c.target) for c in others]
-        surface = _surface(config, self.surfaces, [_part(config, part, "exclude") for part in alone])
+        surface = touching_surface(config, self.surfaces, [as_part(config, part, "exclude") for part in alone])
         self._skin = skin = Skin(config, surface)
-        place = skin.order([_part(config, part, "order") for part in self.order])
+        place = skin.order([as_part(config, part, "order") for part in self.order])
         self._name_bodies()
         nodes = surface_nodes(config, surface)
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
@@ -155,7 +154,7 @@ class GeneralContact(OfProblem, given.Sealed):
         options: dict[str, Any] = {"friction": friction, "max_penetration": bound, "measure": self.measure}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
-            itself |= skin.bodies_of(_part(config, part, "self_contact"))
+            itself |= skin.bodies_of(as_part(config, part, "self_contact"))
         if len(with_facets) < 2 and not itself.any() and not self.rigid:
             raise SurfaceError(
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
@@ -164,16 +163,15 @@ class GeneralContact(OfProblem, given.Sealed):
         self._refuse_open_conductance(config, bound)
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
-            apart: list[Apart] = [(*_where(skin, one, "exclude"), *_where(skin, other, "exclude")) for one, other in pairs]
+            apart: list[Apart] = [(*where(skin, one, "exclude"), *where(skin, other, "exclude")) for one, other in pairs]
             if self.coupling != "mortar":
                 # nodes at the border of what is tied are tied: they touch nothing beside it
                 tied = [False] * (len(pairs) - len(others)) + [c.tied is True for c in others]
-                apart = [_with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
+                apart = [with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
             among = self._mortar if self.coupling == "mortar" else self._nodes
-            heat = {} if self.heat is None else {"heat": self.heat.without_temperature()}
-            parts += among(nodes, place, itself, apart, bound, options | heat)
-        if self.heat is not None and self.heat.temperature is not None:
-            options["heat"] = self.heat
+            heat = [law.without_temperature() for law in self.heats]
+            parts += among(nodes, place, itself, apart, bound, options | {"heat": heat})
+        options["heat"] = [law for law in self.heats if law.temperature is not None]
         for i, target in enumerate(self.rigid):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
@@ -186,11 +184,11 @@ class GeneralContact(OfProblem, given.Sealed):
 
     def _refuse_open_conductance(self, config: Configuration, bound: float) -> None:
         """Raise InputError for heat that passes through gaps: what is farther than a facet is not looked at (collective)."""
-        if self.heat is None or not callable(self.heat.h):
-            return
         gaps = bound * np.array([1.0, 1e-2, 1e-4])
-        open_ = self.heat.conductances(config.comm, self.name, np.zeros(3), gaps, np.zeros(3, bool))
-        if open_.any():
+        for law in self.heats:
+            open_ = law.conductances(config.comm, self.name, np.zeros(3), gaps, np.zeros(3, bool))
+            if not open_.any():
+                continue
             raise InputError(
                 f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
                 "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
@@ -245,14 +243,14 @@ class GeneralContact(OfProblem, given.Sealed):
     def _place_of(self, one: Any) -> tuple[Bools, Bools]:
         """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part, or of a body by its name (collective)."""
         if not isinstance(one, str):
-            return _where(self._skin, one, "friction")
+            return where(self._skin, one, "friction")
         body = self._names.index(given.word("the name of a body in friction", one, self._names))
         return self._skin.body_of_node == body, self._skin.body == body
 
     def _name_bodies(self) -> None:
         from uem_dolfinx.geometry.skin import names_of_bodies
 
-        parts = {name: self._skin.bodies_of(_part(self._config, part, "bodies")) for name, part in self.bodies.items()}
+        parts = {name: self._skin.bodies_of(as_part(self._config, part, "bodies")) for name, part in self.bodies.items()}
         self._names = names_of_bodies(parts, self._skin.n_bodies)
 
     @property
@@ -287,6 +285,14 @@ class GeneralContact(OfProblem, given.Sealed):
         """Contact pressure as a scalar field on contactors, the sum where they touch several bodies (collective)."""
         return self._sum("pressure")
 
+    def pressure_to_integrate(self) -> fem.Function:
+        """Normal forces per reference area, whose integral over surfaces in contact is their sum; see ``Contact`` (collective).
+
+        Of two surfaces that touch the nodes of one follow, and nodes at sharp edges of both: integrate over the facets of both that face
+        each other.
+        """
+        return self._together("pressure_to_integrate", [part.pressure_to_integrate() for part in self.parts], np.add)
+
     @property
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field, on both bodies (collective)."""
@@ -299,8 +305,17 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def heat_flux(self) -> fem.Function:
-        """Power per area from contactors to the opposite surface, as a scalar field; 0 without ``heat`` (collective)."""
-        return self._sum("heat_flux")
+        """Power per area that goes from contactors to what they touch, as a scalar field; 0 without ``heat`` (collective).
+
+        Of several conductances it is that of the first one's field.
+        """
+        return self.heat_flux_of(self.heats[0].field) if self.heats else self._sum("heat_flux")
+
+    def heat_flux_of(self, field: int) -> fem.Function:
+        """The same of a field; see ``Contact.heat_flux_of`` (collective)."""
+        field = one_of_fields(self.name, self.heats, field)
+        what = "heat_flux" if field == self.heats[0].field else f"heat_flux_of_field_{field}"
+        return self._together(what, [part.flux_of_part(field) for part in self.parts], np.add)
 
     def heat_balance(self) -> float:
         """Heat summed over all bodies over the sum of its nodal sizes, the largest of all contacts between bodies (collective)."""
@@ -329,7 +344,9 @@ class GeneralContact(OfProblem, given.Sealed):
 
     def _of_all(self, what: str, together: np.ufunc) -> fem.Function:
         """A field of all parts together (collective)."""
-        fields = [getattr(part, what) for part in self.parts]
+        return self._together(what, [getattr(part, what) for part in self.parts], together)
+
+    def _together(self, what: str, fields: list[fem.Function], together: np.ufunc) -> fem.Function:
         if what not in self._fields:
             self._fields[what] = fem.Function(fields[0].function_space, name=f"contact_{what}_of_all")
         self._fields[what].x.array[:] = together.reduce([field.x.array for field in fields])
@@ -348,10 +365,11 @@ class GeneralContact(OfProblem, given.Sealed):
         sums = self._sums_of_pairs(about)
         return [(one.touch, one.moment) for one in sums if one.touch.n_active or one.touch.force.any()]
 
-    def _sums_of_pairs(self, about: npt.ArrayLike | None = None) -> list[Pair]:
+    def _sums_of_pairs(self, about: npt.ArrayLike | None = None, field: int | None = None) -> list[Pair]:
         g, rigid = self._config.gdim, [self._rigid_name(part) for part in self.parts]
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
-        return sums_of_pairs(self.parts, self._skin, self._names, rigid, centre)
+        field = self.heats[0].field if self.heats and field is None else field
+        return sums_of_pairs(self.parts, self._skin, self._names, rigid, centre, field)
 
     def between(self, first: str, second: str | None = None, about: Any = None) -> Resultant:
         """Force and moment on a body from another one or from a rigid surface (collective).
@@ -366,14 +384,24 @@ class GeneralContact(OfProblem, given.Sealed):
         """
         return self._between(first, second, about)[0]
 
-    def heat_power(self, first: str, second: str | None = None) -> float:
-        """Power from a body to another one or to a rigid surface, without the heat of friction; see ``between`` (collective)."""
-        return self._between(first, second, None)[1]
+    def heat_power(self, first: str, second: str | None = None, field: int | None = None) -> float:
+        """Power that goes from a body to another one or to a rigid surface, the heat of friction aside (collective).
 
-    def _between(self, first: str, second: str | None, about: Any) -> tuple[Resultant, float]:
+        Args:
+            first: as of ``between``.
+            second: likewise.
+            field: of which field, by all of its conductances together; None is the first one's.
+
+        Raises:
+            InputError: for an unknown name, or if no conductance is of that field.
+        """
+        of = None if field is None else one_of_fields(self.name, self.heats, field)
+        return self._between(first, second, None, of)[1]
+
+    def _between(self, first: str, second: str | None, about: Any, field: int | None = None) -> tuple[Resultant, float]:
         names = (*self._names, *(self._rigid_name(part) for part in self.parts if isinstance(part, RigidContact)))
         none = np.zeros((0, self._config.gdim))
-        return between(self._sums_of_pairs(about), names, first, second, sum_up(self._config.comm, none, none))
+        return between(self._sums_of_pairs(about, field), names, first, second, sum_up(self._config.comm, none, none))
 
     def _rigid_name(self, part: Contact) -> str:
         """What ``touching`` calls the rigid surface of one of the contacts."""
@@ -384,67 +412,3 @@ def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration
     """Contacts with general ones taken apart (collective)."""
     single = [one for one in contacts if isinstance(one, Contact)]
     return [part for one in contacts for part in ([one] if isinstance(one, Contact) else one.make_parts(config, single))]
-
-
-def _is_pair(one: Any) -> bool:
-    """Whether this is a pair of parts, rather than one."""
-    return (
-        isinstance(one, tuple) and len(one) == 2 and not hasattr(one[0], "indices") and not isinstance(one[0], int | np.integer)
-    )
-
-
-def _n_sides(config: Configuration) -> int:
-    """Number of facets of a cell."""
-    return len(forms.reference_topology(compat.cell_name(config.mesh))[config.tdim - 1])
-
-
-def _part(config: Configuration, part: Part, role: str) -> Tag:
-    return as_tag(part, config.mesh, (config.tdim - 1, config.tdim), role)
-
-
-def _surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag]) -> Tag:
-    """The facets that may touch something (collective)."""
-    mesh, facets = config.mesh, config.tdim - 1
-    if surfaces is None:
-        mesh.topology.create_connectivity(facets, config.tdim)
-        surfaces = np.asarray(exterior_facet_indices(mesh.topology))
-        if config.axisymmetric:
-            # the axis is inside the bodies
-            surfaces = np.setdiff1d(surfaces, locate_entities_boundary(mesh, facets, on_axis(mesh)))
-    tag = as_tag(surfaces, mesh, (facets,), "surfaces")
-    left = tag.entities
-    for part in without:
-        if part.dim == config.tdim:
-            mesh.topology.create_connectivity(config.tdim, facets)
-            of_cells = mesh.topology.connectivity(config.tdim, facets)
-            left = np.setdiff1d(left, compat.cell_table(of_cells, _n_sides(config))[part.entities])
-        else:
-            left = np.setdiff1d(left, part.entities)
-    if reduced(config.comm, len(left)) == 0:
-        raise SurfaceError("general contact: exclude leaves no facet that may touch: leave some out of exclude")
-    return Tag("all surfaces", 0, facets, mesh, left.astype(np.int32))
-
-
-def _with_border(skin: Skin, sets: Apart) -> Apart:
-    """Two sets of facets with those beside them, which have a node in common (collective)."""
-    config = skin.config
-
-    def more(nodes: Bools) -> Bools:
-        there = config.ask_owners(skin.nodes.ravel(), nodes[: config.n_owned, None].astype(float))
-        return np.asarray((there.reshape(skin.nodes.shape) > 0).any(axis=1))
-
-    one, _, other, _ = sets
-    return one, more(one), other, more(other)
-
-
-def _where(skin: Skin, part: Part, role: str) -> tuple[Bools, Bools]:
-    """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part (collective)."""
-    config = skin.config
-    tag = _part(config, part, role)
-    nodes = np.zeros(config.n_local, bool)
-    nodes[surface_nodes(config, tag)] = True
-    if tag.dim == config.tdim:
-        return nodes, np.isin(skin.cells, tag.entities)
-    cells, sides = forms.cells_of_facets(config.mesh, tag.entities)
-    n_sides = _n_sides(config)
-    return nodes, np.isin(skin.cells * n_sides + skin.sides, cells * n_sides + sides)

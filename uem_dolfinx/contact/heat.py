@@ -11,7 +11,8 @@ closed: one unknown of each contactor that touches is eliminated, and the heat i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from mpi4py import MPI
@@ -133,12 +134,13 @@ class Heat:
         pair: the interface.
         law: what conducts.
         contact: which tells areas and pressures.
+        column: of ``PairState.heat``, of a perfect conductance.
 
     Raises:
         InputError, SpaceError: if there is no such field, or if the target's temperature is not known, or given twice.
     """
 
-    def __init__(self, pair: Pair, law: Conductance, contact: Declared):
+    def __init__(self, pair: Pair, law: Conductance, contact: Declared, column: int = 0):
         words, config = f"contact '{pair.name}': heat", pair.config
         if not isinstance(config, ConfigurationAmongFields):
             raise InputError(
@@ -153,7 +155,7 @@ class Heat:
                 f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
             )
         self.law, self.field, self._pair = law, nodal_field(config, law.field, words), pair
-        self._contact = contact
+        self._contact, self._column = contact, column
         if law.perfect and self.field.weights.shape[1] > 1:
             raise SpaceError(
                 f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
@@ -267,7 +269,7 @@ class Heat:
         """That goes from the contactors to the target ``(n,)`` (collective)."""
         if self.law.perfect:
             assert self._pair.trial.heat is not None
-            return self._pair.trial.heat
+            return self._pair.trial.heat[:, self._column]
         return np.asarray(self.conductances() * self.jump() * self.passage.areas)
 
     def flux(self) -> Array:
@@ -365,6 +367,18 @@ class Heat:
         vector = np.zeros((len(row), g))
         vector[np.arange(len(row)), number % g] = weight
         return Terms(row, number // g, vector)
+
+
+def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list[Heat]:
+    """What conductances let through an interface, which is given room for the powers of those that are perfect (collective).
+
+    Raises:
+        InputError, SpaceError: as ``Heat``.
+    """
+    columns = np.cumsum([law.perfect for law in laws])
+    if columns[-1]:
+        pair.trial = pair.committed = replace(pair.committed, heat=np.zeros((len(pair.nodes), columns[-1])))
+    return [Heat(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
 
 
 class Terms(NamedTuple):

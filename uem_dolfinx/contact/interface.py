@@ -59,7 +59,7 @@ class Interface(Told):
         barred: contactors that came back into the target from past its end with a blow; they are left out until they are in front of it
             again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
-        heat: what passes through; None without.
+        heats: what passes through, one of every conductance.
     """
 
     kinematics: Kinematics
@@ -82,7 +82,7 @@ class Interface(Told):
         state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
-        self.heat: Heat | None = None
+        self.heats: list[Heat] = []
         none: Bools = np.zeros(n, dtype=bool)
         self.redundant = self.reserved = self.barred = self._redundant = self._reserved = none
         self.initial_overlap, self.mutual = 0.0, False

@@ -59,7 +59,7 @@ def _kind(contact: Contact) -> Hashable:
 
     pair = contact.pair
     nodal = type(contact) is Contact and type(pair.discretisation) is NodeToSurface and type(pair.target) is MeshTarget
-    if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heat is not None:
+    if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None

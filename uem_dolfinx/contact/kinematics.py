@@ -38,7 +38,7 @@ class Traction(NamedTuple):
         force: on the contactor ``(n, gdim)``.
         tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
         bond: multipliers of tied contactors' equations ``(n, gdim)``; None where nothing is ever tied.
-        heat: power that goes from contactors to the target without a jump of temperatures ``(n,)``; None where none ever does.
+        heat: power that goes from contactors to the target without a jump of temperatures, as of ``PairState``; None where none ever does.
     """
 
     lam: Array

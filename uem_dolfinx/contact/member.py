@@ -43,7 +43,7 @@ class Member(Interface):
         self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.sliding, self.max_penetration, self.thickness = own.name, own.sliding, own.max_penetration, own.thickness
-        self.tie, self.heat, self.initial_overlap = None, None, own.initial_overlap
+        self.tie, self.heats, self.initial_overlap = None, [], own.initial_overlap
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
 
     @property

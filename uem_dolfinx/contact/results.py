@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -16,11 +16,15 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
 from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.laws.conductance import one_of_fields
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import Areas
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.laws.conductance import Conductance
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,7 @@ class ContactResults:
         contactor: facets whose nodes are the contactors, or points.
         coupling: word for the discretisation, or a class of the user's.
         measure: what pressures and tractions are forces per area of: ``"reference"`` or ``"current"``.
+        heats: conductances.
         config: configuration of the displacement, once the contact belongs to a problem.
         taken: whether it does.
     """
@@ -103,6 +108,7 @@ class ContactResults:
     contactor: Part
     coupling: Any
     measure: str
+    heats: tuple[Conductance, ...]
     config: Configuration
     taken: bool
     _pair: Interface | None
@@ -204,11 +210,13 @@ class ContactResults:
         facets on both sides of a sharp edge its integral over those that face the target is this sum. It is zero of points.
         """
         from uem_dolfinx.contact.densities import density
+        from uem_dolfinx.contact.duals import basis_of
 
-        areas = self.areas_facing(self.nodes, self.pair.projection.normal, False)
         f = self._field("pressure_to_integrate", 0.0)
         if self.contactor.dim > 0:
-            f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, self.pressing()[0], areas)
+            normal = None if self.coupling == "mortar" else self.pair.projection.normal
+            areas = self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T)
+            f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, self.pair.pressing()[0], areas)
             f.x.scatter_forward()
         return f
 
@@ -274,14 +282,37 @@ class ContactResults:
     def heat_flux(self) -> fem.Function:
         """Power per area that goes from the contactor to the target, as a scalar field on the contactor; 0 without ``heat`` (collective).
 
-        The heat that friction makes where surfaces meet is not in it.
+        The heat that friction makes where surfaces meet is not in it. Of several conductances it is that of the first one's field.
         """
-        return self._field("heat_flux", 0.0 if self.pair.heat is None else self.pair.heat.flux())
+        return self.flux_of_part(self.pair.heats[0].law.field) if self.pair.heats else self._field("heat_flux", 0.0)
+
+    def heat_flux_of(self, field: int) -> fem.Function:
+        """The same of a field, by all of its conductances together, as of an electric current (collective).
+
+        Args:
+            field: number of the part of the mixed space.
+
+        Raises:
+            InputError: if no conductance is of that field.
+        """
+        return self.flux_of_part(one_of_fields(self.name, self.heats, field))
+
+    def heat_power_of(self, field: int) -> float:
+        """Power that goes from the contactor to the target of a field, as of :meth:`heat_flux_of` (collective)."""
+        field = one_of_fields(self.name, self.heats, field)
+        power = sum(float(heat.power().sum()) for heat in self.pair.heats if heat.law.field == field)
+        return float(reduced(self.config.comm, power))
+
+    def flux_of_part(self, field: int) -> fem.Function:
+        """Flux of a field, zero where none passes (collective)."""
+        fluxes = [heat.flux() for heat in self.pair.heats if heat.law.field == field]
+        first = not self.pair.heats or self.pair.heats[0].law.field == field
+        return self._field("heat_flux" if first else f"heat_flux_of_field_{field}", sum(fluxes, np.zeros(len(self.nodes))))
 
     @property
     def heat_power(self) -> float:
         """Power that goes from the contactor to the target, the heat of friction aside; 0 without ``heat`` (collective)."""
-        return float(reduced(self.config.comm, 0.0 if self.pair.heat is None else float(self.pair.heat.power().sum())))
+        return self.heat_power_of(self.pair.heats[0].law.field) if self.pair.heats else 0.0
 
     def opposite(self, f: fem.Function) -> fem.Function:
         """A field of the target at the contactors: what each faces there, as a scalar field on the contactor (collective).
@@ -307,11 +338,13 @@ class ContactResults:
         return self._field("opposite", at.means(at.theirs, values.x.array[: self.config.n_owned]))
 
     def heat_balance(self) -> float:
-        """Heat that passes through the contact, summed over both bodies, over the sum of its nodal sizes (collective)."""
-        heat = self.pair.heat
-        passing = np.zeros(0) if heat is None else heat.nodal()[0]
-        total, size = reduced(self.config.comm, np.array([passing.sum(), np.abs(passing).sum()]))
-        return float(abs(total) / size) if size > 0 else 0.0
+        """Heat that passes through the contact, summed over both bodies, over the sum of its nodal sizes (collective).
+
+        Of several conductances the largest.
+        """
+        passing = [heat.nodal()[0] for heat in self.pair.heats]
+        sums = reduced(self.config.comm, np.array([[part.sum(), np.abs(part).sum()] for part in passing]).reshape(-1, 2))
+        return max((float(abs(total) / size) for total, size in sums if size > 0), default=0.0)
 
     @property
     def force(self) -> fem.Function:

@@ -44,7 +44,7 @@ def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **o
             "temperature, has ties of two meshes or linear equations: give Contact(..., tied=True) with facets of a mesh as its target"
         )
     for contact in contacts:
-        if contact.heat is not None:
+        if contact.heats:
             raise InputError(
                 f"contact '{contact.name}': heat goes through a tie of temperatures without resistance: leave it out"
             )

@@ -73,7 +73,7 @@ def sides_of(pair: Placed) -> Sides:
     )
 
 
-def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: str, pair: Any, heat: Any) -> Array:
+def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: str, pair: Any, heats: Any) -> Array:
     """Mean of the temperatures of contactors and of what they face ``(n,)`` (collective).
 
     Args:
@@ -82,7 +82,7 @@ def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: s
         field: number of the part that is the temperature.
         name: of the contact.
         pair: interface; until its contactors have been placed, or for None, their own temperatures count.
-        heat: a ``Conductance`` that tells a rigid target's temperature, or None.
+        heats: conductances, of which one of the field may tell a rigid target's temperature.
 
     Raises:
         InputError, SpaceError: if there is no such temperature.
@@ -100,6 +100,5 @@ def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: s
     both = at.own + at.theirs
     # nothing is opposite to rigid surfaces' contactors, and to those of many bodies that are near none
     mean = at.means(both, T) / at.sum(both)
-    if heat is None or heat.temperature is None:
-        return np.asarray(mean)
-    return np.asarray(0.5 * (mean + value(heat.temperature)))
+    known = [value(one.temperature) for one in heats if one.field == field and one.temperature is not None]
+    return np.asarray(0.5 * (mean + known[0]) if known else mean)

@@ -136,7 +136,8 @@ class PairState:
             partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
         bond: multipliers of the equations of tied contactors ``(n, gdim)``; None where nothing is ever tied.
-        heat: power that goes from contactors to the target without a jump of temperatures ``(n,)``; None where none ever does.
+        heat: power that goes from contactors to the target without a jump of temperatures, a column for every field that is united
+            ``(n, n_perfect)``; None where none ever does.
     """
 
     active: Bools
@@ -184,6 +185,8 @@ class PairState:
         for name in ("bond", "heat"):
             if getattr(self, name) is None:
                 del kept[name]
+        if self.heat is not None and self.heat.shape[1] == 1:
+            kept["heat"] = self.heat[:, 0]
         if self.friction is not None:
             kept |= {OF_FRICTION + f.name: getattr(self.friction, f.name) for f in fields(FrictionState)}
         return {name: _renumbered(name, array, keys_of) for name, array in kept.items()}
@@ -203,6 +206,8 @@ class PairState:
             if of_friction
             else None
         )
+        if "heat" in arrays and arrays["heat"].ndim == 1:
+            arrays["heat"] = arrays["heat"][:, None]
         own = [f.name for f in fields(cls) if f.name != "friction" and f.name in arrays]
         return cls(**{name: arrays[name] for name in own}, friction=friction)
 

@@ -38,7 +38,7 @@ class Pair(NamedTuple):
         touch: names, number of contactors and force.
         moment: on the first.
         normal: sum of the forces across the surfaces.
-        heat: power from the first to the second, the heat of friction aside.
+        heat: power from the first to the second of one field, the heat of friction aside.
     """
 
     touch: Touch
@@ -47,7 +47,9 @@ class Pair(NamedTuple):
     heat: float
 
 
-def sums_of_pairs(parts: Sequence[Contact], skin: Skin, names: Sequence[str], rigid: Sequence[str], centre: Array) -> list[Pair]:
+def sums_of_pairs(
+    parts: Sequence[Contact], skin: Skin, names: Sequence[str], rigid: Sequence[str], centre: Array, field: int | None = None
+) -> list[Pair]:
     """Sums over the contactors of each pair of bodies, sorted by their numbers in the mesh's input (collective).
 
     Args:
@@ -56,6 +58,7 @@ def sums_of_pairs(parts: Sequence[Contact], skin: Skin, names: Sequence[str], ri
         names: of the bodies ``(n_bodies,)``.
         rigid: names of the rigid surfaces, of every part.
         centre: point that moments are taken about ``(gdim,)``.
+        field: whose power is summed up; None for no power.
     """
     config, n = skin.config, skin.n_bodies + len(parts)
     g = config.gdim
@@ -64,7 +67,7 @@ def sums_of_pairs(parts: Sequence[Contact], skin: Skin, names: Sequence[str], ri
         pair = part.pair
         # rows of mortar have the contactors around their own in them, active or not
         active = pair.trial.active
-        heat = np.zeros(len(active)) if pair.heat is None else pair.heat.power()
+        heat = sum((one.power() for one in pair.heats if one.law.field == field), np.zeros(len(active)))
         i = np.flatnonzero(active | pair.trial.force.any(axis=1) | (heat != 0))
         across = pair.pressing()[0]
         second = np.full(len(i), skin.n_bodies + k)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +18,7 @@ from uem_dolfinx.errors import OrientationError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, facets_of, pairs_of_equals
-from uem_dolfinx.geometry.shapes import integrals
+from uem_dolfinx.geometry.shapes import FacetShape, integrals
 from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.parallel import Exchange, agree, reduced
 
@@ -128,16 +129,43 @@ class Areas:
         areas = np.array((self.current if current else self.reference)[nodes])
         if self._tag.dim == 0 or self._sharp is None:
             return areas
+        facets = self._sharp[0]
+        x = facets.x if current else self._config.X[facets.dofs]
+        return self._towards(areas, integrals(facets.shape, x, self._config.axisymmetric), nodes, normal, False)
+
+    def of_functions(self, nodes: Indices, normal: Array | None, coefficients: Callable[[FacetShape], Array]) -> Array:
+        """Integrals of other functions over the reference surface, at sharp edges over what faces the target ``(n,)`` (collective).
+
+        Args:
+            nodes: as of ``facing``.
+            normal: likewise; None where the whole surface counts.
+            coefficients: of these functions, from nodal values, of a shape of facets ``(nn, nn)``.
+        """
+        config, facets = self._config, self._made or facets_of(self._config, self._tag, "contactor")
+        parts = integrals(facets.shape, config.X[facets.dofs], config.axisymmetric) @ np.linalg.inv(coefficients(facets.shape))
+        areas = config.to_owners(facets.dofs.ravel(), parts.ravel())[nodes]
+        return areas if normal is None or self._sharp is None else self._towards(areas, parts, nodes, normal, True)
+
+    def _towards(self, areas: Array, parts: Array, nodes: Indices, normal: Array, entire: bool) -> Array:
+        """Areas ``(n,)`` that are, at sharp edges, those of facets ``(m, nn)`` as far as they face what is touched (collective).
+
+        Where they are to be ``entire``, facets count in full that face it at least half as much as the one that does most, others not.
+        """
+        assert self._sharp is not None
         config, (facets, facet, node, exchange) = self._config, self._sharp
-        x = facets.x if current else config.X[facets.dofs]
-        integral = integrals(facets.shape, x, config.axisymmetric)[facet, node]
+        integral = parts[facet, node]
         there, area, facing = exchange.send(facets.nodes[facet, node], integral, facets.normals()[facet, node])
         row = np.full(config.n_owned, -1)
         row[nodes] = np.arange(len(nodes))
         row = row[there - config.first]
         row, area, facing = row[row >= 0], area[row >= 0], facing[row >= 0]
         areas[row] = 0.0
-        np.add.at(areas, row, area * np.maximum(-np.einsum("kg,kg->k", facing, normal[row]), 0.0))
+        part = np.maximum(-np.einsum("kg,kg->k", facing, normal[row]), 0.0)
+        if entire:
+            most = np.zeros(len(nodes))
+            np.maximum.at(most, row, part)
+            part = (part > 0) & (2 * part >= most[row])
+        np.add.at(areas, row, area * part)
         return areas
 
 

@@ -280,8 +280,8 @@ class ResultsWriter(Closing, given.Sealed):
         for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
             found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
             found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
-            if contact.heat is not None:
-                found[f"heat_flux{suffix}"] = contact.heat_flux
+            for k, field in enumerate(dict.fromkeys(law.field for law in contact.heats)):
+                found[f"heat_flux{f'_of_field_{field}' if k else ''}{suffix}"] = contact.heat_flux_of(field)
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:

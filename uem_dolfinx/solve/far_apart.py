@@ -180,4 +180,4 @@ class FarApart:
 def _may_be_far(pair: Interface) -> bool:
     measured = isinstance(pair.target, MeshTarget) or getattr(pair.target, "measures", False)
     nodal = getattr(pair.discretisation, "can_be_far", False) and pair.sliding == "finite"
-    return nodal and measured and pair.tie is None and pair.heat is None
+    return nodal and measured and pair.tie is None and not pair.heats

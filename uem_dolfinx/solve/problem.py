@@ -15,6 +15,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general import GeneralContact, parts_of
 from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.joining import join_alike
+from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
 from uem_dolfinx.contact.watched import Watch
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
@@ -155,10 +156,8 @@ class UnitedProblem(given.Sealed):
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
             given.kind("method", method, callable(method), "what makes a united system of bodies and contacts, as BodySystem")
-            if method is not BodySystem and any(getattr(contact, "heat", None) is not None for contact in contacts):
-                raise InputError(
-                    "heat passes through contacts that are eliminated alone: leave method out, or heat out of the contacts"
-                )
+            if method is not BodySystem and any(contact.heats for contact in contacts):
+                raise InputError("heat passes through eliminated contacts alone: leave method out, or heat out of contacts")
             consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(
@@ -204,6 +203,7 @@ class UnitedProblem(given.Sealed):
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         for contact in self.contacts:
             contact.attach(self.config, free, **clock)
+        refuse_shared_pressures(self.config, self.contacts)
         if method is BodySystem:
             join_alike(self.contacts)
         if dynamics is not None:

@@ -27,7 +27,7 @@ from uem_dolfinx.solve.tangent import contact_curvature, together
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
-    from uem_dolfinx.contact.heat import HeatEquations
+    from uem_dolfinx.contact.heat import Heat, HeatEquations
 
 
 class OverConstraints:
@@ -78,7 +78,7 @@ class OverConstraints:
                 )
         self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
         self.contestable = self.shared or any(pair.discretisation.prescribed for pair in whole)
-        if any(_unites_heat(pair) for pair in pairs):
+        if any(_united_fields(pair) for pair in pairs):
             # temperatures of both sides stand in the same rows, and may be prescribed
             self.stacked = self.contestable = True
         self._n_linear = 0
@@ -139,7 +139,8 @@ class Rows:
         independent: how conflicts were resolved; None if there could be none.
         test: Q.
         frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
-        heat: equations of temperatures by number of their pair, which come after those of ``equations``, before those of users.
+        heat: equations of temperatures by number of their pair, each of one field, which come after those of ``equations``, before those
+            of users.
         rigid: couplings whose equations come last; None without any.
         given: what Q was made of before it was rewritten for these; None without any.
     """
@@ -149,7 +150,7 @@ class Rows:
     independent: IndependentEquations | None
     test: Restriction
     frictionless: Restriction
-    heat: dict[int, HeatEquations]
+    heat: dict[int, list[HeatEquations]]
     rigid: RigidNodes | None = None
     given: UnitingEquations | None = None
 
@@ -174,8 +175,7 @@ class BodyState(IterationState):
         if test.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
             return self
         for pair, own in zip(pairs, self.rows.equations):
-            if pair.heat is not None and callable(pair.heat.law.h):
-                parts.append(pair.heat.by_forces(own, test.lift[first : first + len(own)]))
+            parts += [heat.by_forces(own, test.lift[first : first + len(own)]) for heat in pair.heats if callable(heat.law.h)]
             first += len(own)
         if not parts:
             return self
@@ -209,9 +209,10 @@ def make_rows(
     for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    heat = {i: pair.heat.equations() for i, pair in enumerate(pairs) if pair.heat is not None and _unites_heat(pair)}
+    united = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
+    heat = {i: [one.equations() for one in fields] for i, fields in united if fields}
     users = [] if linear is None else [linear.at_present()]
-    more = [*(e.rows for e in heat.values()), *users]
+    more = [*(e.rows for fields in heat.values() for e in fields), *users]
     frictionless = trial = UnitingEquations.join([*(e.frictionless for e in equations), *more], g)
     if any(e.trial is not e.frictionless for e in equations):
         trial = UnitingEquations.join([*(e.trial for e in equations), *more], g)
@@ -262,9 +263,9 @@ def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int
     return UnitingEquations.join([equations, *more], block) if more else equations
 
 
-def _unites_heat(pair: Interface) -> bool:
-    """Whether temperatures are the same where the pair's surfaces touch."""
-    return pair.heat is not None and pair.heat.law.perfect
+def _united_fields(pair: Interface) -> list[Heat]:
+    """Heat of those fields that are the same on both sides where the pair's surfaces touch."""
+    return [heat for heat in pair.heats if heat.law.perfect]
 
 
 def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array | None) -> tuple[list[Traction], Array]:
@@ -287,11 +288,13 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         pair.set_redundant(own, redundant[part])
         found.append(pair.forces(own, lam[part], du))
         start = part.stop
-    for i, equations in rows.heat.items():
-        heat, part = pairs[i].heat, slice(start, start + len(equations.which))
-        assert heat is not None
-        found[i] = found[i]._replace(heat=heat.read(equations, lam[part], redundant[part]))
-        start = part.stop
+    for i, fields in rows.heat.items():
+        powers = []
+        for heat, equations in zip(_united_fields(pairs[i]), fields):
+            part = slice(start, start + len(equations.which))
+            powers.append(heat.read(equations, lam[part], redundant[part]))
+            start = part.stop
+        found[i] = found[i]._replace(heat=np.column_stack(powers))
     if rows.rigid is not None and rows.given is not None:
         last = rows.rigid.beside(last, rows.given.select(np.arange(len(rows.given)) < len(lam)), lam)
     return found, np.append(lam[start:], last)

@@ -107,8 +107,9 @@ class Settings:
                 words[f"{name}, friction"] = "follows the load"
             else:
                 values[f"{name}, friction"] = _extent(contact.friction_values())
-            for what, value in ({} if contact.heat is None else contact.heat.parameters).items():
-                words[f"{name}, {what} of heat"] = described(value)
+            for k, law in enumerate(contact.heats, 1):
+                for what, value in law.parameters.items():
+                    words[f"{name}, {what} of heat{f' {k}' if k > 1 else ''}"] = described(value)
             if contact.pair.friction is not None and contact.pair.friction.wear is not None:
                 values[f"{name}, wear"] = _extent(contact.pair.friction.wear.k)
         if (d := self._dynamics) is not None:

@@ -96,7 +96,7 @@ def _check(problem: UnitedProblem, step: Step, words: str) -> None:
     if step.contacts or step.bcs is not None:
         if not isinstance(problem.system, BodySystem):
             raise InputError(f"{words}: conditions and contacts change where contact is eliminated alone: leave method out")
-        if any(contact.heat is not None and contact.heat.perfect for contact in problem.contacts):
+        if any(law.perfect for contact in problem.contacts for law in contact.heats):
             raise InputError(f"{words}: conditions and contacts stay where temperatures are united: give a finite conductance")
 
 

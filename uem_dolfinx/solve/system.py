@@ -97,7 +97,7 @@ class BodySystem:
         from uem_dolfinx.solve.far_apart import FarApart
 
         self.pairs, self.linear, self._here = list(pairs), linear, None
-        self._heats = [pair.heat for pair in self.pairs if pair.heat is not None]
+        self._heats = [heat for pair in self.pairs for heat in pair.heats]
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
         self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)

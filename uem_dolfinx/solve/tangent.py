@@ -212,7 +212,7 @@ def slip_terms(
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
-    heat = [part for pair in pairs if pair.heat is not None for part in pair.heat.tangent()]
+    heat = [part for pair in pairs for one in pair.heats for part in one.tangent()]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
     masses = [] if linear is None else linear.added_mass()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, TypeAlias
 
@@ -87,6 +87,35 @@ class Conductance(given.Sealed):
                     f"contact '{name}': heat, h(p, g) has shape {h.shape}: expected {len(p)} numbers, {given.NOT_NEGATIVE.words}"
                 )
         return np.broadcast_to(h, p.shape)
+
+
+def conductances_of(heat: Any) -> tuple[Conductance, ...]:
+    """Conductances of a contact, handed as one, as a list, or as None for none.
+
+    Raises:
+        InputTypeError: for anything else.
+        InputError: for two of one field that unite its temperatures, or that both take heat of friction.
+    """
+    some = () if heat is None else (heat,) if hasattr(heat, "conductances") else heat
+    fits = isinstance(some, list | tuple) and all(hasattr(one, "conductances") for one in some)
+    given.kind("heat", heat, fits, "a Conductance, a list of them, or None")
+    for words, wrong in (
+        ("h = inf", [one.field for one in some if one.perfect]),
+        ("a friction_share", [one.field for one in some if one.friction_share is not None]),
+    ):
+        twice = sorted({field for field in wrong if wrong.count(field) > 1})
+        if twice:
+            raise InputError(f"heat: {wrong.count(twice[0])} conductances of field {twice[0]} have {words}: expected one at most")
+    return tuple(some)
+
+
+def one_of_fields(name: str, laws: Sequence[Conductance], field: Any) -> int:
+    """A field of a contact's conductances; InputError for any other."""
+    fields = sorted({law.field for law in laws})
+    if field not in fields:
+        expected = f"one of {fields}" if fields else "a contact with heat=..."
+        raise InputError(f"contact '{name}': no conductance is of field {given.shown(field)}: expected {expected}")
+    return int(field)
 
 
 def value(number: float | fem.Constant) -> float:

@@ -1,0 +1,71 @@
+"""Contacts that unite the same surfaces: forces are shared among them, and no law of the pressure of either has the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools, Indices
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.tags import Tag
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.contact import Contact
+
+
+def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) -> None:
+    """Refuse contacts on the same facets of both sides of which one has a law of the pressure (collective).
+
+    Friction and wear are such laws where the same facets are contactors of both; a conductance that is a function of the pressure is one
+    also where the sides are swapped.
+
+    Args:
+        config: of the displacement.
+        contacts: that belong to it.
+
+    Raises:
+        ConflictError: naming two such contacts.
+    """
+    facets = config.tdim - 1
+    single = [one for one in contacts if not one.of_all_surfaces and one.tied is not True and one.contactor.dim == facets]
+    conducts = np.array([any(callable(law.h) for law in one.heats) for one in single], dtype=bool)
+    rubs = np.array([one.pair.friction is not None for one in single], dtype=bool)
+    if len(single) < 2 or not (conducts | rubs).any():
+        return
+    own, theirs = _tables([one.contactor for one in single], [one.target for one in single])
+    common = np.stack([(one @ other.T).toarray() > 0 for one, other in ((own, own), (theirs, theirs), (own, theirs))])
+    config.comm.Allreduce(MPI.IN_PLACE, common, op=MPI.LOR)
+    contactors, targets, swapped = common
+    rigid = np.array([id(one.target) for one in single])
+    targets |= rigid[:, None] == rigid
+    law = conducts | rubs
+    np.fill_diagonal(contactors, False)
+    twice: Bools = contactors & targets & (law[:, None] | law)
+    both_ways: Bools = swapped & swapped.T & (conducts[:, None] | conducts)
+    for i, j in np.argwhere(np.triu(twice | both_ways)):
+        one, other = single[i], single[j]
+        which = "surfaces" if twice[i, j] else "surfaces with the sides swapped"
+        remedy = "declare one contact with all friction, wear and conductances, heat=[...]"
+        raise ConflictError(
+            f"contact '{one.name}' and contact '{other.name}' have the same {which}, and share the pressure: friction, wear or h(p, g) "
+            f"of a part of it would be wrong: {remedy if twice[i, j] else 'keep one of the two'}"
+        )
+
+
+def _tables(*sides: Sequence[object]) -> list[Any]:
+    """Which of this rank's facets each tag of a side has; none of rigid surfaces."""
+    from scipy.sparse import csr_matrix
+
+    none: Indices = np.zeros(0, np.int32)
+    lists = [[tag.entities if isinstance(tag, Tag) else none for tag in tags] for tags in sides]
+    n = 1 + max(int(entities.max(initial=0)) for side in lists for entities in side)
+    found = []
+    for side in lists:
+        every, starts = np.concatenate(side), np.cumsum([0, *(len(entities) for entities in side)])
+        found.append(csr_matrix((np.ones(len(every)), every, starts), shape=(len(side), n)))
+    return found
