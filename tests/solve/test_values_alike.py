@@ -71,3 +71,46 @@ def test_values_of_one_rank(what):
 def test_values_of_all_ranks(what):
     """The same on all is what was meant."""
     KINDS[what](Square(), 1.0)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-9, 1e3])
+def test_functions_whose_ghosts_differ(size):
+    """Values in Functions are those of the nodes' owners, whatever other ranks have at their copies; so are ramps, steps and gradients."""
+    s = Square()
+    s.mesh.geometry.x[:] *= size
+    ends = []
+    for spoilt in (False, True):
+        s.u.x.array[:] = 0.0
+        g = fem.Function(s.V)
+        g.x.array[:] = -0.01 * size
+        own = s.V.dofmap.index_map.size_local * 2
+        if spoilt:
+            g.x.array[own:] = 7.0 * size
+        E = fem.Constant(s.mesh, 1.0)
+        F = uem.LinearElastic(E, 0.3, kind="plane_strain").residual(s.u, s.v) * ufl.dx
+        bcs = [*s.hold, fem.dirichletbc(g, fem.locate_dofs_topological(s.V, 1, s.top))]
+        problem = uem.UnitedProblem(F, s.u, bcs=bcs)
+        steps = [(step.factor, step.newton_iterations) for step in uem.load_steps(problem, 2)]
+        J = ufl.inner(s.u, s.u) * ufl.dx
+        (by,) = uem.gradient(problem, J, g)
+        sums = [COMM.allreduce(float(f.x.array[:own].sum())) for f in (s.u, by)]
+        ends.append([np.array(s.u.x.array), np.array(by.x.array), sums, steps])
+    for one, other in zip(*ends):
+        assert np.array_equal(one, other)
+
+
+def test_conditions_that_their_owner_lacks():
+    """A condition that no rank but one with a copy of its nodes has is refused on all; one that copies lack is taken."""
+    s = Square()
+    n = s.V.dofmap.index_map.size_local
+    top = fem.locate_dofs_topological(s.V, 1, s.top)
+    own = [fem.dirichletbc(np.array([0.0, -0.01]), top[top < n], s.V)]
+    ends = []
+    for more in (own, [fem.dirichletbc(np.array([0.0, -0.01]), top, s.V)]):
+        s.u.x.array[:] = 0.0
+        s.run(bcs=[*s.hold, *more])
+        ends.append(np.array(s.u.x.array))
+    assert np.array_equal(*ends)
+    copies = [fem.dirichletbc(np.array([0.0, -0.01]), np.arange(n, len(s.u.x.array) // 2, dtype=np.int32), s.V)]
+    if COMM.size > 1:
+        refused(uem.InputError, ("a Dirichlet condition holds", "owns the node"), lambda: s.run(bcs=[*s.hold, *copies]))

@@ -222,6 +222,7 @@ def _check_values(problem: UnitedProblem) -> None:
     """Refuse Dirichlet values that change with the load factor (collective)."""
     wanted = np.array(problem.committed)
     compat.set_bc_values(wanted, problem.bodies.bcs)
+    wanted = problem.bodies.of_owners(wanted)
     with agreed(problem.comm):
         if not np.array_equal(wanted, problem.committed):
             at = problem.config.place_of(int(np.flatnonzero(wanted != problem.committed)[0]))

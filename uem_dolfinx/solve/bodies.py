@@ -16,9 +16,9 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import AnyArray, Array, Bools
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import NotFiniteError
+from uem_dolfinx.errors import InputError, NotFiniteError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
@@ -263,14 +263,36 @@ class Bodies:
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
 
     def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
-        """Take these Dirichlet conditions for all, from the next step on."""
+        """Take these Dirichlet conditions for all, from the next step on, as the owners of nodes have them (collective).
+
+        Raises:
+            InputError: for a component that a condition holds on a rank that does not own it, and none on the one that does.
+        """
         self.bcs = list(bcs)
-        self.held: Bools = np.zeros(len(self.u.x.array), dtype=bool)
+        own = np.zeros(len(self.u.x.array), dtype=bool)
         for bc in self.bcs:
-            self.held[compat.bc_dofs(bc)[0]] = True
+            own[compat.bc_dofs(bc)[0]] = True
+        self.held: Bools = self.of_owners(own)
+        lost = np.flatnonzero(own & ~self.held)
+        with agreed(self.comm):
+            if len(lost):
+                raise InputError(
+                    f"a Dirichlet condition holds {self.config.place_of(int(lost[0]))} on rank {self.comm.rank}, but not on the rank that "
+                    "owns the node: expected conditions at the same nodes on all ranks; locate them by uem.dirichlet, or by "
+                    "fem.locate_dofs_topological on all ranks with remote=True"
+                )
         self.free: Bools = ~self.config.of(self.held)
         self.free_rows: Bools = self.config.rows(~self.held[: self._n_owned])
         self.tangent.hold(self.free_rows)
+
+    def of_owners(self, values: AnyArray) -> AnyArray:
+        """Values of all unknowns ``(n,)`` whose ghosts have what their owners have, of the same kind (collective)."""
+        if self.comm.size == 1:
+            return values
+        f = fem.Function(self.u.function_space)
+        f.x.array[:] = values
+        f.x.scatter_forward()
+        return np.array(f.x.array).astype(values.dtype)
 
     @property
     def prescribed(self) -> Array:

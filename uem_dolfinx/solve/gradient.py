@@ -181,6 +181,11 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.heats for contact in problem.contacts):
             raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
+        if chords := [contact.name for contact in problem.contacts if contact.chords]:
+            raise InputError(
+                f"contact '{chords[0]}': there is no gradient with chords=True, whose rows are not the derivative of the gaps: expected "
+                "chords=False"
+            )
         if any(contact.tied for contact in problem.contacts):
             raise InputError(
                 "gradients do not support ties, which depend on the tied surfaces: expected contacts that are not tied"
@@ -311,6 +316,11 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
         )
     if m.parameter == "offset" and not keeps_distance(m.contact):
         raise InputError(f"{what} is the offset from a rigid surface: expected a plane, a sphere or a cylinder, or a mesh")
+    if m.parameter in ("place", "turn") and m.contact.adjust:
+        raise InputError(
+            f"{what} is the {m.parameter} of the target of contact '{m.contact.name}', with which gaps that are adjusted change: expected "
+            "a contact with no adjust"
+        )
     if m.contact.sliding != "finite" and m.parameter != "offset":
         raise InputError(
             f"{what} is a {m.parameter}, by which contacts of sliding='{m.contact.sliding}' have no gradient: expected 'finite'"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,8 @@ class History(given.Sealed):
         self.problem = problem
         self._first = problem.progress.steps
         self._records = Records(folder)
+        #: What tells the places of the nodes in each step from others.
+        self._places: list[bytes] = []
         #: What a motion begins with; None in statics.
         self._start: Record | None = None
         #: What steps have led, so that it keeps its id.
@@ -79,6 +82,7 @@ class History(given.Sealed):
                 "the steps of an arc depend on each other by their lengths, of which there are no derivatives: record steps of given load"
             )
         self._records.cut(problem.progress.steps - self._first - 1)
+        self._places[len(self._records) :] = [_places(problem)]
         taken = problem.progress.taken
         self._led += [one for one, *_ in taken.led if all(one is not other for other in self._led)]
         held = uniform(problem, taken.held)
@@ -139,6 +143,7 @@ class History(given.Sealed):
         refuse_without_state(problem, given_forms, self._state())
         refuse_idle_controls(problem, "controls", some, given_forms)
         self._check_controls(some)
+        self._refuse_moved_nodes()
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
         offsets = [pair.discretisation.offset for pair in problem.pairs]
@@ -160,6 +165,17 @@ class History(given.Sealed):
             now.put_back(problem)
             problem.u.x.array[:] = displacement
         return sweep.found
+
+    def _refuse_moved_nodes(self) -> None:
+        """Refuse steps that were taken with nodes at other places than now (collective)."""
+        now = _places(self.problem)
+        with agreed(self.problem.comm):
+            for k, then in enumerate(self._places):
+                if then != now:
+                    raise InputError(
+                        f"the nodes have moved since step {k + 1} of the history, which would be swept over at their present places: "
+                        "expected nodes that stay where they are while steps are recorded, and until there is a gradient"
+                    )
 
     def _check_controls(self, controls: Sequence[AnyControl]) -> None:
         """Refuse controls that steps depend on in a way of which there are no derivatives (collective)."""
@@ -262,6 +278,11 @@ class History(given.Sealed):
             pair.trial = state
         if problem.dynamics is not None and record is not self._start:
             problem.dynamics.begin(record.dt)
+
+
+def _places(problem: UnitedProblem) -> bytes:
+    """What tells the places of this rank's nodes from others."""
+    return blake2b(np.ascontiguousarray(problem.config.mesh.geometry.x).tobytes()).digest()
 
 
 def _friction_of(pair: Any) -> Array | None:

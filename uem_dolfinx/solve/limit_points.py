@@ -70,5 +70,6 @@ class LimitPoint:
         problem = self._problem
         wanted = np.array(problem.committed)
         compat.set_bc_values(wanted, problem.bodies.bcs)
+        wanted = problem.bodies.of_owners(wanted)
         moved = any(a is not b for a, b in zip(self._motions, problem.rigid_motions()))
         return bool(reduced(problem.comm, int(moved or not np.array_equal(wanted, problem.committed))))

@@ -333,7 +333,7 @@ class UnitedProblem(given.Sealed):
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.bodies.bcs)
         check_values(self, wanted)
-        self.bodies.wanted[:] = ramped(self.load, self.bodies.bcs, start, wanted, fraction)
+        self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:
             self.bodies.begin_step()
             if self.linear is not None:

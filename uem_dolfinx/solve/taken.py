@@ -105,7 +105,7 @@ def wanted_by_step(problem: Any) -> Array | None:
     compat.set_bc_values(wanted, problem.bodies.bcs)
     # a step that has been left has no load any more
     load = {one: value for one, value, _ in progress.taken.now().led if isinstance(one, fem.Constant)}
-    return ramped(load, problem.bodies.bcs, begin, wanted, fraction)
+    return np.asarray(problem.bodies.of_owners(ramped(load, problem.bodies.bcs, begin, wanted, fraction)))
 
 
 def uniform(problem: Any, held: Array | float) -> float | None:
