@@ -190,7 +190,7 @@ def test_laws_with_history_that_are_not_told():
         (law.residual(v), [], uem.InputError, ("of a law with history", "materials=[material]")),
         (linear(b.u, 1.0) + law.peeq * v[0] * ufl.dx(degree=2), [], uem.InputError, ("F holds 'peeq'", "materials=[material]")),
         (law.residual(v) + steel(b.u).residual(v), [law], uem.InputError, ("of a law with history",)),
-        (law.residual(v), [law, law], uem.InputError, ("materials[1], a VonMises", "before")),
+        (law.residual(v), [law, law], uem.InputError, ("materials[1], a VonMises", "earlier in the list")),
         (linear(b.u, 1.0), [law], uem.InputError, ("F is not made of materials[0]", "material.residual(v)")),
         (twin.residual(v), [twin], uem.SpaceError, ("materials[0], a VonMises", "another displacement")),
         (law.residual(v) + twin.residual(v), [law, twin], uem.SpaceError, ("materials[1]", "another displacement")),
