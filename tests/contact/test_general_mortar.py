@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from body_scenes import Discs, grid, oedometer
+from body_scenes import Discs, grid, oedometer, surface_of
 from dolfinx import fem
 from helpers import M, at, box, clamp, highest, linear, modulus, run, scene, slow
 
@@ -47,6 +47,28 @@ def test_what_it_does_not_go_with():
     for how in ({"self_contact": True}, {"normals": "averaged"}):
         with pytest.raises(uem.InputError, match=f"{next(iter(how))} = .*mortar"):
             uem.GeneralContact(coupling="mortar", **how)
+
+
+@pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
+def test_a_rigid_punch_finer_than_the_block_below(length):
+    """It is the target whatever its mesh, and sinks in a few iterations as deep as one that is the target by hand."""
+
+    def pressed(general):
+        cell = "quadrilateral"
+        parts = [box(cell, [-1, 0], [1, 1], [20, 8]), box(cell, [-0.4, 1], [0.4, 1.5], [16, 3])]
+        s = scene(COMM, cell, parts, pose=lambda x: length * x)
+        u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+        base, top, foot = s.tag("base", 0, at(1, 0.0)), s.tag("top", 0, at(1, 1.0)), s.tag("foot", 1, at(1, 1.0))
+        punch = uem.RigidCoupling(surface_of(s, 1), (0.0, 1.5 * length), force=(0.0, -0.05 * length))
+        contact = uem.GeneralContact(coupling="mortar") if general else uem.Contact(top, foot, coupling="mortar")
+        bcs = clamp(u.function_space, base)
+        problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], couplings=[punch])
+        (step,) = run(problem)
+        return len(step.iterations) - 1, punch.displacement[1] / length
+
+    iterations, depth = pressed(True)
+    assert iterations <= 4 and depth < 0.0
+    assert depth == pytest.approx(pressed(False)[1], rel=1e-7)
 
 
 def test_excluded_parts_do_not_touch():

@@ -155,7 +155,13 @@ def test_a_given_order():
     # one that names two bodies leaves their order as it was, and the first that names a body counts
     both = all_facets(s.mesh)
     assert np.array_equal(skin.order([both, last]), [2, 1, 0])
-    assert len(surface_nodes(skin.config, both)) > 0
+    nodes = surface_nodes(skin.config, both)
+    assert highest(COMM, len(nodes)) > 0
+    # rigid bodies come last, unless they are named; one that is rigid in part does not
+    rigid = skin.body_of_node[: skin.config.n_owned] == 2
+    assert np.array_equal(skin.order([], rigid), [1, 0, 2])
+    assert np.array_equal(skin.order([both], rigid), [2, 1, 0])
+    assert np.array_equal(skin.order([], rigid & (skin.config.X[: skin.config.n_owned, 0] > 3.5)), [2, 1, 0])
 
 
 # -- cones -----------------------------------------------------------------------------------------------------------------

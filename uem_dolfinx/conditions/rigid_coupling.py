@@ -11,7 +11,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.algebra.rings import DEPENDENT
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.conditions.equation import Value, checked_value, values_of
 from uem_dolfinx.conditions.places import is_point, nodes_at
 from uem_dolfinx.conditions.rigid_set import RigidSet, moments
@@ -199,6 +199,11 @@ class RigidCoupling(given.Sealed):
         at = self.nodes.placement(u)
         shift = at.displacement(self.point[None])[0]
         return np.append(shift, at.turn if at.small is not None else nearest_turn(at.turn, self.turns if near is None else near))
+
+    def mark(self, config: Configuration, rigid: Bools) -> None:
+        """Mark the owned nodes ``(n_owned,)`` of a problem that move as one rigid body (collective)."""
+        if not self.distribute:
+            rigid[nodes_at(config, self.where, f"the part of the RigidCoupling of '{self.name}'")] = True
 
     # -- what users read ---------------------------------------------------------------------------------------------------
 

@@ -72,13 +72,20 @@ class Skin(TargetFacets):
         x, ends = self.config.X[self.dofs], np.array(self.shape.topology[1])
         return np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
 
-    def order(self, first: list[Tag]) -> Ints:
+    def order(self, first: list[Tag], rigid: Bools | None = None) -> Ints:
         """Place of each body in the order in which they follow each other, each those behind it ``(n_bodies,)`` (collective).
 
         Args:
             first: parts of bodies that come first, in this order; then the finer ones.
+            rigid: nodes whose surface moves as a rigid body ``(n_owned,)``; None for none. Bodies whose whole surface does come last: as
+                contactors, more than three of their nodes in the plane, six in space, would depend on each other.
         """
         named = np.full(self.n_bodies, len(first))
+        if rigid is not None:
+            nodes = surface_nodes(self.config, self.tag)
+            gives_way = np.zeros(self.n_bodies, bool)
+            gives_way[self.body_of_node[nodes[~rigid[nodes]]]] = True
+            named[~reduced(self.config.comm, gives_way, op=MPI.LOR)] += 1
         for k, tag in reversed(list(enumerate(first))):
             named[self.bodies_of(tag)] = k
         with np.errstate(divide="ignore"):

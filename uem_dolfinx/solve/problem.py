@@ -172,7 +172,7 @@ class UnitedProblem(given.Sealed):
         self.declared: list[Contact | GeneralContact] = contacts
         #: What else was declared: ties of a scalar field, linear equations, couplings, and loads and springs at points.
         self.ties, self.equations, self.couplings, self.points = ties, equations, couplings, points
-        self.contacts: list[Contact] = parts_of(contacts, self.config)
+        self.contacts: list[Contact] = parts_of(contacts, self.config, couplings)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             check_residual(damping, u, "the damping form")
