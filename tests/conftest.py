@@ -33,8 +33,8 @@ pytest.register_assert_rewrite(
 from helpers import complementary, coulomb, highest
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.norms import first
-from uem_dolfinx.solve.system import BodySystem
+from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.united.system import BodySystem
 
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # where two workers need a form at once the second waits for the compiler of the first, and longer than DOLFINx's 10 s; on meshes of

@@ -22,8 +22,8 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.solve.tangent import curvature_of
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.solve.bodies.tangent import curvature_of
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 #: Oedometric modulus over Young's modulus.

@@ -67,7 +67,7 @@ except ImportError as _error:
 from uem_dolfinx.algebra.options import multigrid_options, saddle_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.tresca import Tresca
 from uem_dolfinx.contact.results import Balance, Resultant
@@ -110,10 +110,10 @@ from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.load_step import LoadStep
-from uem_dolfinx.solve.load_steps import load_steps
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.time_steps import TimeStep, time_steps
+from uem_dolfinx.solve.steps.load_step import LoadStep
+from uem_dolfinx.solve.steps.load_steps import load_steps
+from uem_dolfinx.solve.steps.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
@@ -122,10 +122,12 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
-    from uem_dolfinx.contact.parameters import ContactParameter
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
     from uem_dolfinx.geometry.mesh_files import read_mesh
+    from uem_dolfinx.gradients.gradient import gradient, tangent, taylor_test
+    from uem_dolfinx.gradients.history import History, recording
+    from uem_dolfinx.gradients.parameters import ContactParameter
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
     from uem_dolfinx.materials.von_mises import VonMises
@@ -136,10 +138,8 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
     from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
-    from uem_dolfinx.solve.gradient import gradient, tangent, taylor_test
-    from uem_dolfinx.solve.history import History, recording
     from uem_dolfinx.solve.modes import Vibrations, modes
-    from uem_dolfinx.solve.step import Step
+    from uem_dolfinx.solve.steps.step import Step
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
@@ -156,10 +156,10 @@ _LATER = {
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",
-    "ContactParameter": "contact.parameters",
-    "gradient": "solve.gradient", "tangent": "solve.gradient", "taylor_test": "solve.gradient",
-    "History": "solve.history", "recording": "solve.history",
-    "Step": "solve.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
+    "ContactParameter": "gradients.parameters",
+    "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
+    "History": "gradients.history", "recording": "gradients.history",
+    "Step": "solve.steps.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 
 

@@ -130,7 +130,7 @@ class ConvergenceError(UEMError, RuntimeError):
     """The united Newton loop did not converge; the committed state has been restored.
 
     Attributes:
-        history: the iterations made, in order (see ``uem_dolfinx.solve.newton.Iteration``).
+        history: the iterations made, in order (see ``uem_dolfinx.solve.united.newton.Iteration``).
     """
 
     def __init__(self, message: str, history: Sequence[object] = ()):

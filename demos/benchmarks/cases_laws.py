@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 import uem_dolfinx as uem
 from benchmarks.cases import BALANCE, COMM, OVERLAP, BoxScene, Trial
 from benchmarks.scenes import Array
-from uem_dolfinx.contact.mortar import Mortar
+from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 

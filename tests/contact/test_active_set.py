@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from uem_dolfinx.contact import active_set
-from uem_dolfinx.contact.active_set import Rule
-from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.seam import active_set
+from uem_dolfinx.contact.seam.active_set import Rule
+from uem_dolfinx.contact.seam.state import PairState
 
 
 def state(active, lam=None):

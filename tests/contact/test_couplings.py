@@ -13,8 +13,8 @@ from helpers import arch, blocks, clamp, gathered_matrix, gathered_vector, highe
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.contact.kinematics import NORMAL
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.seam.placement import NORMAL
 
 COMM = MPI.COMM_WORLD
 

@@ -10,7 +10,7 @@ from mortar_scenes import COMM
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.duals import Covered, basis_of, dual_functions
+from uem_dolfinx.contact.mortar.duals import Covered, basis_of, dual_functions
 from uem_dolfinx.geometry.shapes import facet_shape
 
 KINDS = [("interval", 1), ("interval", 2), ("triangle", 1), ("triangle", 2), ("quadrilateral", 1), ("quadrilateral", 2)]

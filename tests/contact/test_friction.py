@@ -15,7 +15,7 @@ from helpers import NU, blocks, clamp, factors, gathered_matrix, highest, lowest
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.solve.tangent import curvature_of
+from uem_dolfinx.solve.bodies.tangent import curvature_of
 
 
 @pytest.mark.parametrize("mu", [slow(0.1), 0.3, slow(0.9)])

@@ -14,7 +14,7 @@ from helpers import slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.solve.tangent import contact_curvature
+from uem_dolfinx.solve.bodies.tangent import contact_curvature
 
 COMM = MPI.COMM_WORLD
 MORTAR = {"coupling": "mortar"}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from uem_dolfinx.contact import friction
-from uem_dolfinx.contact.active_set import Violations
-from uem_dolfinx.contact.state import FrictionState
+from uem_dolfinx.contact.friction import stick_slip
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.contact.seam.state import FrictionState
 
 
 def state(stick, direction):
@@ -28,17 +28,17 @@ def test_tangents_in_free_components():
     normal = rng.normal(size=(20, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     free = np.ones((20, 3), bool)
-    T = friction.tangents(normal[:, None], free)
+    T = stick_slip.tangents(normal[:, None], free)
     assert np.abs(np.einsum("nrg,ng->nr", T, normal)).max() <= 1e-15
     assert np.abs(np.einsum("nrg,nsg->nrs", T, T) - np.eye(2)).max() <= 1e-14
     free[:, 1] = False
-    T = friction.tangents(normal[:, None], free)
+    T = stick_slip.tangents(normal[:, None], free)
     assert (T.any(axis=2).sum(axis=1) == 1).all() and not T[:, :, 1].any()
     assert np.abs(np.einsum("nrg,ng->nr", T, normal)).max() <= 1e-15
     # a normal that leans from a prescribed component leaves of what is across both this part, over the root of two
     for lean, count in ((5e-6, 1), (5e-7, 2)):
         n = np.array([[lean, 0.0, np.sqrt(1 - lean**2)]])
-        assert friction.tangents(n[:, None], np.array([[True, True, False]])).any(axis=2).sum() == count
+        assert stick_slip.tangents(n[:, None], np.array([[True, True, False]])).any(axis=2).sum() == count
 
 
 def test_stick_and_slip():
@@ -48,14 +48,16 @@ def test_stick_and_slip():
     slip = np.array([[0.0, 0], [0, 0], [0.1, 0], [-0.1, 0], [0, 0]])
     contact = nothing(5)
     contact.release[4] = True
-    seen = friction.Seen(np.ones(5), tau, np.full(5, 0.3), slip, np.zeros(5))
-    wrong = friction.find_violations(contact, s, np.ones(5, bool), seen, np.full(5, 2.0), force_rounding=1e-9, gap_rounding=1e-9)
+    seen = stick_slip.Seen(np.ones(5), tau, np.full(5, 0.3), slip, np.zeros(5))
+    wrong = stick_slip.find_violations(
+        contact, s, np.ones(5, bool), seen, np.full(5, 2.0), force_rounding=1e-9, gap_rounding=1e-9
+    )
     assert wrong.slide.tolist() == [False, True, False, False, False]
     assert wrong.hold.tolist() == [False, False, False, True, False]
     assert wrong.count == 3
     assert wrong.violation == pytest.approx([0.0, 0.1, 0.0, 0.2, 0.0])
     assert wrong.among_the_worst(0.2).hold.sum() == 1 and wrong.among_the_worst(0.2).slide.sum() == 0
-    after = friction.exchange(s, wrong, tau)
+    after = stick_slip.exchange(s, wrong, tau)
     assert after.stick.tolist() == [True, False, False, True, True]
     assert after.direction.tolist() == [[0, 0], [1, 0], [1, 0], [0, 0], [0, 0]]
 
@@ -72,13 +74,13 @@ def test_springs_that_are_dragged(way, bound, stick, back):
     for _ in range(4):
         slipped = np.where(s.stick, 0.0, way - bound * s.direction[:, 0])
         tau = -(way - slipped)[:, None] * [[1.0, 0.0]]
-        seen = friction.Seen(np.ones(8), tau, bound, slipped[:, None] * [[1.0, 0.0]], np.zeros(8))
-        wrong = friction.find_violations(
+        seen = stick_slip.Seen(np.ones(8), tau, bound, slipped[:, None] * [[1.0, 0.0]], np.zeros(8))
+        wrong = stick_slip.find_violations(
             nothing(8), s, np.ones(8, bool), seen, np.ones(8), force_rounding=1e-12, gap_rounding=1e-12
         )
         if not wrong.count:
             break
-        s = friction.exchange(s, wrong, tau)
+        s = stick_slip.exchange(s, wrong, tau)
     assert not wrong.count
     assert np.abs(-tau[:, 0] - np.clip(way, -bound, bound)).max() <= 2e-12
 
@@ -86,17 +88,17 @@ def test_springs_that_are_dragged(way, bound, stick, back):
 def test_who_comes_sticks_and_who_goes_forgets():
     s = state([True, False, False], [[0, 0], [0, 1], [0, 0]])
     before, now = np.array([True, True, False]), np.array([False, True, True])
-    after = friction.come_and_go(s, before, now, np.array([True, True, True]))
+    after = stick_slip.come_and_go(s, before, now, np.array([True, True, True]))
     assert after.stick.tolist() == [False, False, True]
     assert after.direction.tolist() == [[0, 0], [0, 1], [0, 0]]
-    assert not friction.come_and_go(s, before, now, np.zeros(3, bool)).stick.any()
-    assert not friction.come_and_go(s, before, ~now, np.ones(3, bool)).direction.any()
+    assert not stick_slip.come_and_go(s, before, now, np.zeros(3, bool)).stick.any()
+    assert not stick_slip.come_and_go(s, before, ~now, np.ones(3, bool)).direction.any()
 
 
 def test_the_direction_turns_with_the_motion():
     """The fixed point of the semismooth form is Coulomb's law: friction against the slip, whatever the stiffness."""
-    s = friction.turned(state([False], [[1.0, 0, 0]]), np.array([True]), np.array([[3.0, 4.0, 0.0]]))
+    s = stick_slip.turned(state([False], [[1.0, 0, 0]]), np.array([True]), np.array([[3.0, 4.0, 0.0]]))
     assert s.direction[0] == pytest.approx([0.6, 0.8, 0.0])
-    k, part = friction.turn_stiffness(np.array([2.0, 1.0]), np.array([1.0, 1.0]), np.array([10.0, 10.0]))
+    k, part = stick_slip.turn_stiffness(np.array([2.0, 1.0]), np.array([1.0, 1.0]), np.array([10.0, 10.0]))
     assert (k[0], part[0]) == pytest.approx((10.0, 1.0))
-    assert part[1] == pytest.approx(friction.LEAST_TURN / (1 - friction.LEAST_TURN))
+    assert part[1] == pytest.approx(stick_slip.LEAST_TURN / (1 - stick_slip.LEAST_TURN))

@@ -19,7 +19,7 @@ from helpers import M, at, blocks, box, clamp, highest, linear, modulus, run, sl
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.contact.sliding import Sliding
+from uem_dolfinx.contact.friction.sliding import Sliding
 
 COMM = MPI.COMM_WORLD
 

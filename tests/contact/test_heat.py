@@ -20,7 +20,7 @@ from field_scenes import fields, strain, stress
 from helpers import blocks, factors, highest, linear, modulus, refused, run, slow
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.tangent import slip_terms
+from uem_dolfinx.solve.bodies.tangent import slip_terms
 
 COMM = MPI.COMM_WORLD
 COLD, HOT, K = 100.0, 300.0, 2.0

@@ -94,7 +94,7 @@ def test_by_mortar():
 
 def test_what_touches_nothing_is_not_asked(monkeypatch):
     """Of the lists of a general contact those with nothing on them look for nothing that is opposite."""
-    from uem_dolfinx.contact import heat
+    from uem_dolfinx.contact.thermal import heat
 
     asked = []
     monkeypatch.setattr(heat, "sides_of", lambda pair, of=heat.sides_of: (asked.append(pair), of(pair))[1])

@@ -21,7 +21,7 @@ from helpers import box, clamp, highest, linear, modulus
 import uem_dolfinx as uem
 from uem_dolfinx.contact import joining
 from uem_dolfinx.contact.laws.law import as_law
-from uem_dolfinx.contact.member import Member
+from uem_dolfinx.contact.pair.member import Member
 from uem_dolfinx.solve import problem as problems
 
 CALLS = ("Allreduce", "allreduce", "Allgather", "allgather", "Alltoall", "Alltoallv", "bcast")

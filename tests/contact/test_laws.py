@@ -15,7 +15,7 @@ from dolfinx import fem
 from helpers import blocks, clamp, linear, modulus, raised, run, slow
 
 import uem_dolfinx as uem
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 
 COMM = MPI.COMM_WORLD
 STRESS = 2e-3

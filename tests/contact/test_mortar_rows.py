@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mortar_scenes import Blocks, disturbed
 
-from uem_dolfinx.contact.duals import basis_of
+from uem_dolfinx.contact.mortar.duals import basis_of
 from uem_dolfinx.geometry.shapes import facet_shape
 
 

@@ -12,7 +12,7 @@ from helpers import CELLS
 from mortar_scenes import Blocks, disturbed
 
 import uem_dolfinx as uem
-from uem_dolfinx.contact.mortar_ends import curvature
+from uem_dolfinx.contact.mortar.ends import curvature
 
 
 class WeightedGap:

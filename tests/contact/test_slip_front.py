@@ -4,7 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.contact.slip_front import Front
+from uem_dolfinx.contact.friction.slip_front import Front
 
 
 def test_slip_that_eats_its_way_goes_ahead():

@@ -17,8 +17,8 @@ from helpers import at, blocks, box, clamp, linear, modulus, rotation, run, scen
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact import target_corners
-from uem_dolfinx.contact.target_corners import corner_nodes
+from uem_dolfinx.contact.warnings import target_corners
+from uem_dolfinx.contact.warnings.target_corners import corner_nodes
 
 COMM = MPI.COMM_WORLD
 

@@ -35,7 +35,7 @@ from helpers import (
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.solve.tangent import curvature_of
+from uem_dolfinx.solve.bodies.tangent import curvature_of
 
 COMM = MPI.COMM_WORLD
 COUPLINGS = ("node_to_surface", "mortar")

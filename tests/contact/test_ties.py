@@ -15,7 +15,7 @@ from helpers import Array, Blocks, at, blocks, box, clamp, linear, modulus, scen
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.ties import Ties
+from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.geometry.configuration import Configuration
 
 MU = 0.3

@@ -16,7 +16,7 @@ from helpers import blocks, box, clamp, linear, modulus, raised, run, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact import checks
+from uem_dolfinx.contact.warnings import checks
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.search import MeshTarget

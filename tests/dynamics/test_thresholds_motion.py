@@ -17,7 +17,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
 from uem_dolfinx.solve.passages import refuse_passages
-from uem_dolfinx.solve.time_steps import _refuse_given_energy
+from uem_dolfinx.solve.steps.time_steps import _refuse_given_energy
 
 COMM = MPI.COMM_WORLD
 

@@ -20,7 +20,7 @@ from restart_scenes import COMM, bits, lead, slider
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.contact.state import PairState
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.restart import numbering
 
 # -- fields ----------------------------------------------------------------------------------------------------------------

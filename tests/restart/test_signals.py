@@ -22,7 +22,7 @@ from ramp_scenes import COMM, five_steps, nothing
 
 import uem_dolfinx as uem
 from uem_dolfinx.parallel import INTERRUPTED
-from uem_dolfinx.solve.system import BodySystem
+from uem_dolfinx.solve.united.system import BodySystem
 
 ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: SystemExit}
 

@@ -14,8 +14,8 @@ from restart_scenes import goes_on_alike
 from resting_scenes import COMM
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve import arc_length
-from uem_dolfinx.solve.arc_length import ArcLength
+from uem_dolfinx.solve.steps import arc_length
+from uem_dolfinx.solve.steps.arc_length import ArcLength
 
 L, RISE, E = 200.0, 2.0, 1000.0
 k = 2 * np.pi / L

@@ -11,7 +11,7 @@ from resting_scenes import COMM
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.solve.tangent import contact_curvature, convex_part
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, convex_part
 
 # ---------------------------------------------------------------------------------------------- curvature of the contact
 

@@ -19,11 +19,11 @@ from helpers import Body, at, blocks, box, clamp, linear, modulus, raised, run, 
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.active_set import Pivoting, Rule, Violations
-from uem_dolfinx.contact.friction import FrictionViolations, Seen
-from uem_dolfinx.contact.state import PairState
-from uem_dolfinx.solve import exchanges as exchanges_of_a_step
-from uem_dolfinx.solve.exchanges import ALONG, Exchanges
+from uem_dolfinx.contact.friction.stick_slip import FrictionViolations, Seen
+from uem_dolfinx.contact.seam.active_set import Pivoting, Rule, Violations
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.solve.united import exchanges as exchanges_of_a_step
+from uem_dolfinx.solve.united.exchanges import ALONG, Exchanges
 
 COMM = MPI.COMM_WORLD
 

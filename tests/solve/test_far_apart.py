@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve import far_apart
-from uem_dolfinx.solve.far_apart import Boxes, FarApart
+from uem_dolfinx.solve.bodies import far_apart
+from uem_dolfinx.solve.bodies.far_apart import Boxes, FarApart
 
 
 def pressed(cell, gap, way, rigid=False, degree=1, **how):

@@ -11,8 +11,8 @@ from helpers import box, lawful
 
 import uem_dolfinx as uem
 from uem_dolfinx import forms
-from uem_dolfinx.solve import rigid_steps
-from uem_dolfinx.solve.rigid_steps import least_motion
+from uem_dolfinx.solve.rigid import rigid_steps
+from uem_dolfinx.solve.rigid.rigid_steps import least_motion
 
 RADIUS, GAP, WEIGHT = 0.5, 0.05, 1e-4
 

@@ -17,7 +17,7 @@ from helpers import refused, slow
 from history_scenes import COMM, alone, slope_alone, taylor, thrown
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.records import Records
+from uem_dolfinx.gradients.records import Records
 
 SCENES = [
     {"scheme": uem.generalised_alpha(0.7)},

@@ -9,7 +9,7 @@ import pytest
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.newton import FORCING, Increment, IterationState, LinearisedProblem, solve_united
+from uem_dolfinx.solve.united.newton import FORCING, Increment, IterationState, LinearisedProblem, solve_united
 
 
 def vector(value):

@@ -10,7 +10,7 @@ from helpers import box, linear, scene
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.solve.rigid_motions import RigidMotions
+from uem_dolfinx.solve.rigid.rigid_motions import RigidMotions
 
 COMM = MPI.COMM_WORLD
 

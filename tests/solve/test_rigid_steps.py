@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import block_diag, csr_matrix, eye
 
-from uem_dolfinx.solve import rigid_steps
-from uem_dolfinx.solve.rigid_steps import least_motion, nearest_point, weighted
+from uem_dolfinx.solve.rigid import rigid_steps
+from uem_dolfinx.solve.rigid.rigid_steps import least_motion, nearest_point, weighted
 
 COMM = MPI.COMM_WORLD
 

@@ -8,7 +8,7 @@ from friction_scenes import driven
 from helpers import blocks, clamp, linear, modulus, run
 
 import uem_dolfinx as uem
-from uem_dolfinx.solve.newton import Increment
+from uem_dolfinx.solve.united.newton import Increment
 
 COMM = MPI.COMM_WORLD
 

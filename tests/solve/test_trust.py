@@ -17,7 +17,7 @@ from helpers import CELLS, at, blocks, box, clamp, complementary, linear, modulu
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.rings import DependentRingError
-from uem_dolfinx.solve import rows
+from uem_dolfinx.solve.united import rows
 
 COMM = MPI.COMM_WORLD
 

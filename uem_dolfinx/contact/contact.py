@@ -12,9 +12,6 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices
-from uem_dolfinx.contact.checks import warn_of_slim_tips, warn_of_straight_facets
-from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.kinematics import Discretisation, Kinematics
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of
 from uem_dolfinx.contact.laws.law import (
     Field,
@@ -28,7 +25,10 @@ from uem_dolfinx.contact.laws.law import (
     values_at,
 )
 from uem_dolfinx.contact.laws.thermal import OfTemperature
-from uem_dolfinx.contact.watched import WatchedContact
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
+from uem_dolfinx.contact.warnings.checks import warn_of_slim_tips, warn_of_straight_facets
+from uem_dolfinx.contact.warnings.watch import WatchedContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of
@@ -40,12 +40,12 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_o
 from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.laws.conductance import Conductance
-    from uem_dolfinx.contact.mortar import Mortar
+    from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
-    from uem_dolfinx.contact.pair_friction import ValuesOfPairs
-    from uem_dolfinx.contact.sliding import Sliding
-    from uem_dolfinx.contact.tie import Tie
+    from uem_dolfinx.contact.ties.tie import Tie
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
@@ -245,7 +245,7 @@ class Contact(WatchedContact, given.Sealed):
         """Values of a law's parameter at contactors ``(n,)``, where they have been placed; None if there is no friction (collective)."""
         T = None
         if isinstance(law.field, OfTemperature):
-            from uem_dolfinx.contact.sides import mean_temperatures
+            from uem_dolfinx.contact.thermal.sides import mean_temperatures
 
             T = mean_temperatures(self.config, nodes, law.field.field, self.name, self._pair, self.heats)
         return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at, T)
@@ -347,7 +347,7 @@ class Contact(WatchedContact, given.Sealed):
             self._offsets_of_pair().adjust(self.adjust)
         self._set_offset()
         if self._wears:
-            from uem_dolfinx.contact.wear import Wear
+            from uem_dolfinx.contact.friction.wear import Wear
 
             assert friction is not None
             friction.wear = Wear(
@@ -360,7 +360,7 @@ class Contact(WatchedContact, given.Sealed):
                 name=self.name,
             )
         if self.heats:
-            from uem_dolfinx.contact.heat import heats_of
+            from uem_dolfinx.contact.thermal.heat import heats_of
 
             self._pair.heats = heats_of(self._pair, self.heats, self)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
@@ -371,15 +371,15 @@ class Contact(WatchedContact, given.Sealed):
         config = self.config
         # points have no facets to integrate over
         if self.coupling == "mortar" and self.contactor.dim > 0:
-            from uem_dolfinx.contact.mortar import Mortar
+            from uem_dolfinx.contact.mortar.discretisation import Mortar
 
             surface = TargetFacets(config, self.contactor, "contactor")
             warn_of_slim_tips(config, self.name, surface)
             tied = self.tied and target.n_nodes
             means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
             return Mortar(config, nodes, target, surface=surface, **how), means
-        from uem_dolfinx.contact.bernstein import Bernstein
-        from uem_dolfinx.contact.node_to_surface import NodeToSurface
+        from uem_dolfinx.contact.nodes.bernstein import Bernstein
+        from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 
         kind = Bernstein if config.degree == 2 else NodeToSurface
         own = self.coupling if callable(self.coupling) else kind
@@ -397,8 +397,8 @@ class Contact(WatchedContact, given.Sealed):
         value = self._friction_at(law, nodes, self._at)
         if value is None and not self._wears:
             return None
-        from uem_dolfinx.contact.limits import Limits
-        from uem_dolfinx.contact.sliding import Sliding
+        from uem_dolfinx.contact.friction.limits import Limits
+        from uem_dolfinx.contact.friction.sliding import Sliding
 
         if of_rate(law) and duration is None:
             raise InputError(
@@ -413,7 +413,7 @@ class Contact(WatchedContact, given.Sealed):
 
     def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie:
         """What ties contactors; ``means`` as of ``Tie``."""
-        from uem_dolfinx.contact.tie import Tie
+        from uem_dolfinx.contact.ties.tie import Tie
 
         return Tie(
             self.config, nodes, discretisation, means=means, reach=None if isinstance(self.adjust, bool) else self.adjust, **of

@@ -6,12 +6,12 @@ from collections.abc import Hashable, Sequence
 from typing import TYPE_CHECKING
 
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.thermal import OfTemperature
+from uem_dolfinx.contact.pair.interface import Interface
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.sliding import Sliding
+    from uem_dolfinx.contact.friction.sliding import Sliding
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:
@@ -27,7 +27,7 @@ def join_alike(contacts: Sequence[Contact]) -> None:
             groups.setdefault(kind, []).append(contact)
     for alike in groups.values():
         if len(alike) > 1:
-            from uem_dolfinx.contact.joined import JoinedInterface
+            from uem_dolfinx.contact.pair.joined import JoinedInterface
 
             whole = JoinedInterface([contact.pair for contact in alike])
             for contact, member in zip(alike, whole.make_members()):
@@ -54,7 +54,7 @@ def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]
 
 def _kind(contact: Contact) -> Hashable:
     """What contacts that are treated together have in common; None for those that are not."""
-    from uem_dolfinx.contact.node_to_surface import NodeToSurface
+    from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
     from uem_dolfinx.geometry.search import MeshTarget
 
     pair = contact.pair

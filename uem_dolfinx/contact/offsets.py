@@ -14,7 +14,7 @@ from uem_dolfinx.contact.laws.law import Field, asked_at
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.interface import Interface
+    from uem_dolfinx.contact.pair.interface import Interface
 
 
 class Offsets:

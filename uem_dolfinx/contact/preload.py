@@ -12,10 +12,10 @@ import numpy.typing as npt
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.interface import Interface
-from uem_dolfinx.contact.kinematics import Discretisation
-from uem_dolfinx.contact.mortar import Mortar
-from uem_dolfinx.contact.preloaded import Preloaded
+from uem_dolfinx.contact.mortar.discretisation import Mortar
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Discretisation
+from uem_dolfinx.contact.ties.preloaded import Preloaded
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.configuration import Configuration

@@ -15,8 +15,8 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
-from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.conductance import one_of_fields
+from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import Areas
@@ -209,8 +209,8 @@ class ContactResults:
         It differs from :attr:`pressure` at degree 2, and with mortar where the contactor overhangs the target. Where the contactor has
         facets on both sides of a sharp edge its integral over those that face the target is this sum. It is zero of points.
         """
-        from uem_dolfinx.contact.densities import density
-        from uem_dolfinx.contact.duals import basis_of
+        from uem_dolfinx.contact.mortar.densities import density
+        from uem_dolfinx.contact.mortar.duals import basis_of
 
         f = self._field("pressure_to_integrate", 0.0)
         if self.contactor.dim > 0:
@@ -330,7 +330,7 @@ class ContactResults:
         given.kind("f", f, isinstance(f, fem.Function), "a scalar Function")
         if f.ufl_shape != () or not compat.is_on(f.function_space, self.config.mesh) or not meshed:
             raise InputError(f"contact '{self.name}': opposite needs a scalar Function on the mesh, and a target that is meshed")
-        from uem_dolfinx.contact.sides import sides_of
+        from uem_dolfinx.contact.thermal.sides import sides_of
 
         values = fem.Function(compat.function_space(self.config.mesh, self.config.degree))
         values.interpolate(f)

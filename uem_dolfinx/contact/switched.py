@@ -11,14 +11,14 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.checks import check_initial
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.interface import Interface
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
 from uem_dolfinx.contact.laws.thermal import OfTemperature
+from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.preload import Preload
-from uem_dolfinx.contact.state import FrictionState, PairState
-from uem_dolfinx.contact.tie import Tie
+from uem_dolfinx.contact.seam.state import FrictionState, PairState
+from uem_dolfinx.contact.ties.tie import Tie
+from uem_dolfinx.contact.warnings.checks import check_initial
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agree, agreed, reduced
 

@@ -10,7 +10,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.conditions.places import is_point, nodes_at
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 from uem_dolfinx.geometry.tags import Part, as_tag, name_of

@@ -15,9 +15,9 @@ from uem_dolfinx.output.frames import Frame
 from uem_dolfinx.output.pictures import new_canvas, plot_scene
 from uem_dolfinx.output.tables import given_path
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.time_steps import TimeStep
+from uem_dolfinx.solve.steps.load_step import LoadStep
+from uem_dolfinx.solve.steps.time_steps import TimeStep
 
 T = TypeVar("T")
 

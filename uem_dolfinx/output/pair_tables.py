@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.solve.problem import UnitedProblem
 

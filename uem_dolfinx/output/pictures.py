@@ -15,7 +15,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError, InputTypeError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part

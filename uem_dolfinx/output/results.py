@@ -13,7 +13,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_values
@@ -22,9 +22,9 @@ from uem_dolfinx.output.columns import Columns
 from uem_dolfinx.output.pair_tables import PairTables
 from uem_dolfinx.output.tables import Closing, CsvTable, refuse_shared
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.solve.load_step import LoadStep
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.time_steps import TimeStep
+from uem_dolfinx.solve.steps.load_step import LoadStep
+from uem_dolfinx.solve.steps.time_steps import TimeStep
 
 #: Endings of VTX files, by the rank of what is in them.
 ENDINGS = ("scalars", "vectors")

@@ -14,7 +14,7 @@ from uem_dolfinx.errors import UEMError, UserFunctionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.loading import bring_load, forget_load
-from uem_dolfinx.solve.newton import Iteration
+from uem_dolfinx.solve.united.newton import Iteration
 
 
 @dataclass(frozen=True)

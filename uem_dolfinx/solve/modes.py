@@ -18,11 +18,11 @@ from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, together
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.rows import make_rows
-from uem_dolfinx.solve.system import BodySystem
-from uem_dolfinx.solve.tangent import added_mass, curvature_of, together
+from uem_dolfinx.solve.united.rows import make_rows
+from uem_dolfinx.solve.united.system import BodySystem
 
 #: Relative error of the eigenvalues.
 #: [bound; the eigenvalue; -]

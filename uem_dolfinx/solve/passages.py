@@ -20,8 +20,8 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.checks import CORNER
-from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.warnings.checks import CORNER
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration

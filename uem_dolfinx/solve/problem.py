@@ -10,13 +10,13 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.contact.checks import check_moved, check_new
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact, parts_of
-from uem_dolfinx.contact.interface import Interface
+from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import join_alike
+from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
-from uem_dolfinx.contact.watched import Watch
+from uem_dolfinx.contact.warnings.checks import check_moved, check_new
+from uem_dolfinx.contact.warnings.watch import Watch
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.forms import in_all_cells
@@ -29,16 +29,16 @@ from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.bodies import Bodies, configured, solver_of
+from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
+from uem_dolfinx.solve.bodies.norms import Norm
 from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values, take_materials
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
-from uem_dolfinx.solve.newton import ContactMethod, Iteration, solve_united
-from uem_dolfinx.solve.norms import Norm
 from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
-from uem_dolfinx.solve.system import BodySystem
 from uem_dolfinx.solve.taken import taken_by
+from uem_dolfinx.solve.united.newton import ContactMethod, Iteration, solve_united
+from uem_dolfinx.solve.united.system import BodySystem
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring

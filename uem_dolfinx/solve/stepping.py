@@ -16,14 +16,14 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general import GeneralContact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.log import logger
 from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.newton import Iteration
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.taken import Taken
+from uem_dolfinx.solve.united.newton import Iteration
 
 S = TypeVar("S", bound="ConvergedStep")
 

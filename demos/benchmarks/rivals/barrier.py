@@ -17,10 +17,10 @@ from scipy.sparse import coo_matrix
 
 from benchmarks.rivals.line_search import flat_length
 from benchmarks.rivals.pushed import PushedSystem
-from uem_dolfinx.contact.kinematics import Traction
+from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.newton import InEquilibrium, IterationState
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -29,11 +29,11 @@ from uem_dolfinx.geometry.surfaces import tributary_areas
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.bodies import Bodies
+    from uem_dolfinx.solve.bodies.bodies import Bodies
     from collections.abc import Sequence
 
     from uem_dolfinx.contact.contact import Contact
-    from uem_dolfinx.contact.interface import Interface
+    from uem_dolfinx.contact.pair.interface import Interface
 
 Array = npt.NDArray[np.float64]
 

@@ -18,15 +18,15 @@ from scipy.sparse import coo_matrix
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.floating import FloatingBodies
-from uem_dolfinx.solve.newton import Increment, LinearisedProblem
-from uem_dolfinx.solve.system import BodySystem
+from uem_dolfinx.solve.rigid.floating import FloatingBodies
+from uem_dolfinx.solve.united.newton import Increment, LinearisedProblem
+from uem_dolfinx.solve.united.system import BodySystem
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.bodies import Bodies
-    from uem_dolfinx.contact.interface import Interface
-    from uem_dolfinx.solve.newton import IterationState
+    from uem_dolfinx.solve.bodies.bodies import Bodies
+    from uem_dolfinx.contact.pair.interface import Interface
+    from uem_dolfinx.solve.united.newton import IterationState
 
 DIRECT = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 #: For large bodies that are held: Murphy, Golub and Wathen's block diagonal, with the Schur complement from the diagonal of K.

@@ -17,22 +17,22 @@ from petsc4py import PETSc
 
 from benchmarks.rivals.line_search import flat_length
 from benchmarks.rivals.pushed import PushedSystem
-from uem_dolfinx.contact.kinematics import Traction
-from uem_dolfinx.contact.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.seam.placement import Traction
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.newton import InEquilibrium, IterationState
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
-from uem_dolfinx.solve.bodies import FORCE_ROUNDING
-from uem_dolfinx.solve.tangent import contact_curvature
+from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING
+from uem_dolfinx.solve.bodies.tangent import contact_curvature
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.solve.bodies import Bodies
+    from uem_dolfinx.solve.bodies.bodies import Bodies
     from uem_dolfinx.geometry.gmsh import Tag
-    from uem_dolfinx.contact.interface import Interface
+    from uem_dolfinx.contact.pair.interface import Interface
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -11,15 +11,15 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.contact.checks import check_initial, check_prescribed
+from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.solve.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
     from uem_dolfinx.conditions.user_rows import UserRows
-    from uem_dolfinx.contact.interface import Interface
-    from uem_dolfinx.solve.bodies import Bodies
+    from uem_dolfinx.contact.pair.interface import Interface
+    from uem_dolfinx.solve.bodies.bodies import Bodies
 
 
 class PushedSystem(ABC):

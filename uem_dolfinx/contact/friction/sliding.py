@@ -1,0 +1,451 @@
+"""What an interface with friction adds along the target: equations of contactors that stick, rotated rows and forces of those that slip.
+
+``friction`` says, as functions of arrays, which contactors stick and which slip, and a law how much force that takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.friction import rubbing, stick_slip
+from uem_dolfinx.contact.friction.anchors import anchored, anchors_of, way_since
+from uem_dolfinx.contact.friction.frame import Frame
+from uem_dolfinx.contact.friction.limits import Limits
+from uem_dolfinx.contact.friction.pivot import LastStep, Pivot
+from uem_dolfinx.contact.friction.rows import with_friction
+from uem_dolfinx.contact.friction.slip_front import Front
+from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
+from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
+from uem_dolfinx.contact.seam.corners import friction_in
+from uem_dolfinx.contact.seam.placement import Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.seam.relative_motion import Ties
+from uem_dolfinx.contact.seam.state import FrictionState, PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.wear import Wear
+
+
+class Sliding:
+    """Friction of the contactors of one interface.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        discretisation: what ties them to their target.
+        law: of friction.
+        value: of its parameter at the contactors ``(n,)``.
+        limits: how much of it contactors bear.
+        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+        keeps_feet: whether feet stay where they were at the start of the step.
+        value_now: tells the parameter's values ``(n,)`` where contactors have been placed, None for those of before (collective).
+
+    Attributes:
+        frame: directions along the target and relative motions, of the last placement.
+        pivot: what the exchanges of the present linearised problem have done.
+        wear: of the contactors; None without.
+        left_out: tangents whose equations depend on others and were left out ``(n, gdim - 1)``.
+    """
+
+    frame: Frame
+
+    #: Makes what tells where slip begins, for another linearised problem.
+    front: Any = Front
+
+    def __init__(
+        self,
+        config: Configuration,
+        nodes: Indices,
+        discretisation: Discretisation,
+        *,
+        law: FrictionLaw,
+        value: Array,
+        limits: Limits,
+        free: Bools,
+        keeps_feet: bool,
+        value_now: Callable[[Kinematics], Array | None],
+    ):
+        self.config, self.nodes, self.discretisation, self.free, self.keeps_feet = config, nodes, discretisation, free, keeps_feet
+        n, g, self.limits, self._value_now = len(nodes), config.gdim, limits, value_now
+        self.wear: Wear | None = None
+        self.set(law, value)
+        self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
+        self._other_normals: Array = np.zeros((n, 0, g))
+        self._anchors: Array = np.zeros((n, g))
+        self._held_by: tuple[Ints, Ints, Array] | None = None
+        self._last: LastStep | None = None
+        self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+
+    def set(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law, and the values of its parameter ``(n,)``."""
+        self.discretisation.with_friction(self.limits.set(law, value))
+
+    @property
+    def value(self) -> Array:
+        """Of the law's parameter at the contactors ``(n,)``, 0 where there is no friction."""
+        return self.limits.value
+
+    # -- where the contactors stand --------------------------------------------------------------------------------------
+
+    def place(self, kinematics: Kinematics, state: FrictionState) -> None:
+        """Find the anchors, or how far contactors have moved, where bodies and target are now (collective)."""
+        if self.discretisation.pointwise:
+            self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
+        elif self._last is None:
+            here = self.config.x[: self.config.n_owned].copy()
+            self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
+        self.limits.grow(kinematics)
+        if (value := self._value_now(kinematics)) is not None:
+            self.discretisation.with_friction(self.limits.change(value))
+        self.replace(kinematics)
+
+    def replace(self, kinematics: Kinematics) -> None:
+        """Take other kinematics at the same displacement (collective)."""
+        if self.discretisation.pointwise:
+            way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
+            away = kinematics.points - self._anchors
+        else:
+            assert self._last is not None
+            way = self._last.ties
+            away = way.relative(self._way_since(self._last))
+        self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.prescribed)
+        if of_rate(self.limits.law):
+            self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.force_per_multiplier)
+
+    def _way_since(self, last: LastStep) -> Array:
+        return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
+
+    def meet(self, kinematics: Kinematics, normals: Array) -> None:
+        """Take the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which they do not slip (collective)."""
+        if reduced(self.config.comm, not np.array_equal(normals, self._other_normals), op=MPI.LOR):
+            self._other_normals = normals
+            self.replace(kinematics)
+
+    def active(self, state: PairState) -> Bools:
+        """Active contactors that friction acts on ``(n,)``."""
+        return state.active & (self.value > 0)
+
+    def slipping(self, state: PairState) -> Bools:
+        """Contactors that slip ``(n,)``."""
+        return self.active(state) & ~_of(state).stick
+
+    def directions(self, state: PairState) -> Array:
+        """Directions of slip, which turn with the surface ``(n, gdim)``; zero for contactors that do not slip."""
+        return self.frame.directions(_of(state).direction)
+
+    def distances(self, state: PairState, redundant: Bools) -> Array:
+        """Distances from the anchors that contactors stick to, zero for all others, lengths ``(n,)``."""
+        held = np.where(self.left_out[:, :, None], 0.0, self.frame.free_tangents)
+        away = np.linalg.norm(stick_slip.along(held, self.frame.away), axis=1)
+        return np.where(self.active(state) & _of(state).stick & ~redundant, away, 0.0)
+
+    def return_vectors(self, state: PairState) -> Array:
+        """Displacements along the target that put contactors that stick back to their anchors ``(n, gdim)``."""
+        return -np.where(self._at_anchors(state)[:, None], stick_slip.along(self.frame.free_tangents, self.frame.away), 0.0)
+
+    def _at_anchors(self, state: PairState) -> Bools:
+        """Contactors that stick to a point of the target and are free to follow it ``(n,)``."""
+        stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
+        return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
+
+    def bound(self, state: PairState, lam: Array | None = None) -> Array:
+        """Largest force along the target of a state, or of it with other forces ``lam (n,)`` along the normal ``(n,)``."""
+        return self.limits.of(state.lam if lam is None else lam, self.slipping(state))[0]
+
+    def hold_limits(self, lam: Array | None) -> Array:
+        """Let limits be those of forces ``lam (n,)`` along the normal; see ``Limits.hold``."""
+        return self.limits.hold(lam)
+
+    def _cone(self, state: PairState) -> tuple[Array, Array]:
+        return self.limits.cone(state.lam, self.slipping(state))
+
+    def _limit(self, state: PairState, lam: Array) -> Array:
+        rest, slope = self._cone(state)
+        return rest + slope * lam
+
+    # -- stick and slip --------------------------------------------------------------------------------------------------
+
+    def come_and_go(self, state: PairState, before: Bools) -> PairState:
+        """The state in which contactors that were not active ``before (n,)`` stick, and those that are no longer forget."""
+        return replace(state, friction=stick_slip.come_and_go(_of(state), before, state.active, self.value > 0))
+
+    def other_law(self, state: PairState, law: FrictionLaw, value: Array) -> PairState:
+        """The state with a law, and other values ``(n,)`` of its parameter: contactors that get friction stick where they are."""
+        was = state.active & (self.value > 0)
+        self.set(law, value)
+        now = stick_slip.come_and_go(_of(state), was, state.active & (value > 0), value > 0)
+        return replace(state, friction=now)
+
+    def violated(
+        self,
+        violated: Violations,
+        state: PairState,
+        seen: Traction,
+        stiffness: Array,
+        rounding: tuple[Array, float],
+        du: Array | None,
+    ) -> stick_slip.FrictionViolations:
+        """Add those that break the conditions of friction (collective).
+
+        Args:
+            violated: contactors that break the conditions of contact.
+            state: of the interface.
+            seen: contact forces, here or predicted.
+            stiffness: of the contactors ``(n,)``.
+            rounding: forces ``(n,)`` and lengths below which they are zero.
+            du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
+        """
+        away, tau = self.frame.away, _of(state).tau
+        if du is not None and seen.tau is not None:
+            away, tau = away + self.frame.way.relative(du), seen.tau
+        lam, forced = seen.lam, self.frame.forced(away, self._lost)
+        by = stick_slip.Seen(lam, self.frame.tangential(tau), self.bound(state, lam), self.frame.along(away), forced)
+        turned = replace(_of(state), direction=self.directions(state))
+        forces, lengths = rounding
+        active = self.active(state)
+        return stick_slip.find_violations(violated, turned, active, by, stiffness, force_rounding=forces, gap_rounding=lengths)
+
+    @property
+    def _lost(self) -> Bools:
+        return np.asarray(self.left_out & ~self.free.all(axis=1, keepdims=True))
+
+    def exchange(
+        self,
+        violated: Violations,
+        state: PairState,
+        committed: PairState,
+        kinematics: Kinematics,
+        ahead: bool,
+        enter: Callable[[PairState], PairState],
+    ) -> tuple[PairState, bool]:
+        """Let wrong contactors change between stick and slip (collective).
+
+        Args:
+            violated: contactors to change.
+            state: of the interface.
+            committed: that of the last step.
+            kinematics: of the contactors.
+            ahead: whether those that are to follow slip ahead.
+            enter: takes contactors in and out of contact (collective).
+
+        Returns:
+            The state, and whether any slip ahead.
+        """
+        assert isinstance(violated, stick_slip.FrictionViolations)
+        seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
+        tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
+        space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
+        if ahead:
+            taken, tau = self._next_in_line(violated, state, kinematics.points, tau)
+            pivot = replace(pivot, taken=taken)
+        slide = violated.slide | pivot.taken if ahead else violated.slide
+        # one whose slip turns slips the other way first: where a surface turns back they would else follow one after the other; if it
+        # turns again it is held: where the bodies give way more than the surface has moved it would turn for ever. Nodes in space that
+        # begin to slip turn as long as the force q is beyond the cone; bodies that slide without end are held
+        q, beyond = pivot.stiffness[:, None] * slip - tau / share, ~pivot.turned
+        if space:
+            beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(state, lam) / share[:, 0])
+        turns = violated.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
+        # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
+        back = (violated.enter & (committed.active | pivot.released | forced) | violated.slide & forced) & (size > 0)
+        changed = replace(violated, slide=slide, hold=violated.hold & ~turns)
+        state = enter(replace(state, friction=stick_slip.exchange(_of(state), changed, tau)))
+        led_by = pivot.stiffness[:, None] * slip if self.config.gdim == 3 else slip
+        way = np.where((turns & ~forced)[:, None] & space, q, led_by)
+        state = replace(state, friction=stick_slip.turned(_of(state), back | turns, way))
+        # from here the slip of a target that has moved under contactors adds c w to the forces that q belongs to
+        q, of_q, led = pivot.q.copy(), pivot.tau.copy(), slide | back | turns
+        q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
+        of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
+        released, turned, begun = pivot.released | violated.release, pivot.turned | turns, pivot.begun | slide
+        self.pivot = replace(pivot, released=released, turned=turned, begun=begun, q=q, tau=of_q)
+        return state, ahead and bool(reduced(self.config.comm, pivot.taken.any(), op=MPI.LOR))
+
+    def _next_in_line(
+        self, violated: stick_slip.FrictionViolations, state: PairState, at: Array, tau: Array
+    ) -> tuple[Bools, Array]:
+        """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
+        stick, begin = self.active(state) & _of(state).stick, violated.slide & ~violated.driven
+        near, force = self.pivot.front.along(begin, self.pivot.taken & stick, tau, at)
+        near &= stick & ~begin & ~violated.release
+        return near, np.where(near[:, None], self.frame.tangential(force), tau)
+
+    def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
+        """Begin another linearised problem: directions of slip from where contactors are and from the forces last predicted.
+
+        Args:
+            state: of the interface.
+            kinematics: of the contactors.
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``.
+        """
+        frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
+        if self.config.gdim == 2:
+            self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(len(none)), none, none)
+            return state
+        k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
+        c = stick_slip.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
+        T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
+        # friction has no part in what is prescribed to stand still, and none but of the motion where all of that is prescribed
+        told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
+        goes = frame.forced(frame.away, self._lost) > GAP_ROUNDING * self.config.size
+        tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
+        q = c[:, None] * frame.slip - tau
+        self.pivot = Pivot.begin(self.front(self.config.comm), c, q, tau)
+        return replace(state, friction=stick_slip.turned(_of(state), self.slipping(state), q))
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
+        """Equations with those along the target, and rotated test rows where contactors slip (collective)."""
+        return with_friction(
+            own,
+            self.frame,
+            of_friction=self.active(state),
+            stick=_of(state).stick,
+            directions=self.directions(state),
+            slope=self._cone(state)[1] * kinematics.cone,
+            normal=kinematics.normal,
+            pointwise=self.discretisation.pointwise,
+            keeps_ties=self.keeps_feet or self.discretisation.at_feet,
+        )
+
+    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+        """Take which equations along the target were left out; ``redundant (m,)`` of all."""
+        which = equations.tangent >= 0
+        self.left_out = np.zeros_like(self.left_out)
+        self.left_out[equations.contactor[which], equations.tangent[which]] = redundant[which]
+
+    def forces(
+        self, equations: Constraints, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
+    ) -> Traction:
+        """Contact forces across and along the target from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
+        held = equations.tangent >= 0
+        across = kinematics.forces(state, equations.across(), multipliers[~held])
+        share, i = kinematics.force_per_multiplier, np.flatnonzero(held)
+        limit = self._limit(state, across.lam) / share
+        tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
+        np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.test.direction[i])
+        if du is not None and self._follows_slip:
+            sideways, part, stiffness = self.turning(state, kinematics)
+            i = np.flatnonzero(self.slipping(state))
+            taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
+            tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
+        return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
+
+    def has_known_forces(self, state: PairState) -> bool:
+        """Whether friction of contactors of this rank may not grow with the force along the normal."""
+        return bool(self._cone(state)[0].any())
+
+    def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array]:
+        """Friction of contactors that does not grow with the force along the normal: nodes and forces (collective)."""
+        rest, _ = self._cone(state)
+        size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
+        return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
+
+    @property
+    def _follows_slip(self) -> bool:
+        """Whether friction changes as contactors that slip move: in space its direction, and by laws of rate its size."""
+        return self.config.gdim == 3 or of_rate(self.limits.law)
+
+    def turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
+        """How friction changes as contactors that slip move over the target.
+
+        Returns:
+            Projectors across their directions ``(k, g, g)``, the part of the force across them that is taken away ``(k,)``, and
+            stiffnesses, across them and, by laws of rate, along them ``(k, g, g)``.
+        """
+        i = np.flatnonzero(self.slipping(state))
+        T, s = self.frame.tangents[i], self.directions(state)[i]
+        forwards = s[:, :, None] * s[:, None, :]
+        sideways = np.einsum("krg,krh->kgh", T, T) - forwards
+        sideways[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
+        share = kinematics.force_per_multiplier
+        bound, _, rate = self.limits.of(state.lam, self.slipping(state))
+        size = np.linalg.norm(self.pivot.q[i], axis=1)
+        stiffness, part = stick_slip.turn_stiffness(size, (bound / share)[i], self.pivot.stiffness[i])
+        along = (rate / share**2)[i]
+        return sideways, part, stiffness[:, None, None] * sideways + along[:, None, None] * forwards
+
+    def slip_terms(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array, Array] | None:
+        """What slip adds to tangent and residual: directions that are held back, and friction that grows with the speed."""
+        if not self._follows_slip:
+            return None
+        i = np.flatnonzero(self.slipping(state))
+        sideways, part, stiffness = self.turning(state, kinematics)
+        nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
+        (k, m), g = share.shape, self.config.gdim
+        blocks = np.einsum("ka,kb,kgh->kagbh", share, moved, stiffness).reshape(k, m * g, m * g)
+        forces = np.einsum("k,ka,kgh,kh->kag", part, share, sideways, self.pivot.tau[i]).reshape(k, m * g)
+        return nodes, blocks, forces
+
+    def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
+        """Derivatives of the forces of friction with the rows along the target (collective).
+
+        Contactors that stick at feet follow the same points in all directions: no turn of these counts.
+        """
+        slips = self.slipping(state) & (state.lam > 0)
+        held = self.active(state) & _of(state).stick & (not self.discretisation.at_feet)
+        which = np.flatnonzero(slips | held)
+        if not reduced(self.config.comm, len(which)):
+            return []
+        force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)
+        tau = (force / kinematics.force_per_multiplier[:, None])[which]
+        return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau, held[which])]
+
+    # -- from step to step -----------------------------------------------------------------------------------------------
+
+    def anchored(self, state: PairState, kinematics: Kinematics) -> FrictionState:
+        """The state in which contactors that do not stick are anchored where they are."""
+        f = _of(state)
+        if not self.discretisation.pointwise:
+            return f
+        loose = ~f.stick | ~self.active(state) | self.frame.cornered
+        return anchored(f, kinematics, self.discretisation.target, kinematics.points, loose, self.keeps_feet)
+
+    def commit(self, state: PairState, committed: PairState, kinematics: Kinematics) -> PairState:
+        """The state to be committed, with slips, work and new anchors (collective)."""
+        share, f, held = kinematics.force_per_multiplier[:, None], self.anchored(state, kinematics), self.frame.cornered
+        tau, start, end, taken = self.step(state, committed, kinematics)
+        slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
+        slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
+        self._last, worn = None, f.worn
+        if self.wear is not None:
+            slid = rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, (start, end))
+            worn = worn + self.wear.depths(*slid)
+        now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
+        return replace(state, friction=now)
+
+    def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
+        """Friction at a step's end, ways for a unit of it at start and end ``(n, gdim)``, and the work it takes ``(n,)`` (collective)."""
+        share, held, (_, slope) = kinematics.force_per_multiplier[:, None], self.frame.cornered[:, None], self._cone(state)
+        # one that has stuck all along is where its anchor is, whatever rounding says
+        stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
+        start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
+        # a contactor that changes facets slides over both
+        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
+        return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
+
+    def forget(self) -> None:
+        """Another step has been begun from."""
+        self._last = None
+
+    def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
+        """Ways past the target since the last step, for a unit of friction at its start and one at its end ``(n, gdim)`` (collective)."""
+        share = kinematics.force_per_multiplier[:, None]
+        if self._last is None:
+            return (self.frame.away / share,) * 2
+        now = kinematics.ties.relative(self._way_since(self._last))
+        return self.frame.away / self._last.force_per_multiplier[:, None], now / share
+
+
+def _of(state: PairState) -> FrictionState:
+    assert state.friction is not None
+    return state.friction

@@ -1,0 +1,241 @@
+"""Friction by elimination: which contactors stick, which slip and where to. Pure functions of arrays, without mesh or communication.
+
+A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
+the direction s moves as without friction. Where its limit is ``b + mu lambda``, b is a known force along -s, and the rest
+goes along ``n - mu s``: its test row is rotated,
+
+    trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
+
+so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In space the direction follows the motion: with
+the tangential force tau and the slip w since the last step, ``q = c w - tau`` has the direction ``s = q / |q|`` wherever
+``tau = -mu lambda s`` and w is along s, whatever the stiffness c is (semismooth Newton: Alart and Curnier, 1991,
+doi:10.1016/0045-7825(91)90022-X; Hüeber, Stadler and Wohlmuth, 2008, doi:10.1137/060671061).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.contact.seam.state import FrictionState
+
+#: A tangential direction of which prescribed components leave less than this part is prescribed.
+#: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
+PRESCRIBED = 1e-6
+#: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
+#: [heuristic; the diagonal of K; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
+SLIP_STIFFNESS = 0.2
+#: A contactor on the edge of its cone, where the direction could not turn at all, turns as one with this part of the force.
+#: [heuristic; the force q; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
+LEAST_TURN = 0.999
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What friction decides by, where the bodies are or as predicted.
+
+    Attributes:
+        lam: force along the normal ``(n,)``.
+        tau: force along the target ``(n, gdim)``.
+        bound: its limit ``(n,)``.
+        slip: relative motion along the target since the last step ``(n, gdim)``.
+        forced: how far what is prescribed moves contactors over the target, a length ``(n,)``.
+    """
+
+    lam: Array
+    tau: Array
+    bound: Array
+    slip: Array
+    forced: Array
+
+
+@dataclass(frozen=True)
+class FrictionViolations(Violations):
+    """Contactors that break the conditions of contact or of friction, each ``(n,)``.
+
+    Attributes:
+        slide: those that stick with more force than the limit.
+        hold: those whose slip turns against its direction.
+        driven: those that what is prescribed moves over the target.
+        seen: by what that was decided.
+    """
+
+    slide: Bools
+    hold: Bools
+    driven: Bools
+    seen: Seen
+
+    @property
+    def count(self) -> int:
+        """Number of wrong contactors."""
+        return super().count + int(self.slide.sum() + self.hold.sum())
+
+    @property
+    def which(self) -> Bools:
+        """All of them ``(n,)``."""
+        return super().which | self.slide | self.hold
+
+    def among(self, kept: Bools) -> FrictionViolations:
+        """Those alone that are ``kept (n,)``."""
+        own = super().among(kept)
+        return replace(self, **vars(own), slide=self.slide & kept, hold=self.hold & kept)
+
+    def of_contact(self) -> FrictionViolations:
+        """Those alone that break the conditions of contact: they enter or are released."""
+        return self.among(self.enter | self.release)
+
+    def on_first_touch(self, gap: Array, depth: float) -> FrictionViolations:
+        """As that of ``Violations``; friction changes with what is there."""
+        return replace(self, **vars(super().on_first_touch(gap, depth)))
+
+
+def tangents(normals: Array, free: Bools) -> Array:
+    """Orthonormal directions across all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``; zeros where there are fewer.
+
+    Returns:
+        ``(n, gdim - 1, gdim)``.
+    """
+    first, g = normals[:, 0], normals.shape[2]
+    if g == 2:
+        found = np.stack([-first[:, 1], first[:, 0]], axis=1)[:, None]
+    else:
+        # the first is across the axis that the normal is farthest from
+        across = cross_products(first, np.eye(3)[np.abs(first).argmin(axis=1)])
+        found = np.stack([across, cross_products(first, across)], axis=1)
+    size = np.linalg.norm(found, axis=2, keepdims=True)
+    found /= np.where(size > 0, size, 1.0)
+    more = np.flatnonzero(normals[:, 1:].any(axis=(1, 2)) | ~free.all(axis=1))
+    if len(more):
+        found[more] = _left_by(normals[more], free[more])
+    return found
+
+
+def _left_by(normals: Array, free: Bools) -> Array:
+    """``tangents`` where several normals meet, or something is prescribed."""
+    fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normals.shape[2])
+    _, size, axes = np.linalg.svd(np.concatenate([normals, fixed], axis=1))
+    # the last axes are those that neither the normal nor a prescribed component has a part in
+    return np.where((size[:, 1:] < PRESCRIBED)[:, :, None] & free[:, None], axes[:, 1:], 0.0)
+
+
+def along(directions: Array, vectors: Array) -> Array:
+    """Parts of ``vectors (n, gdim)`` in the span of orthonormal ``directions (n, k, gdim)``: ``(n, gdim)``."""
+    return np.asarray(np.einsum("nrg,nr->ng", directions, np.einsum("nrg,ng->nr", directions, vectors)))
+
+
+def find_violations(
+    violated: Violations,
+    state: FrictionState,
+    frictional: Bools,
+    seen: Seen,
+    stiffness: Array,
+    *,
+    force_rounding: Array | float,
+    gap_rounding: float,
+) -> FrictionViolations:
+    """Add the contactors that break the conditions of friction to those that break the conditions of contact.
+
+    Args:
+        violated: contactors that break the conditions of contact.
+        state: of the contactors.
+        frictional: those that friction acts on ``(n,)``.
+        seen: forces and slips.
+        stiffness: of the contactors, a force per length ``(n,)``.
+        force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
+        gap_rounding: lengths below it are zero.
+    """
+    staying = frictional & ~violated.release
+    excess = np.linalg.norm(seen.tau, axis=1) - seen.bound
+    driven = seen.forced > gap_rounding
+    slide = staying & state.stick & ((excess > force_rounding) | driven)
+    forward = np.einsum("ng,ng->n", seen.slip, state.direction)
+    hold = staying & ~state.stick & ((forward < -gap_rounding) | ~state.direction.any(axis=1))
+    excess = np.where(driven, seen.forced * stiffness, excess)
+    violation = np.where(slide, excess, np.where(hold, -forward * stiffness, violated.violation))
+    return FrictionViolations(violated.enter, violated.release, violation, slide, hold, driven, seen)
+
+
+def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> FrictionState:
+    """The state in which contactors that break the conditions of friction have changed between stick and slip.
+
+    Args:
+        state: of the contactors.
+        violated: those to change.
+        tau: contact force along the target ``(n, gdim)``; it points against the slip of those that begin to.
+    """
+    size = np.linalg.norm(tau, axis=1, keepdims=True)
+    direction = np.where(violated.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
+    direction[violated.hold] = 0.0
+    return replace(state, stick=(state.stick | violated.hold) & ~violated.slide, direction=direction)
+
+
+def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:
+    """The state in another active set: new contactors stick, released ones forget.
+
+    Args:
+        state: of the contactors.
+        before: active so far ``(n,)``.
+        now: active from now on ``(n,)``.
+        frictional: contactors with friction ``(n,)``.
+    """
+    stick = (state.stick & now) | (now & ~before & frictional)
+    return replace(state, stick=stick, direction=np.where((now & ~stick)[:, None], state.direction, 0.0))
+
+
+def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
+    """The state in which contactors ``which (n,)`` slip along ``q (n, gdim)``."""
+    size = np.linalg.norm(q, axis=1)
+    i = which & (size > 0)
+    direction = np.where(i[:, None], q / np.where(i, size, 1.0)[:, None], state.direction)
+    return replace(state, direction=direction, stick=state.stick & ~i)
+
+
+def slip_stiffness(own: Array, row: Ints, weight: Array, followed: Array) -> Array:
+    """Stiffness c of contactors that slip in space ``(n,)``.
+
+    The contactor and what it follows resist a relative motion one behind the other: ``1 / k = 1 / k_i + sum_a N_a^2 / k_a``, with the
+    diagonal of K for the stiffness at each node. That of a contactor alone, were it much stiffer than its target, would turn the slip
+    by far less than it turns.
+
+    Args:
+        own: diagonal of K at the contactors ``(n,)``.
+        row: contactor of each term ``(k,)``.
+        weight: by which it follows a node ``(k,)``.
+        followed: diagonal of K there ``(k,)``; zero where nothing is known.
+    """
+    seen = (followed > 0) & (own[row] > 0)
+    there = np.bincount(row[seen], weight[seen] ** 2 * own[row[seen]] / followed[seen], len(own))
+    return SLIP_STIFFNESS * own / (1.0 + there)
+
+
+def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
+    """What holds the direction of slip back: a stiffness across it, and the part of the force across it that is taken away ``(k,)``.
+
+    With ``a = bound / |q|`` these are ``c a / (1 - a)`` and ``a / (1 - a)``.
+
+    Args:
+        size: ``|q|`` ``(k,)``.
+        bound: limit of friction ``(k,)``.
+        c: stiffness c ``(k,)``.
+    """
+    a = np.clip(bound / np.where(size > 0, size, np.inf), 0.0, LEAST_TURN)
+    return c * a / (1.0 - a), a / (1.0 - a)
+
+
+def work(before: Array, now: Array, start: Array, end: Array, cornered: Bools) -> Array:
+    """What friction takes from the bodies over a step ``(n,)``: the mean of its forces over the way along the target.
+
+    Into a corner a contactor slides before the corner holds it; force that would push it on there is none of the way's friction.
+
+    Args:
+        before: friction at the start of the step ``(n, gdim)``.
+        now: at its end ``(n, gdim)``.
+        start: relative motion in the step, past what friction at its start acts on ``(n, gdim)``.
+        end: past what it acts on at its end ``(n, gdim)``.
+        cornered: contactors that a corner holds at the end ``(n,)``.
+    """
+    first, last = (-0.5 * np.einsum("ng,ng->n", tau, way) for tau, way in ((before, start), (now, end)))
+    return np.asarray(first + np.where(cornered, np.maximum(last, 0.0), last))

@@ -1,0 +1,117 @@
+"""Wear of contactors: what slip under pressure takes from the surface in a step, as a depth at its nodes, by which gaps are larger."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.contact.laws.archard import worn_volume
+from uem_dolfinx.contact.laws.law import Field, asked_at
+from uem_dolfinx.contact.mortar.duals import basis_of
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.surfaces import Areas
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+
+#: A step wears too much where its depth, times the contactor's stiffness, is more than this times the force that it is worn under: the
+#: force then overshoots in the next step, and neighbours take turns in bearing (explicit Euler's bound).
+#: [derived; force along the normal; test_wear.py::test_steps_that_wear_too_much]
+MOST_WORN = 2.0
+
+
+class Wear:
+    """Wear of the contactors of one interface by Archard's law.
+
+    A force wears a volume at its contactor. The depth is the combination of the contactor's shape functions with these volumes as its
+    integrals with the functions that forces belong to, the shape functions, or Bernstein's on surfaces of degree 2.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        k: coefficient of wear over hardness.
+        tag: the contactor.
+        areas: of its nodes.
+        lower: lets gaps be larger by depths ``(n,)``; contactors are then to be placed again.
+        name: of the contact, for messages.
+
+    Attributes:
+        k: coefficient at the contactors ``(n,)``.
+
+    Raises:
+        InputError, UserFunctionError: if contactors are points, or if a function of place is no good.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        nodes: Indices,
+        k: Field,
+        *,
+        tag: Tag,
+        areas: Areas,
+        lower: Callable[[Array], None],
+        name: str,
+    ):
+        words = f"contact '{name}': wear"
+        if tag.dim == 0:
+            raise InputError(f"{words} needs areas, and points have none: give facets")
+        self._config, self._nodes, self._lower, self._name, self._warned = config, nodes, lower, name, False
+        self.k = asked_at(config, nodes, words, k, given.NOT_NEGATIVE) if callable(k) else np.full(len(nodes), k)
+        surface = TargetFacets(config, tag, "contactor")
+        #: Integrals of the shape functions at the contactors ``(n,)``.
+        self._areas: Array = areas.reference[nodes]
+        self._dofs, self._to_nodes = surface.dofs, np.linalg.inv(basis_of(surface.shape).T)
+        self._count = config.to_owners(self._dofs.ravel(), np.ones(self._dofs.size))[nodes]
+        own = self._at_facets(self._areas / self._count) @ self._to_nodes
+        self._integrals = config.to_owners(self._dofs.ravel(), own.ravel())[nodes]
+
+    def _at_facets(self, values: Array) -> Array:
+        """Values at the contactors ``(n,)`` at the nodes of this rank's facets ``(m, nn)`` (collective)."""
+        return self._config.from_owners(self._nodes, values[:, None], self._dofs.ravel()).reshape(self._dofs.shape)
+
+    def depths(self, start: Array, end: Array) -> Array:
+        """Depths at nodes that a step wears off ``(n,)``; arguments as of ``worn_volume`` (collective)."""
+        volume = worn_volume(self.k, start, end)
+        nodal = self._at_facets(volume / self._integrals) @ self._to_nodes.T
+        return np.asarray(self._config.to_owners(self._dofs.ravel(), nodal.ravel())[self._nodes] / self._count)
+
+    def apply(self, state: PairState) -> None:
+        """Let gaps be larger by what a state has worn; contactors are to be placed again (collective)."""
+        assert state.friction is not None
+        self._lower(state.friction.worn)
+
+    def volume(self, state: PairState) -> float:
+        """Volume that a state has worn over all ranks (collective)."""
+        assert state.friction is not None
+        return float(reduced(self._config.comm, float(self._areas @ state.friction.worn)))
+
+    def look_at_step(self, before: PairState, now: PairState, normal: Array, stiffness: Array) -> None:
+        """Warn, once, if a step has worn contactors by more than they spring back (collective).
+
+        Args:
+            before: state at its start.
+            now: at its end.
+            normal: of the contactors ``(n, gdim)``.
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``.
+        """
+        if self._warned:
+            return
+        assert before.friction is not None and now.friction is not None
+        force = (now.friction.worn - before.friction.worn) * np.einsum("ng,ng->n", stiffness[self._nodes], normal**2)
+        fast = now.active & (force > MOST_WORN * np.maximum(now.lam, 0.0))
+        count = int(reduced(self._config.comm, int(fast.sum())))
+        if count:
+            self._warned = True
+            logger.warning(
+                "%s: %d contactors wear by more in a step than they spring back under their force, so that they and their neighbours may "
+                "take turns in bearing: let contactors slip by less in a step",
+                self._name,
+                count,
+            )

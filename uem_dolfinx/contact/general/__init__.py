@@ -1,0 +1,1 @@
+"""General contact: any body with any other and with itself."""

@@ -1,0 +1,56 @@
+"""Nodes to the surfaces of many bodies: the discretisation of general contact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.contact.nodes.bernstein import Bernstein
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface, NothingNear
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.neighbours import Neighbour
+from uem_dolfinx.parallel import reduced
+
+
+class AmongBodies(NodeToSurface):
+    """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
+
+    target: Neighbour
+    #: Lists tell what is near.
+    can_be_far = False
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self.ordered_by = target.neighbours.number
+        # of two edges that meet, the one that is over the other's facet follows it
+        self.ends_hold = ~target.neighbours.skin.corners[nodes]
+
+    def place(self, points: Array, state: PairState) -> NodalKinematics:
+        """Project contactors (collective); see ``Discretisation``."""
+        self.target.hold(np.where(state.active, state.facet, -1))
+        if self.target.nothing_near() and not reduced(self.config.comm, bool(state.active.any()), op=MPI.LOR):
+            return NothingNear.at(self, points)
+        return super().place(points, state)
+
+    def begin_step(self) -> None:
+        """Lists are those that the step began with."""
+        super().begin_step()
+        self.target.neighbours.begin_step()
+
+    def look_farther(self) -> bool:
+        """Reach four times as far: whether that is not beyond the whole model yet."""
+        return self.target.number == 0 and self.target.neighbours.look_farther()
+
+    def commit(self) -> None:
+        """Nodes are in front of facets from where they are now."""
+        super().commit()
+        self.target.neighbours.commit()
+
+
+class AmongQuadraticBodies(AmongBodies, Bernstein):
+    """The same with control gaps, of degree 2."""

@@ -1,0 +1,109 @@
+"""Results of general contact by pairs: which bodies touch, with which forces and moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general.parts import BodiesContact
+from uem_dolfinx.contact.results import Resultant, moments
+from uem_dolfinx.geometry.skin import Skin
+
+
+class Touch(NamedTuple):
+    """Two bodies that touch, or a body and a rigid surface.
+
+    Attributes:
+        first: name of the one.
+        second: name of the other.
+        n_active: number of contactors that touch.
+        force: on the first ``(gdim,)``.
+    """
+
+    first: str
+    second: str
+    n_active: int
+    force: Array
+
+
+class Pair(NamedTuple):
+    """What passes between two bodies, or a body and a rigid surface.
+
+    Attributes:
+        touch: names, number of contactors and force.
+        moment: on the first.
+        normal: sum of the forces across the surfaces.
+        heat: power from the first to the second of one field, the heat of friction aside.
+    """
+
+    touch: Touch
+    moment: Array
+    normal: float
+    heat: float
+
+
+def sums_of_pairs(
+    parts: Sequence[Contact], skin: Skin, names: Sequence[str], rigid: Sequence[str], centre: Array, field: int | None = None
+) -> list[Pair]:
+    """Sums over the contactors of each pair of bodies, sorted by their numbers in the mesh's input (collective).
+
+    Args:
+        parts: the contacts that a general contact consists of.
+        skin: surfaces of the bodies.
+        names: of the bodies ``(n_bodies,)``.
+        rigid: names of the rigid surfaces, of every part.
+        centre: point that moments are taken about ``(gdim,)``.
+        field: whose power is summed up; None for no power.
+    """
+    config, n = skin.config, skin.n_bodies + len(parts)
+    g = config.gdim
+    found: dict[tuple[int, int], Array] = {}
+    for k, part in enumerate(parts):
+        pair = part.pair
+        # rows of mortar have the contactors around their own in them, active or not
+        active = pair.trial.active
+        heat = sum((one.power() for one in pair.heats if one.law.field == field), np.zeros(len(active)))
+        i = np.flatnonzero(active | pair.trial.force.any(axis=1) | (heat != 0))
+        across = pair.pressing()[0]
+        second = np.full(len(i), skin.n_bodies + k)
+        if isinstance(part, BodiesContact):
+            second = part.opposite(skin)[i]
+        first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
+        turning = moments(config.of_circles(pair.points[i]) - centre, force)
+        rows = np.column_stack([active[i], across[i], heat[i], force, turning])
+        keys, inverse = np.unique(first * n + second, return_inverse=True)
+        sums = np.zeros((len(keys), rows.shape[1]))
+        np.add.at(sums, inverse.ravel(), rows)
+        for key, row in (item for own in config.comm.allgather(list(zip(keys.tolist(), sums))) for item in own):
+            a, b = divmod(key, n)
+            # nodes of either of two bodies may follow the other
+            a, b, sign = (a, b, 1.0) if a <= b else (b, a, -1.0)
+            found[a, b] = found.get((a, b), 0.0) + row * np.where(np.arange(len(row)) < 2, 1.0, sign)
+    called = [*names, *rigid]
+    of = ((called[a], called[b], row) for (a, b), row in sorted(found.items()))
+    return [Pair(Touch(a, b, int(row[0]), row[3 : 3 + g]), row[3 + g :], float(row[1]), float(row[2])) for a, b, row in of]
+
+
+def between(
+    pairs: Sequence[Pair], names: Sequence[str], first: str, second: str | None, nothing: Resultant
+) -> tuple[Resultant, float]:
+    """Force and moment on a body from another one, None for all of them, and the power that goes there.
+
+    Raises:
+        InputError: for a name that is not among all ``names``.
+    """
+    given.word("first", first, names)
+    if second is not None:
+        given.word("second", second, names)
+    total, power = nothing, 0.0
+    for (a, b, _, force), moment, normal, heat in pairs:
+        if first in (a, b) and second in (None, b if first == a else a):
+            sign = 1.0 if first == a else -1.0
+            total = Resultant(total.force + sign * force, total.moment + sign * moment, total.normal + normal)
+            power += sign * heat
+    return total, power

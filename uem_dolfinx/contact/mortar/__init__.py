@@ -1,0 +1,1 @@
+"""The mortar discretisation: weighted gaps of dual shape functions over segments."""

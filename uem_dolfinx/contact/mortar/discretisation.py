@@ -1,0 +1,353 @@
+"""Mortar: uniting equations from integrals over segments, exact on any pair of meshes.
+
+Where a node's part of the contactor is covered by the target, its equation says that the gap vanishes in the mean, weighted with the
+node's dual function. The equations eliminate one component of the node each, like those of ``node_to_surface``; their multipliers
+are pressures, and the nodal forces balance in force and moment. Nodes that are farther from the target than a facet, until they come
+nearer, and corners whose facets do not face it, have the equation of a node against the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.mortar.duals import HARDLY_COVERED, Covered, dual_functions
+from uem_dolfinx.contact.mortar.placement import Contactors, MortarKinematics
+from uem_dolfinx.contact.mortar.rows import Pieces, Terms, WeightedRows, terms_of
+from uem_dolfinx.contact.mortar.segment_motions import slopes
+from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_normals
+from uem_dolfinx.contact.seam.placement import GapRows
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.opposite import FACING, find_opposite
+from uem_dolfinx.geometry.overlaps import Planes, Segments, overlap
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
+from uem_dolfinx.geometry.shapes import tangents
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
+
+#: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
+#: [convention; radians; test_mortar.py::test_parallel_facets]
+PARALLEL = 1e-10
+#: A rigid surface covers a facet if the cosine of the angle between its normal and the facet's reversed is larger at all points: the
+#: rows of small and fixed sliding are kept along the facet's normal.
+#: [convention; cosine; test_mortar.py::test_rigid_surfaces_cover_what_faces_them]
+COVERS = 0.75
+#: One that it has covered before stays covered as long as this cosine is larger: a facet that turns with what covers it would else be
+#: covered and let go for ever.
+#: [convention; cosine; test_mortar.py::test_rigid_surfaces_go_on_covering]
+GOES_ON_COVERING = 0.7
+
+
+class Mortar(Contactors):
+    """Implements ``Discretisation``: contactor facets against the surface of one target; arguments as those of ``Contactors``."""
+
+    chained, two_pass = True, False
+    pointwise = False
+
+    #: Whether the last rows were made when no facets had faced each other in the step.
+    _afresh = False
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
+        super().__init__(config, nodes, target, surface=surface, **how)
+        # tells equal nodes apart, alike in any partition
+        nn = surface.dofs.shape[1]
+        code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
+        self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
+        #: The last search that rows were made from, the contactors with averaged normals and what covered them before, and the rows; a
+        #: search finds the same object as long as nothing moves.
+        self._united: tuple[Projection, Ints, WeightedRows] | None = None
+        #: Rows that a contact with small or fixed sliding keeps.
+        self._kept: WeightedRows | None = None
+        #: Motion of a rigid target when they were made.
+        self._kept_at: Motion | None = None
+
+    # -- placement -------------------------------------------------------------------------------------------------------
+
+    def place(self, points: Array, state: PairState) -> MortarKinematics:
+        """Project contactors and find the segments of their facets (collective); see ``Discretisation``."""
+        if self.sliding == "finite":
+            nearest, locked = self.on_target(points), state.changes >= MOST_CHANGES
+            known = np.column_stack([locked, state.cover])
+            same = self._united is not None and self._united[0] is nearest and np.array_equal(self._united[1], known)
+            if not reduced(self.config.comm, same, op=MPI.LAND):
+                self._afresh = not len(self.faced)
+                placed = nearest
+                if self.target.faceted and isinstance(nearest, FacetProjection):
+                    placed = with_averaged_normals(nearest, locked, points)
+                self._united = nearest, known, self._unite(placed, points, self.remembered.shares(state.cover))
+            assert self._united is not None
+            rows = self._united[2]
+        elif self._kept is None:
+            nearest = self.take_feet(points)
+            rows = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
+            self._kept, self._kept_at = rows, self.target.motion
+            if self.offset is not None and not self.target.n_nodes:
+                # of heights over a rigid surface, which offsets are taken from anew
+                self._kept = replace(
+                    rows, equations=replace(rows.equations, gap=rows.equations.gap + self._weighted_offset(rows))
+                )
+        else:
+            nearest = self.on_target(points, self.anchor)
+            rows = self._follow(self._kept, nearest)
+        gap = rows.length * rows.equations.gap
+        seen: Any = replace(nearest, gap=gap, normal=rows.plain.direction)  # type: ignore[type-var]
+        if self.target.n_nodes:
+            # forces and their reactions lie on one line through the contactor
+            seen = seen.with_rows(np.flatnonzero(rows.covered), {"foot": points[rows.covered]})
+        movable = np.linalg.norm(seen.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
+        if self.prescribed:
+            movable |= self._can_move(rows.plain)
+        return MortarKinematics(self, points, seen, nearest, gap, rows, movable)
+
+    def _can_move(self, equations: UnitingEquations) -> Bools:
+        """Contactors whose equations follow anything that can move (collective)."""
+        free = self.config.ask_owners(equations.followed, self.free_of_owned.astype(float))
+        can = np.zeros(len(equations), dtype=bool)
+        can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
+        return can
+
+    def _follow(self, rows: WeightedRows, nearest: Projection) -> WeightedRows:
+        """The same rows where contactors and target are now (collective)."""
+        eq, n = rows.equations, self.config.n_owned
+        if self.target.n_nodes:
+            gap = self._along(eq, self.config.x[:n])
+        else:
+            assert self.anchor is not None
+            eq = self._turned(eq)
+            # what the nodes have come nearer, as a displacement along the rows
+            lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
+            way = np.zeros((n, self.config.gdim))
+            way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
+            gap = eq.gap + self._along(eq, way)
+        if self.offset is not None:
+            gap = gap - self._weighted_offset(rows)
+        moved = replace(eq, gap=gap)
+        return replace(rows, equations=moved, plain=moved, normal=eq.direction)
+
+    def _along(self, equations: UnitingEquations, values: Array) -> Array:
+        """Left sides of equations for the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
+        return GapRows.along_normals(self.config, equations, np.ones(len(equations)), self.free).along(values)
+
+    def _turned(self, equations: UnitingEquations) -> UnitingEquations:
+        """Kept rows, which turn with a rigid target."""
+        now, then = self.target.motion, self._kept_at
+        if now is then:
+            return equations
+        still = Motion.none(self.config.gdim)
+        Q = (now or still).Q @ (then or still).Q.T
+        return replace(equations, direction=equations.direction @ Q.T, coefficients=equations.coefficients @ Q.T)
+
+    # -- rows ------------------------------------------------------------------------------------------------------------
+
+    @timed("segments")
+    def _unite(self, nearest: Projection, points: Array, before: Bools) -> WeightedRows:
+        """Equations of all contactors; ``before (m, nn)`` are shares of facets that the target covered before (collective)."""
+        surface, config, nn = self.surface, self.config, self.surface.dofs.shape[1]
+        x = surface.x
+        away = np.linalg.norm(points - nearest.foot, axis=1) if self.target.n_nodes else np.abs(nearest.height)
+        away = config.from_owners(self.nodes, away[:, None], surface.dofs.ravel())[:, 0].reshape(-1, nn)
+        size = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) * 2
+        near = np.ones(len(x), dtype=bool)
+        if self.target.n_nodes and self.sliding == "finite":
+            near = away.min(axis=1) < 2 * size
+        facets = np.flatnonzero(near)
+        planes = Planes.of(surface.shape, x, surface.sign).take(facets)
+        reach = away[facets].max(axis=1, initial=0.0) / FACING + 0.5 * size[facets]
+        if isinstance(self.target, MeshTarget):
+            pieces = self._over_segments(planes, x[facets], facets, reach)
+        else:
+            pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
+        segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
+        phi = surface.shape.functions(segments.xi)
+        b = phi if surface.shape.degree == 1 else self.basis.at(segments.xi)
+        radius, offset = None, None
+        if config.axisymmetric:
+            radius = np.einsum("qa,qa->q", phi, x[facets][pairs[segments.pair], :, 0])
+            segments = replace(segments, weight=2 * np.pi * radius * segments.weight)
+        dofs, offsets = surface.dofs[facets], self._offsets(facets)
+        if offsets is not None:
+            offset = np.einsum("qa,qa->q", phi, offsets[pairs[segments.pair]])
+        covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]), offset)
+        part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
+        ratio = part / np.where(full > 0, full, 1.0)
+        duals = dual_functions(covered, self.precedence(ratio[dofs], dofs), before[facets])
+        other = self.target.shape if isinstance(self.target, MeshTarget) else None
+        at = SegmentPoints(
+            segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
+            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius, offsets,
+        )  # fmt: skip
+        rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
+        return replace(rows, facing=facing)
+
+    def told(self, facets: Ints) -> Array | None:
+        """What tells which facets of the target those of the contactor ``(m,)`` may touch ``(m, k)``; None where they may touch all."""
+        return None
+
+    def _offsets(self, facets: Ints) -> Array | None:
+        """Offsets at the nodes of facets ``(m, nn)``; None for none (collective)."""
+        if self.offset is None:
+            return None
+        dofs = self.surface.dofs[facets]
+        return self.config.from_owners(self.nodes, self.offset[:, None], dofs.ravel()).reshape(dofs.shape)
+
+    def _weighted_offset(self, rows: WeightedRows) -> Array:
+        """What the present offsets take from the gaps of rows, which may have been made with others ``(n,)`` (collective)."""
+        offsets = self._offsets(rows.facets)
+        assert offsets is not None and self.offset is not None
+        total, length = self._over_lengths(rows, offsets)
+        return np.where(rows.covered, total / length, self.offset)
+
+    def _over_lengths(self, rows: WeightedRows, values: Array) -> tuple[Array, Array]:
+        """Weighted ``values (m, nn)`` at the facets' nodes, and what plain rows were divided by ``(n,)`` each (collective)."""
+        at = rows.points
+        coefficients = at.duals.C @ self.basis.T
+        weighted = np.einsum("mij,mj->mi", coefficients, values)
+        own = np.einsum("mii,mg->mig", coefficients, at.planes.normal)
+        parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, 1 + self.config.gdim)
+        total = self.config.add_at_owners(at.nodes.ravel(), parts)[self.nodes]
+        return total[:, 0], np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
+
+    def with_variation(self, kinematics: MortarKinematics) -> MortarKinematics:
+        """The kinematics with rows that are derivatives of the gaps where these do not vanish on parallel facets, too (collective)."""
+        rows = kinematics.rows
+        if self.sliding != "finite":
+            return kinematics
+        _, scale = self._over_lengths(rows, np.zeros(rows.points.nodes.shape))
+        variation, _ = self.elimination.variation(rows.points, scale, rows.plain)
+        equations, length = self.elimination.derivatives(rows.plain, variation)
+        return replace(kinematics, rows=replace(rows, equations=equations, length=length))
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again."""
+        super().set_offset(offset)
+        self._united = None
+
+    def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
+        """Segments against a mesh (collective)."""
+        assert isinstance(self.target, MeshTarget)
+        shape = self.target.shape
+        keys = self.surface.keys[facets]
+        found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.told(facets))
+        e = found.facet
+        s = overlap(planes, (self.surface.shape, x), (shape, found.x), self.surface.sign[facets], e)
+        # what lies behind the facets in reach is no contact
+        weight = np.bincount(s.pair, s.weight, minlength=len(e))
+        mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
+        upon = (weight > 0) & (np.abs(mean) <= reach[e])
+        kept, number = upon[s.pair], np.cumsum(upon) - 1
+        s = Segments(number[s.pair[kept]], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
+        e, y = e[upon], found.x[upon]
+        to_gap = slopes(shape, y, planes.normal[e], s.pair, s.eta)
+        facing = np.column_stack([keys[e], found.key[upon]])
+        return Pieces(s, e, to_gap, shape.functions(s.eta), found.nodes[upon], y, None, facing)
+
+    def _over_facets(self, planes: Planes, x: Array, least: Array) -> Pieces:
+        """Whole facets against a rigid surface, which covers all that face it with cosines above ``least (m,)``."""
+        shape, (m, g) = self.surface.shape, planes.origin.shape
+        points, weights = forms.quadrature_rule(shape.cell, 4 * shape.degree)
+        q = len(weights)
+        xi, row = np.tile(points, (m, 1)), np.repeat(np.arange(m), q)
+        tab = shape.tabulate(xi)
+        p = self.target.project(np.einsum("qa,qag->qg", tab.N, x[row]))
+        lean = -np.einsum("qg,qg->q", p.normal, planes.normal[row])
+        flat = np.einsum("qfg,qeg->qfe", tangents(tab, x[row]), planes.axes[row][:, :-1])
+        weight = np.tile(weights, m) * np.abs(np.linalg.det(flat))
+        i = np.flatnonzero((lean.reshape(m, q) > least[:, None]).all(axis=1)[row])
+        none = np.zeros((len(i), 0))
+        s = Segments(row[i], xi[i], none, weight[i], p.gap[i])
+        nodes, y = np.zeros((m, 0), np.int64), np.zeros((m, 0, g))
+        return Pieces(s, np.arange(m), p.normal[i], none, nodes, y, p.hessians(i), np.zeros((0, 2), np.int64))
+
+    def precedence(self, ratio: Array, dofs: Indices) -> Array:
+        """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
+
+        A node's equation may take in nodes that come after it, so that no equation follows itself: middles come before vertices.
+
+        Args:
+            ratio: part of the node's share of all its facets that is covered ``(m, nn)``.
+            dofs: local nodes of the facets ``(m, nn)``.
+        """
+        code = 1e-7 * self._code[dofs]
+        well = 1.0 + self.basis.rank + 0.5 * np.round(np.minimum(ratio, 1.0), 6) + code
+        return np.where(ratio >= HARDLY_COVERED, well, ratio * (1 + code))
+
+    def _gather(self, at: SegmentPoints, facets: Ints, ratio: Array, stretch: Array, nearest: Projection) -> WeightedRows:
+        """Add up the facets' parts of each row at the owner of its node, and complete them (collective)."""
+        config, n = self.config, len(self.nodes)
+        own, e, normal, A, C = at.nodes, at.facet, -at.planes.normal, at.duals.A, at.duals.C
+        coefficients = C @ self.basis.T
+        on_facet = coefficients[:, :, :, None] * normal[:, None, None]
+        followed = (A[e] @ at.covered.N)[..., None]
+        on_target = followed * normal[e][:, None, None]
+        area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", A, at.covered.G)
+        f, i = np.nonzero(area > 0)
+        values = np.column_stack([on_facet[f, i, i], gap[f, i], area[f, i, None] * normal[f]])
+        total = config.add_at_owners(own[f, i], values)[self.nodes]
+        direction, gap, size = total[:, : config.gdim], total[:, config.gdim], np.linalg.norm(total[:, config.gdim + 1 :], axis=1)
+        length = np.linalg.norm(direction, axis=1)
+        is_covered = length > 0
+        scale = np.where(is_covered, length, 1.0)
+        direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
+        # a row follows its own facets' other nodes where it takes them in, and the target's
+        other = ~np.eye(own.shape[1], dtype=bool)
+        terms = [terms_of(own, own, -on_facet, other & (coefficients != 0)), terms_of(own[e], at.opposite, on_target)]
+        row, term, value = self.elimination.at_owners(terms, scale)
+        # the rest keep their places on the target
+        alone = np.flatnonzero(~is_covered)
+        k, a = np.nonzero(nearest.nodes[alone] >= 0)
+        row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
+        value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
+        gap = np.where(is_covered, gap / scale, nearest.gap)
+        variation: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
+        length, parts = np.ones(n), np.einsum("mii,mg->mig", coefficients, normal)
+        plain_parts = parts
+        plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
+        if self.sliding == "finite" and reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
+            variation, more = self.elimination.variation(at, scale, plain)
+            parts = parts + more
+            equations, length = self.elimination.derivatives(plain, variation)
+        share = np.where(is_covered, size / scale, 1.0)
+        weights = frictionless = slope = push = whole = None
+        if self.frictional:
+            along = self.elimination.of_themselves(plain, variation)
+            slope = np.linalg.norm(along, axis=1)
+            pushed = np.linalg.norm([plain_parts[f, i], parts[f, i]], axis=2).T
+            pushed = config.add_at_owners(own[f, i], pushed)[self.nodes]
+            taken = np.bincount(variation[0], minlength=n) > 0
+            push = np.where(is_covered, np.where(taken, pushed[:, 1], pushed[:, 0]) / scale, 1.0)
+            frictionless = along / slope[:, None]
+            whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
+            means = [
+                terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
+                terms_of(own[e], at.opposite, followed),
+            ]
+            whole = np.where(is_covered, whole, 1.0)
+            r, t, w = self.elimination.at_owners(means, whole)
+            near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
+            weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
+        return WeightedRows(
+            equations, length, plain, at, facets, is_covered, ratio, size, stretch, share, weights, frictionless, slope, push, parts, whole,
+        )  # fmt: skip
+
+    def begin_step(self) -> None:
+        """Facets that no longer face each other are forgotten."""
+        super().begin_step()
+        if not self._afresh:
+            self._united = None
+
+    def let_go(self) -> None:
+        """Keep no feet and no segments."""
+        super().let_go()
+        self._kept = None

@@ -1,0 +1,187 @@
+"""Second derivatives of weighted gaps where the target ends over contactor facets: what is covered changes, and dual functions with it.
+
+With multipliers l, and f the foremost node, the weighted gaps of a facet sum up to
+
+    int (l_f + w . b) g    with    w = M^-1 (m D),    m_j = l_j - l_f for nodes with functions of their own, zero for others,
+
+and grow with what is covered by the integral over its boundary of ``h v``, where v is how fast that moves outward and
+
+    h = l_f g + sum_j m_j b_j c_j + w . b (g - b . c)    with    c = M^-1 int b g.
+
+The place of the target's boundary on the contactor facet, the height of the gap there, c and w change with the displacement; the
+derivatives of ``int h v`` with these, and what ends change in the derivatives inside, are symmetric together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.mortar.duals import add_up, basis_of
+from uem_dolfinx.contact.mortar.segment_motions import Motions, Sides, dual_tangents, ring_of, skew, sum_of_products
+from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.geometry.shapes import FacetShape, tangents
+
+#: Pairs of facets whose second derivatives are made at once, in a few times the memory that these take.
+#: [bound; pairs; -]
+AT_ONCE = 1000
+
+
+def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
+    """Minus the second derivatives of weighted gaps times their multipliers, those of the target's ends among them.
+
+    Args:
+        at: points of the segments.
+        pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
+
+    Returns:
+        Lists of global nodes ``(p, c)`` and symmetric blocks ``(p, c gdim, c gdim)``.
+    """
+    pressing, parts = np.flatnonzero(pressure.any(axis=1)), []
+    last = np.cumsum(np.bincount(at.facet, minlength=len(pressure))[pressing])
+    for some in np.split(pressing, np.flatnonzero(np.diff(last // AT_ONCE)) + 1):
+        alone = np.zeros_like(pressure)
+        alone[some] = pressure[some]
+        parts.append(at.curvature(alone))
+    if at.other is not None:
+        which = at.partly_covered()
+        which = which[(pressure[at.facet[which]] != 0).any(axis=1)]
+        if len(which):
+            parts += [(nodes, -blocks) for nodes, blocks in _Ends(at, at.other, pressure, which).second_derivatives()]
+    return parts
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """Ends of the target over contactor facets that press.
+
+    Attributes:
+        at: points of the segments.
+        other: shape of the target's facets.
+        pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
+        which: pairs, with all that are opposite of a facet ``(p,)``.
+    """
+
+    at: SegmentPoints
+    other: FacetShape
+    pressure: Array
+    which: Ints
+
+    def second_derivatives(self) -> list[tuple[Ints, Array]]:
+        """Global nodes and symmetric blocks: of each pair, and of each with all that are opposite of the same facet."""
+        at, which = self.at, self.which
+        sides = at.sides(self.other, which).at_ends()
+        half = self._local(sides)
+        if self.other.dim == 2:
+            half += self._at_cuts(at.sides(self.other, which, cuts=True).at_ends())
+        e = at.facet[which]
+        nodes = np.concatenate([at.nodes[e], at.opposite[which]], axis=1)
+        return [(nodes, half + half.transpose(0, 2, 1)), self._in_the_mean(sides)]
+
+    def _factors(self, e: Ints, s: Sides) -> tuple[Array, Array, Array, Array]:
+        """Of places on facets ``e (q,)``: ``l_f + w . b``, h ``(q,)``, how h changes with b ``(q, nc)``, and ``g - b . c`` ``(q,)``."""
+        duals = self.at.duals
+        fore, more, w, c = (values[e] for values in self._of_facets())
+        wb, left = np.einsum("qb,qb->q", w, s.b), s.gap - s.offset - np.einsum("qb,qb->q", s.b, duals.gap[e])
+        h = fore * (s.gap - s.offset) + np.einsum("qb,qb->q", more * s.b, c) + wb * left
+        return fore + wb, h, more * c + w * left[:, None] - wb[:, None] * c, left
+
+    def _of_facets(self) -> tuple[Array, Array, Array, Array]:
+        """l_f ``(m,)``, and m, w and c of the facets ``(m, nc)``."""
+        duals, pressure = self.at.duals, self.pressure
+        fore = pressure[np.arange(len(pressure)), duals.foremost]
+        more = np.where(duals.own, pressure - fore[:, None], 0.0)
+        return fore, more, np.einsum("mij,mj->mi", duals.inverse, more * self.at.covered.D), duals.gap
+
+    def _local(self, s: Sides) -> Array:
+        """Half of what is of one pair ``(p, (nc + nt) gdim, (nc + nt) gdim)``."""
+        at, k = self.at, len(self.which)
+        e = at.facet[self.which[s.pair]]
+        n, size = at.planes.normal[e], at.planes.size[e]
+        press, h, with_b, _ = self._factors(e, s)
+        v, grown = -s.way, s.motions.of_area(n / size[:, None])
+        rise = s.motions.along(s.t - n) + 2 * s.gap[:, None, None] * grown
+        # places on the contactor facet, and how the functions change there
+        tab = at.shape.tabulate(s.xi)
+        over = dual_tangents(tangents(tab, at.x[e]), n)
+        if at.offsets is not None:
+            for f, slope in enumerate(np.einsum("qaf,qa->fq", tab.dN, at.offsets[e])):
+                rise = rise + slope[:, None, None] * s.motions.along(over[:, f])
+        half = sum_of_products(s.pair, 0.5 * s.weight * press, v, rise, k)
+        half += sum_of_products(s.pair, s.weight * h, grown, v, k)
+        of_b = np.einsum("qb,qbf->qf", with_b, np.einsum("qaf,ab->qbf", tab.dN, np.linalg.inv(basis_of(at.shape).T)))
+        if at.radius is not None:
+            # circles grow as the place goes outward, and with the nodes
+            r, wider = np.einsum("qa,qa->q", s.motions.phi, at.x[e][:, :, 0]), np.zeros(v.shape)
+            of_b += (h / r)[:, None] * np.einsum("qaf,qa->qf", tab.dN, at.x[e][:, :, 0])
+            wider[:, : s.motions.nc, 0] = s.motions.phi / r[:, None]
+            half += sum_of_products(s.pair, s.weight * h, wider, v, k)
+        weight = s.weight * h
+        for f in range(at.shape.dim):
+            goes = -s.motions.along(over[:, f])
+            half += sum_of_products(s.pair, 0.5 * s.weight * of_b[:, f], v, goes, k)
+            spread = np.zeros(v.shape)
+            spread[:, : s.motions.nc] = tab.dN[:, :, f, None] * s.outward[:, None]
+            half -= sum_of_products(s.pair, weight, spread, goes, k)
+        sinks = s.motions.along(n) / size[:, None, None]
+        half += sum_of_products(s.pair, weight, sinks, s.motions.of_area(s.outward), k)
+        if at.shape.dim == 1:
+            return half
+        # sides turn, and area vectors are bilinear
+        along = np.einsum("qfg,qg->qf", over, s.ahead)
+        step = Motions(
+            np.einsum("qaf,qf->qa", tab.dN, along), s.shift, np.einsum("qg,qg->q", s.t, s.ahead) / size, s.motions.turning
+        )
+        half += sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.outward), step.along(s.ahead), k)
+        half -= sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.ahead), step.along(s.outward), k)
+        ring = ring_of(at.shape)
+        c, g = len(ring), n.shape[1]
+        vector = add_up(s.pair, (at.sign[e] * weight * s.gap / size)[:, None] * s.outward, k)
+        bent = half.reshape(k, v.shape[1], g, v.shape[1], g)
+        bent[:, :c, :, :c] += 0.25 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
+        return half
+
+    def _at_cuts(self, s: Sides) -> Array:
+        """Half of what comes from places where sides leave the contactor facet, which move along its own sides."""
+        e = self.at.facet[self.which[s.pair]]
+        _, h, _, _ = self._factors(e, s)
+        return sum_of_products(s.pair, 0.5 * s.weight * h, -s.way, -s.motions.along(s.cut), len(self.which))
+
+    def _in_the_mean(self, s: Sides) -> tuple[Ints, Array]:
+        """What goes through c and w, with which all that is opposite of a facet has to do."""
+        at, which, k = self.at, self.which, len(self.which)
+        nc, nt, g = at.nodes.shape[1], at.opposite.shape[1], at.x.shape[2]
+        width = (nc + nt) * g
+        e = at.facet[which[s.pair]]
+        _, more, w, _ = self._of_facets()
+        _, _, _, left = self._factors(e, s)
+        wb = np.einsum("qb,qb->q", w[e], s.b)
+        v = (-s.way * s.weight[:, None, None]).reshape(len(e), 1, width)
+        z = add_up(s.pair, (((more[e] - wb[:, None]) * s.b)[:, :, None] * v).reshape(len(e), nc * width), k)
+        y = add_up(s.pair, ((s.b * left[:, None])[:, :, None] * v).reshape(len(e), nc * width), k)
+        # what the gap's projection changes by inside
+        place = np.full(len(at.facet), -1, dtype=np.int64)
+        place[which] = np.arange(k)
+        q = np.flatnonzero(place[at.segments.pair] >= 0)
+        pair = place[at.segments.pair[q]]
+        f = at.facet[which[pair]]
+        n, size, gap = at.planes.normal[f], at.planes.size[f], at.segments.gap[q]
+        inside = Motions(at.phi[q], at.N[q], gap / size, at.turning[f])
+        change = inside.along(at.to_gap[q]) + inside.of_area((gap / size)[:, None] * n)
+        weighted = (at.segments.weight[q, None] * at.b[q])[:, :, None] * change.reshape(len(q), 1, width)
+        y += add_up(pair, weighted.reshape(len(q), nc * width), k)
+        z, y = z.reshape(k, nc, width), y.reshape(k, nc, width)
+        facet = at.facet[which]
+        here = np.flatnonzero(z.any(axis=(1, 2)))
+        i, j = np.nonzero(facet[here, None] == facet[None, :])
+        i = here[i]
+        left_part, right_part = np.zeros((2, len(i), nc, nc + 2 * nt, g))
+        left_part[:, :, : nc + nt] = z[i].reshape(len(i), nc, nc + nt, g)
+        own = y[j].reshape(len(i), nc, nc + nt, g)
+        right_part[:, :, :nc], right_part[:, :, nc + nt :] = own[:, :, :nc], own[:, :, nc:]
+        wide = (nc + 2 * nt) * g
+        half = left_part.reshape(-1, nc, wide).transpose(0, 2, 1) @ at.duals.inverse[facet[i]] @ right_part.reshape(-1, nc, wide)
+        nodes = np.concatenate([at.nodes[facet[i]], at.opposite[which[i]], at.opposite[which[j]]], axis=1)
+        return nodes, half + half.transpose(0, 2, 1)

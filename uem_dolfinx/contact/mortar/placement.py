@@ -1,0 +1,363 @@
+"""Weighted gaps of a mortar discretisation: what contact asks of the rows that integrals over segments have made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, cross_products
+from uem_dolfinx.contact.mortar.duals import Basis, basis_of
+from uem_dolfinx.contact.mortar.ends import curvature
+from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
+from uem_dolfinx.contact.mortar.turning import Frictional, turning
+from uem_dolfinx.contact.seam.base import OnTarget
+from uem_dolfinx.contact.seam.ends import past_end
+from uem_dolfinx.contact.seam.placement import Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.relative_motion import Ties
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.overlaps import Planes
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
+
+#: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
+#: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
+COVERED_AGAIN = 0.5
+
+
+class Contactors(OnTarget):
+    """Contactor facets of one target; other arguments as those of ``OnTarget``.
+
+    Args:
+        surface: the contactor's facets.
+
+    Attributes:
+        faced: contactor and target facets that have faced each other in this step, by what tells them in any partition ``(p, 2)``.
+    """
+
+    at_feet = False
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self.surface = surface
+        self.basis: Basis = basis_of(surface.shape)
+        self.elimination = Elimination(config, nodes)
+        self.remembered = Remembered(config, nodes, surface)
+        self.faced: Ints = np.zeros((0, 2), np.int64)
+
+    def begin_step(self) -> None:
+        """As of ``OnTarget``; which facets have faced each other is forgotten."""
+        super().begin_step()
+        self.faced = np.zeros((0, 2), np.int64)
+
+    def sizes(self, x: Array) -> Array:
+        """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
+        return Planes.of(self.surface.shape, x, self.surface.sign).size
+
+    def growth(self, facets: Ints, x: Array) -> Array:
+        """Derivatives of ``sizes`` of some facets by their nodes at ``x (m, nn, gdim)``: ``(m, nn, gdim)``."""
+        planes, out = Planes.of(self.surface.shape, x, self.surface.sign[facets]), np.zeros(x.shape)
+        if self.surface.shape.dim == 1:
+            out[:, 1] = planes.axes[:, 0]
+            out[:, 0] = -out[:, 1]
+            return out
+        # twice the area vector of a ring of corners is the sum of the products of each with the next
+        ring, n = self.surface.shape.ring, planes.normal * self.surface.sign[facets, None]
+        corners = x[:, ring]
+        across = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
+        out[:, ring] = 0.5 * cross_products(across, n[:, None])
+        return out
+
+    def shares(self, size: Array, x: Array) -> Array:
+        """Integrals of the basis over facets of a ``size (m,)`` with nodes at ``x (m, nn, gdim)``: ``(m, nn)``."""
+        if self.config.axisymmetric:
+            return 2 * np.pi * size[:, None] * (x[:, :, 0] @ self.basis.products.T)
+        return size[:, None] * self.basis.mean
+
+    def share_slopes(self, facets: Ints, x: Array) -> Array:
+        """Derivatives of the ``shares`` of some facets by their nodes at ``x (m, nn, gdim)``: ``(m, nn, nn, gdim)``."""
+        size = Planes.of(self.surface.shape, x, self.surface.sign[facets]).size
+        out = (self.shares(size, x) / size[:, None])[:, :, None, None] * self.growth(facets, x)[:, None]
+        if self.config.axisymmetric:
+            out[..., 0] += 2 * np.pi * size[:, None, None] * self.basis.products
+        return out
+
+    def stretch(self, facets: Ints, size: Array) -> Array:
+        """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
+        dofs, X = self.surface.dofs[facets], self.config.X[self.surface.dofs]
+        shares = self.shares(size, self.surface.x[facets]), self.shares(self.sizes(X), X)[facets]
+        now, then = (self.config.to_owners(dofs.ravel(), own.ravel())[self.nodes] for own in shares)
+        return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
+
+
+@dataclass(frozen=True)
+class MortarKinematics:
+    """Implements ``Kinematics``: weighted gaps.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        points: of the contactors ``(n, gdim)``.
+        projection: of the contactors, with weighted gaps and the directions of their plain rows.
+        nearest: of the contactors, on their nearest facets.
+        gap: weighted gaps ``(n,)``.
+        rows: all equations and what they were made of.
+        movable: contactors that can move along the normal, or something that they follow can ``(n,)``.
+    """
+
+    of: Contactors
+    points: Array
+    projection: Projection
+    nearest: Projection
+    gap: Array
+    rows: WeightedRows
+    movable: Bools
+
+    @property
+    def idle(self) -> bool:
+        """No: the target is one for all."""
+        return False
+
+    @property
+    def corners(self) -> None:
+        """No corner holds a facet."""
+        return None
+
+    @property
+    def normal(self) -> Array:
+        """Directions of the derivatives of the gaps with the contactors' own displacements ``(n, gdim)``."""
+        assert self.rows.normal is not None
+        return self.rows.normal
+
+    @cached_property
+    def ties(self) -> Ties:
+        """With integrals of the dual functions times the shape functions of both sides, over that of the contactor's own."""
+        of = self.of
+        assert self.rows.weights is not None
+        return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, of.at_feet)
+
+    @property
+    def force_per_multiplier(self) -> Array:
+        """Of all that the facets at a contactor push with, each along its own derivative of the gap."""
+        assert self.rows.push is not None
+        return np.asarray(self.rows.share / self.rows.push)
+
+    @property
+    def cone(self) -> Array:
+        """Of equations that were divided by the lengths of their derivatives."""
+        assert self.rows.push is not None
+        return np.asarray(self.rows.push / self.rows.length)
+
+    # -- the same contactors in another state ----------------------------------------------------------------------------
+
+    def placed_again(self, state: PairState) -> MortarKinematics:
+        """No equation depends on the state."""
+        return self
+
+    def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
+        """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
+
+        What a rigid target covers is kept in mind, and of what a mesh covers the nodes with a dual function of their own, and for the
+        step the facets that face each other.
+        """
+        of, rows = self.of, self.rows
+        if of.sliding == "finite":
+            covered = np.zeros(of.surface.dofs.shape, dtype=bool)
+            if isinstance(of.target, MeshTarget):
+                assert rows.facing is not None
+                of.faced = np.unique(np.concatenate([of.faced, rows.facing]), axis=0)
+                covered[rows.facets] = rows.points.duals.kept
+            else:
+                covered[rows.facets[rows.points.facet[rows.points.segments.pair]]] = True
+            state = replace(state, cover=of.remembered.of(covered))
+        if not (of.target.faceted and of.sliding == "finite"):
+            return self, state, False
+        number = self.projection.facet
+        moved = state.active & ~rows.covered & (state.facet >= 0) & (state.facet != number)
+        return self, replace(state, facet=number, changes=state.changes + moved), False
+
+    # -- what decides ----------------------------------------------------------------------------------------------------
+
+    def off(self, state: PairState) -> Bools:
+        """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
+
+        A target that springs back when its end lets go would cover the contactor's last bit again, for ever.
+        """
+        rows = self.rows
+        if not self.of.target.n_nodes:
+            return np.zeros(len(self.points), dtype=bool)
+        past = past_end(self.projection, state, self.of.thickness)
+        return np.where(rows.covered, state.at_end & (rows.ratio < COVERED_AGAIN), past)
+
+    def at_end(self, state: PairState) -> Bools:
+        """No end holds contactors: what is covered of them fades away."""
+        return np.zeros(len(self.points), dtype=bool)
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def gap_rows(self) -> GapRows:
+        """One row for each contactor, divided by the length of the weighted gap's derivative."""
+        return GapRows.along_normals(self.of.config, self.rows.equations, self.rows.length, self.of.free)
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """Pressures times areas, and the contactors' forces (collective)."""
+        rows, config = self.rows, self.of.config
+        mu = np.zeros(len(self.points))
+        mu[equations.contactor] = multipliers
+        force = np.asarray(config.add_at_owners(*self._handed_on(mu))[self.of.nodes])
+        return Traction(mu / rows.length * rows.share, np.einsum("ng,ng->n", force, rows.plain.direction), force)
+
+    def nodal_friction(self, tau: Array) -> Array:
+        """Of the rows' weights, on both sides of contactors that follow each other (collective)."""
+        return np.asarray(self.of.config.add_at_owners(*self.ties.handed_on(tau))[self.of.nodes])
+
+    def _handed_on(self, mu: Array) -> tuple[Ints, Array]:
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
+        eq, nodes = self.rows.equations, self.of.nodes
+        own, terms = mu != 0, mu[eq.row] != 0
+        there = np.concatenate([self.of.config.to_global(nodes[own]), eq.followed[terms]])
+        return there, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """Nodal forces of the state's multipliers, by the equations."""
+        nodes, forces = self._handed_on(state.lam / self.rows.share * self.rows.length)
+        if state.friction is None:
+            return nodes, forces
+        along = self.ties.handed_on(state.friction.tau / self.force_per_multiplier[:, None])
+        return np.concatenate([nodes, along[0]]), np.concatenate([forces, along[1]])
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Second derivatives of the weighted gaps."""
+        of, rows = self.of, self.rows
+        pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
+        dofs = of.surface.dofs[rows.facets]
+        at_nodes = of.config.from_owners(of.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
+        return curvature(rows.points, at_nodes)
+
+    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
+        """Of those that the target covers: traction turns, grows with its surface and is handed to what is opposite (collective)."""
+        of, rows = self.of, self.rows
+        assert rows.weights is not None
+        kept = rows.covered[which]
+        slips = np.ones(len(which), dtype=bool) if held is None else ~held
+        frictional = Frictional(which[kept], self.normal[which[kept]], tau[kept], slips[kept])
+        return turning(of.elimination, rows, of.surface.dofs[rows.facets], frictional, rows.weights)
+
+    def areas(self, areas: Array, current: bool) -> Array:
+        """Integrals of the dual functions over what is covered (collective)."""
+        of, rows = self.of, self.rows
+        own = rows.area if current and of.sliding == "finite" else rows.area / rows.stretch
+        if current and of.sliding != "finite":
+            own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
+        return np.where(rows.covered, own, areas)
+
+    def heights(self) -> Array:
+        """Nodal heights whose means, weighted with dual functions, are those of the gaps (collective).
+
+        Functions of degree 2 have them in Bernstein's basis first, whose coefficients at the middles are made of those around.
+        """
+        of, rows, dofs = self.of, self.rows, self.of.surface.dofs
+        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
+        at = of.config.from_owners(of.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
+        nodal = at @ np.linalg.inv(of.basis.T).T
+        total, count = (of.config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
+        return np.asarray(total[of.nodes] / count[of.nodes])
+
+    def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
+        """By the integrals of the dual functions over what is covered; others at their nodes (collective)."""
+        of, rows, at = self.of, self.rows, self.rows.points
+        own, area = at.nodes, at.duals.C.sum(axis=2)
+        f, i = np.nonzero(area > 0)
+        total = of.config.add_at_owners(own[f, i], area[f, i, None])[of.nodes, 0]
+        scale = np.where(rows.covered, total, 1.0)
+        found = []
+        for parts in (terms_of(own, own, (at.duals.C @ of.basis.T)[..., None]), self._opposite()):
+            row, node, weight = of.elimination.at_owners([parts], scale)
+            kept = rows.covered[row]
+            found.append((row[kept], node[kept], weight[kept, 0]))
+        alone, near = np.flatnonzero(~rows.covered), self.nearest
+        k, a = np.nonzero(near.nodes[alone] >= 0)
+        more = (
+            (alone, of.config.to_global(of.nodes[alone]), np.ones(len(alone))),
+            (alone[k], near.nodes[alone][k, a], near.weights[alone][k, a]),
+        )
+        own_terms, theirs = (tuple(np.concatenate(both) for both in zip(*parts)) for parts in zip(found, more))
+        return own_terms, theirs  # type: ignore[return-value]
+
+    def _opposite(self) -> Terms:
+        """Integrals of the dual functions with the target's shape functions."""
+        at = self.rows.points
+        return terms_of(at.nodes[at.facet], at.opposite, (at.duals.A[at.facet] @ at.covered.N)[..., None])
+
+    def mean_areas(self, areas: Array, current: bool) -> Array:
+        """The same as those of forces."""
+        return self.areas(areas, current)
+
+    def areas_along(self, areas: Array) -> Array:
+        """Of contactors that nothing covers; others see their facets, as ``stretching`` tells."""
+        return np.where(self.rows.covered, 0.0, areas)
+
+    def areas_back(self, weights: Array) -> Array:
+        """The same."""
+        return np.where(self.rows.covered, 0.0, weights)
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """From pressures times areas, which are the same in ``areas``."""
+        return weights * self.rows.share / self.rows.length
+
+    def stretching(self, current: bool) -> MortarStretching | None:
+        """Multipliers are pressures where the surface is now, and forces over kept areas with small and fixed sliding."""
+        of, finite = self.of, self.of.sliding == "finite"
+        if current == finite:
+            return None
+        facets = self.rows.facets if finite else np.arange(len(of.surface.dofs))
+        return MortarStretching(of, np.where(self.rows.covered, 1.0 if finite else -1.0, 0.0), facets)
+
+
+@dataclass(frozen=True)
+class MortarStretching:
+    """Implements ``Stretching``: of pressures that are as a power of the stretch of the facets around their contactor.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        power: ``(n,)``.
+        facets: numbers of the contactor's facets that count ``(m,)``.
+    """
+
+    of: Contactors
+    power: Array
+    facets: Ints
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[Array, Array], ...]:
+        """Derivatives of facets' shares ``(m, nn, nn, gdim)``, and powers over their sums ``(n,)``: now and as drawn (collective)."""
+        of, parts = self.of, []
+        dofs = of.surface.dofs[self.facets]
+        for x, sign in ((of.config.x[dofs], 1.0), (of.config.X[dofs], -1.0)):
+            size = Planes.of(of.surface.shape, x, of.surface.sign[self.facets]).size
+            whole = of.config.to_owners(dofs.ravel(), of.shares(size, x).ravel())[of.nodes]
+            parts.append((of.share_slopes(self.facets, x), sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
+        return tuple(parts)
+
+    def along(self, now: Array, drawn: Array) -> Array:
+        """Areas of the facets change, and their sums at the contactors (collective)."""
+        of, found = self.of, np.zeros(len(self.power))
+        dofs = of.surface.dofs[self.facets]
+        for (slopes, over), moved in zip(self._parts, (now, drawn)):
+            change = np.einsum("mbag,mag->mb", slopes, moved[dofs])
+            found += over * of.config.to_owners(dofs.ravel(), change.ravel())[of.nodes]
+        return found
+
+    def back(self, weights: Array) -> tuple[Array, Array]:
+        """The same backwards (collective)."""
+        of, found = self.of, []
+        dofs = of.surface.dofs[self.facets]
+        for slopes, over in self._parts:
+            at = of.config.from_owners(of.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
+            values = np.einsum("mb,mbag->mag", at, slopes)
+            found.append(of.config.add_at_owners(of.config.to_global(dofs.ravel()), values.reshape(-1, of.config.gdim)))
+        return found[0], found[1]

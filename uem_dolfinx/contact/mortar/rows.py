@@ -1,0 +1,203 @@
+"""Rows of weighted gaps as lists of terms, at the owners of their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_groups
+from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.overlaps import Segments
+from uem_dolfinx.parallel import Exchange
+
+#: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
+#: [bound; bits; -]
+MOST_BITS = 52
+
+
+#: Rows that terms belong to, the nodes they follow and the coefficients.
+Terms: TypeAlias = tuple[Ints, Ints, Array]
+
+
+class Pieces(NamedTuple):
+    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``.
+
+    ``facing`` is as in ``WeightedRows``.
+    """
+
+    segments: Segments
+    facet: Ints
+    to_gap: Array
+    N: Array
+    opposite: Ints
+    y: Array
+    shape_operator: Array | None
+    facing: Ints
+
+
+@dataclass(frozen=True)
+class WeightedRows:
+    """Equations of all contactors, one each.
+
+    Attributes:
+        equations: in the order of the contactors; none is active. Their left sides are the derivatives of the gaps.
+        length: what these were divided by ``(n,)``.
+        plain: the same, along the normals of the contactor's facets alone.
+        points: quadrature points of the segments, where the rows were made.
+        covered: contactors whose equation comes from segments ``(n,)``.
+        facets: numbers of the contactor's facets near the target ``(m,)``.
+        ratio: part of the contactor's share of its facets that is covered ``(n,)``.
+        area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
+        stretch: areas of the facets around the contactor over their reference areas ``(n,)``.
+        share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
+        weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
+        normal: directions of the gaps' derivatives with the contactors' own displacements, across which friction acts ``(n, gdim)``;
+            None without.
+        slope: lengths of these derivatives, over those of the plain rows ``(n,)``; None without friction.
+        push: sum of the lengths of what each facet has of these derivatives, over those of the plain rows ``(n,)``: what the facets push
+            with together, each along its own normal; None without friction.
+        parts: of the facets' nodes, what the facet has of their own derivatives ``(m, nc, gdim)``.
+        whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
+            without friction.
+        facing: contactor and target facets that lie upon each other, by what tells them in any partition ``(p, 2)``.
+    """
+
+    equations: UnitingEquations
+    length: Array
+    plain: UnitingEquations
+    points: SegmentPoints
+    facets: Ints
+    covered: Bools
+    ratio: Array
+    area: Array
+    stretch: Array
+    share: Array
+    weights: Terms | None = None
+    normal: Array | None = None
+    slope: Array | None = None
+    push: Array | None = None
+    parts: Array | None = None
+    whole: Array | None = None
+    facing: Ints | None = None
+
+
+class Elimination:
+    """Rows of the contactors of one surface, which live at the owners of their nodes.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+    """
+
+    def __init__(self, config: Configuration, nodes: Indices):
+        self.config, self.nodes = config, nodes
+        self._place = np.full(config.n_owned, -1, dtype=np.int64)
+        self._place[nodes] = np.arange(len(nodes))
+        self._own = config.to_global(nodes)
+
+    def at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
+        """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
+        node, term, value = (np.concatenate(part) for part in zip(*parts))
+        node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
+        row = self._place[node - self.config.first]
+        return add_up_terms((row, term, value / scale[row, None]))
+
+    def variation(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
+        """What the derivatives of the gaps add to the ``plain`` rows, since normals and weights vary, over ``scale (n,)`` (collective).
+
+        Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
+        they do: all others can be eliminated for any active set.
+
+        Returns:
+            Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.
+        """
+        on_facet, on_target = at.gap_derivatives()
+        terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
+        variation = row, term, value = self.at_owners(terms, scale)
+        own = np.einsum("ng,ng->n", self.of_themselves(plain, variation), plain.direction)
+        kept = own[row] > 0.0
+        return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
+
+    def of_themselves(self, plain: UnitingEquations, variation: Terms) -> Array:
+        """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
+        row, term, value = variation
+        itself, direction = term == self._own[row], plain.direction.copy()
+        # each row has at most one such term
+        direction[row[itself]] -= value[itself]
+        return direction
+
+    def derivatives(self, plain: UnitingEquations, variation: Terms) -> tuple[UnitingEquations, Array]:
+        """Equations whose left sides are the derivatives of the gaps, and what each was divided by ``(n,)``.
+
+        They follow other contactors, and these them, by parts of second order in the angles between facets.
+        """
+        row, term, value = variation
+        other, direction = term != self._own[row], self.of_themselves(plain, variation)
+        by = np.linalg.norm(direction, axis=1)
+        made = with_terms(plain, (row[other], term[other], value[other]))
+        gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]
+        return replace(made, direction=direction / by[:, None], gap=gap, coefficients=coefficients), by
+
+
+class Remembered:
+    """Bits of contactors that tell some of their shares of the facets around them from others, alike in any partition (collective).
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        surface: the contactor's facets.
+    """
+
+    def __init__(self, config: Configuration, nodes: Indices, surface: TargetFacets):
+        self.config, self.nodes, self.dofs = config, nodes, surface.dofs
+        node, key = config.to_global(self.dofs.ravel()), np.repeat(surface.keys, self.dofs.shape[1])
+        meeting = Exchange.to(config.comm, config.owner_of(node))
+        node, key = meeting.send(node, key)
+        order = np.lexsort((key, node))
+        number = np.empty(len(node), dtype=np.int64)
+        number[order] = np.arange(len(node)) - np.searchsorted(node[order], node[order])
+        place = np.empty(self.dofs.size, dtype=np.int64)
+        (place[meeting.rows],) = meeting.back(number)
+        #: Bits of the facets at each of their nodes; numbers of type float hold no more.
+        self._place = place.reshape(self.dofs.shape)
+        self._has = self._place < MOST_BITS
+
+    def of(self, which: Bools) -> Ints:
+        """Bits ``(n,)`` of nodes of facets ``which (m, nn)``, or all of a facet's ``(m, 1)`` (collective)."""
+        bits = np.ldexp((self._has & which).astype(float), np.minimum(self._place, MOST_BITS))
+        return self.config.to_owners(self.dofs.ravel(), bits.ravel())[self.nodes].astype(np.int64)
+
+    def shares(self, bits: Ints) -> Bools:
+        """The nodes of facets ``(m, nn)`` of which ``of`` returned these (collective)."""
+        there = self.config.from_owners(self.nodes, bits[:, None].astype(float), self.dofs.ravel()).astype(np.int64)
+        return np.asarray(self._has & (there.reshape(self.dofs.shape) >> np.minimum(self._place, MOST_BITS) & 1 > 0))
+
+
+def terms_of(rows: Ints, followed: Ints, values: Array, which: Bools | bool = True) -> Terms:
+    """Terms of rows of nodes ``rows (m, nr)`` that follow ``followed (m, nf)`` with ``values (m, nr, nf, gdim)``, zeros left out."""
+    m, i, a = np.nonzero(values.any(axis=3) & which)
+    return rows[m, i], followed[m, a], values[m, i, a]
+
+
+def add_up_terms(*parts: Terms) -> Terms:
+    """Terms of several lists, those of the same row and node added up."""
+    row, term, value = (np.concatenate(part) for part in zip(*parts))
+    if not len(row):
+        return row, term, value
+    key = row * (term.max() + 1) + term
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    each = order[first]
+    return row[each], term[each], sums_of_groups(value, first, order)
+
+
+def with_terms(equations: UnitingEquations, terms: Terms) -> UnitingEquations:
+    """The equations with more terms."""
+    row, term, value = add_up_terms((equations.row, equations.followed, equations.coefficients), terms)
+    return replace(equations, row=row, followed=term, coefficients=value)

@@ -1,0 +1,349 @@
+"""How weighted gaps change with the displacement: their first derivatives are the rows, their second ones the contact's curvature.
+
+The quadrature points stay where they are on the contactor's facets. The gap of such a point x, on a facet with area vector a and
+normal n, is ``|a| gamma``, where ``y(eta) = x + gamma a`` is the point of the target opposite. With t, the target's normal over
+minus its product with n, there is ``t . dy/deta = 0`` and ``t . n = -1``, so that
+
+    d gap = t . (dx - dy + gamma da) + gamma n . da.
+
+An offset is part of what is open, and of no height: areas grow with gaps less it.
+
+Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
+in the second derivatives. The ends of the target move too, and dual functions with them (``mortar_ends``). Parts of quadratic
+facets do not all grow as these do, and change dual functions as ends do; second derivatives have what is of first order in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.mortar.duals import Covered, Duals, add_up, basis_of, products
+from uem_dolfinx.contact.mortar.segment_motions import (
+    Motions,
+    Sides,
+    dual_tangents,
+    edges,
+    ends,
+    ring_of,
+    skew,
+    sum_of_products,
+    to_gap,
+)  # fmt: skip
+from uem_dolfinx.geometry.overlaps import SLIVER, Planes, Segments, locate
+from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, facet_shape, tangents
+
+
+@dataclass(frozen=True)
+class SegmentPoints:
+    """Quadrature points of segments with all that derivatives there need.
+
+    Attributes:
+        segments: of ``k`` pairs.
+        facet: contactor facet of each pair, among ``m`` ``(k,)``, ascending.
+        nodes: global nodes of the contactor facets ``(m, nc)``.
+        opposite: of the target facets, pair by pair ``(k, nt)``; without any where the target is rigid.
+        planes: of the contactor facets.
+        duals: dual functions of the contactor facets.
+        covered: integrals over them.
+        b: functions of the basis at the points ``(q, nc)``.
+        phi: the contactor's shape functions there ``(q, nc)``.
+        N: the target's ``(q, nt)``.
+        to_gap: change of the gap with ``x - y``, called t above; a rigid target's normal ``(q, gdim)``.
+        shape: of the contactor's facets.
+        other: of the target's; None where it is rigid.
+        x: nodes of the contactor facets ``(m, nc, gdim)``.
+        y: of the target facets, pair by pair ``(k, nt, gdim)``.
+        sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
+        shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
+        radius: of the circles that points of axisymmetric bodies stand for, which their weights hold ``(q,)``; None of others.
+        offsets: of the gap at the contactor facets' nodes ``(m, nc)``; None for none.
+    """
+
+    segments: Segments
+    facet: Ints
+    nodes: Ints
+    opposite: Ints
+    planes: Planes
+    duals: Duals
+    covered: Covered
+    b: Array
+    phi: Array
+    N: Array
+    to_gap: Array
+    shape: FacetShape
+    other: FacetShape | None
+    x: Array
+    y: Array
+    sign: Array
+    shape_operator: Array | None
+    radius: Array | None = None
+    offsets: Array | None = None
+
+    @cached_property
+    def offset(self) -> Array:
+        """Of the gap at the points ``(q,)``."""
+        return self._offset_at(self.facet[self.segments.pair], self.phi)
+
+    def _offset_at(self, e: Ints, phi: Array) -> Array:
+        """Offsets at points of facets ``e (q,)`` with the shape functions ``phi (q, nc)``: ``(q,)``."""
+        return np.zeros(len(e)) if self.offsets is None else np.einsum("qa,qa->q", phi, self.offsets[e])
+
+    @cached_property
+    def turning(self) -> Array:
+        """How area vectors change with the contactor facets' nodes ``(m, nc, gdim, gdim)``."""
+        m, nc, g = self.x.shape
+        out = np.zeros((m, nc, g, g))
+        if g == 2:
+            quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
+            out[:, 0], out[:, 1] = -quarter, quarter
+        else:
+            ring = ring_of(self.shape)
+            # of a ring of corners, the area vector is half the sum of the products of each with the next
+            out[:, : len(ring)] = 0.5 * skew(np.einsum("ab,mbg->mag", ring.T, self.x[:, : len(ring)]))
+        return out * self.sign[:, None, None, None]
+
+    @property
+    def tilt(self) -> Array:
+        """Part of ``to_gap`` across the contactor's normal: zero where the facets are parallel ``(q, gdim)``."""
+        return self.to_gap + self.planes.normal[self.facet[self.segments.pair]]
+
+    @cached_property
+    def stretching(self) -> Array:
+        """How the part of the plane that a point stands for grows with the contactor facet's nodes beside the facet ``(q, nc, gdim)``.
+
+        Of affine facets all parts grow alike, but for circles.
+        """
+        e = self.facet[self.segments.pair]
+        tab, x, n = self.shape.tabulate(self.segments.xi), self.x[e], self.planes.normal[e]
+        over = dual_tangents(tangents(tab, x), n)
+        turned = (to_gap(area_vectors(tab, x), n) + 2 * n) / self.planes.size[e, None]
+        grown = np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
+        if self.radius is not None:
+            grown[:, :, 0] += self.phi / self.radius[:, None]
+        return grown
+
+    @property
+    def unequal(self) -> bool:
+        """Whether parts of facets do not grow as these do."""
+        return self.shape.degree == 2 or self.radius is not None
+
+    # -- first derivatives -----------------------------------------------------------------------------------------------
+
+    def gap_derivatives(self) -> tuple[Array, Array]:
+        """What the derivatives of weighted gaps have beyond ``-n int psi_j (phi_a, -N_l)``.
+
+        Returns:
+            With respect to the contactor facets' nodes ``(m, nc, nc, gdim)`` and to the target's, pair by pair ``(k, nc, nt, gdim)``.
+        """
+        s, e, g = self.segments, self.facet, self.to_gap.shape[1]
+        (m, nc), (k, nt) = self.nodes.shape, self.opposite.shape
+        n, size, weighted = self.planes.normal, self.planes.size, s.weight[:, None] * self.b
+        vector = self.covered.G[:, :, None] * n[:, None]
+        if self.other is not None and self.shape.affine and self.other.affine:
+            # the same all over a pair
+            tilt = np.zeros((k, g))
+            tilt[s.pair] = self.tilt
+            own, gap = np.split(self.covered.own, [nc], axis=2)
+            on_facet = add_up(e, (own[..., None] * tilt[:, None, None]).reshape(k, nc * nc * g), m).reshape(m, nc, nc * g)
+            on_target = (self.covered.N[..., None] * tilt[:, None, None]).reshape(k, nc, nt * g)
+            vector = vector + add_up(e, (gap * tilt[:, None]).reshape(k, nc * g), m).reshape(m, nc, g)
+        else:
+            lean = products(weighted, self.tilt)
+            on_facet = add_up(e[s.pair], products(lean, self.phi), m).reshape(m, nc, g, nc).swapaxes(2, 3).reshape(m, nc, nc * g)
+            on_target = add_up(s.pair, products(lean, self.N), k).reshape(k, nc, g, nt).swapaxes(2, 3).reshape(k, nc, nt * g)
+            if nt:
+                vector = vector + add_up(e[s.pair], lean * s.gap[:, None], m).reshape(m, nc, g)
+        # with the area, and on a mesh with the direction, of what is not closed
+        vector = vector / size[:, None, None]
+        on_facet += (vector[:, None] @ self.turning).swapaxes(1, 2).reshape(m, nc, nc * g)
+        by_node = (self.duals.A @ on_facet).reshape(m, nc, nc, g)
+        by_pair = -(self.duals.A[e] @ on_target).reshape(k, nc, nt, g)
+        if self.unequal:
+            grown = s.weight[:, None] * self.duals.at_end(e[s.pair], self.b, s.gap - self.offset)
+            stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
+            by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
+        if self.other is not None:
+            self._add_ends(self.other, by_node, by_pair)
+        return by_node, by_pair
+
+    def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
+        """Add how weighted gaps change where the target, with facets of such a ``shape``, ends over contactor facets."""
+        which = self.partly_covered()
+        sides = self.sides(shape, which).at_ends()
+        e = self.facet[which][sides.pair]
+        force = sides.weight[:, None] * self.duals.at_end(e, sides.b, sides.gap - sides.offset)
+        way = -force[:, :, None, None] * sides.way[:, None]
+        nc = self.nodes.shape[1]
+        np.add.at(on_facet, e, way[:, :, :nc])
+        np.add.at(on_target, which[sides.pair], way[:, :, nc:])
+
+    def partly_covered(self) -> Ints:
+        """Pairs whose contactor facets are not covered altogether ``(p,)``."""
+        some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
+        return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.covered.full.sum(axis=1))[self.facet] & some)
+
+    # -- second derivatives ----------------------------------------------------------------------------------------------
+
+    def curvature(self, pressure: Array) -> tuple[Ints, Array]:
+        """Minus the second derivatives of the weighted gaps times their multipliers.
+
+        Args:
+            pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
+
+        Returns:
+            Global nodes of the pairs that press ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+        """
+        nc, nt, g = self.nodes.shape[1], self.opposite.shape[1], self.to_gap.shape[1]
+        some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
+        pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1) & some)
+        e, k = self.facet[pressing], len(pressing)
+        amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
+        pair, force, gap, offset, t, eta, motions = self._loaded(pressing, amount)
+        n, size = self.planes.normal[e], self.planes.size[e]
+        turned = t + 2 * n[pair] if nt else n[pair]
+        half = sum_of_products(pair, force, motions.along(t), motions.of_area(turned / size[pair, None]), k)
+        if self.other is not None:
+            tab = self.other.tabulate(eta)
+            for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
+                half += sum_of_products(pair, force, slide, change, k)
+            sides = self.sides(self.other, pressing).between()
+            step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
+            half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
+        elif self.shape_operator is not None:
+            # there are as many pairs as facets, and points in their order
+            shape_operator = self.shape_operator[np.isin(self.segments.pair, pressing)]
+            for row, unit in zip(np.moveaxis(shape_operator, 1, 0), np.eye(g)):
+                half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
+        if self.unequal:
+            gaps = motions.along(t) + motions.of_area((((2 if nt else 1) * gap - offset) / size[pair])[:, None] * n[pair])
+            half += self._stretched(pressing, pair, pressure, gaps)
+        blocks = half + half.transpose(0, 2, 1)
+        # what is not closed, with the second order of the facet's size and direction: once for each facet
+        _, first, of_facet = np.unique(e, return_index=True, return_inverse=True)
+        open_force = np.column_stack([force * gap, (force * gap)[:, None] * turned])
+        opened = self._opened(e[first], add_up(of_facet[pair], open_force, len(first)), self.other is not None)
+        if self.offsets is not None:
+            less = np.column_stack([force * offset, (force * offset)[:, None] * n[pair]])
+            opened -= self._opened(e[first], add_up(of_facet[pair], less, len(first)), False)
+        blocks.reshape(k, nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += opened
+        nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
+        return nodes, -blocks
+
+    def _stretched(self, pressing: Ints, pair: Ints, pressure: Array, gaps: Array) -> Array:
+        """Half of the second derivatives with the parts of the plane that points stand for and with their ``gaps (q, nc + nt, gdim)``."""
+        q, e, k = np.isin(self.segments.pair, pressing), self.facet[pressing], len(pressing)
+        weight, b, grown = self.segments.weight[q], self.b[q], self.stretching[q]
+        (m, nc), width = self.nodes.shape, gaps.shape[1] * gaps.shape[2]
+        of_gap, of_mean = self.duals.spread(e[pair], b, pressure[:, :, None])
+        rows = grown.shape[1] * grown.shape[2]
+        out = np.zeros((k, width, width))
+        flat, weighted = gaps.reshape(-1, width), weight[:, None] * grown.reshape(-1, rows)
+        out[:, :rows] = add_up(pair, products(weighted * of_gap, flat), k).reshape(k, rows, width)
+        means = add_up(e[pair], products(weighted, of_mean[:, :, 0]), m).reshape(m, rows, nc)
+        projected = add_up(pair, products(weight[:, None] * b, flat), k).reshape(k, nc, width)
+        out[:, :rows] += (means @ self.duals.inverse)[e] @ projected
+        return out
+
+    def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Array, Motions]:
+        """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, offsets, t, eta and motions.
+
+        Where all facets are affine and grow evenly, t is the same all over a pair: one point stands for all, with sums for values.
+        """
+        k, s, e = len(pressing), self.segments, self.facet[pressing]
+        place = np.full(len(self.facet), -1, dtype=np.int64)
+        place[pressing] = np.arange(k)
+        q = np.flatnonzero(place[s.pair] >= 0)
+        pair = place[s.pair[q]]
+        force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * s.weight[q]
+        phi, N, gap, size, turning = self.phi[q], self.N[q], s.gap[q], self.planes.size[e], self.turning[e]
+        if self.other is None or self.unequal or not (self.shape.affine and self.other.affine):
+            return pair, force, gap, self.offset[q], self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
+        total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap, self.offset[q]]), k)
+        one = q[np.searchsorted(pair, np.arange(k))]
+        phi, N, both = np.split(total, [phi.shape[1], phi.shape[1] + N.shape[1]], axis=1)
+        gap, offset = both.T
+        return np.arange(k), np.ones(k), gap, offset, self.to_gap[one], s.eta[one], Motions(phi, N, gap / size, turning)
+
+    def _opened(self, e: Ints, open_force: Array, high: bool) -> Array:
+        """Second derivatives of open gaps with the sizes and directions of contactor facets ``e (p,)``, ``(p, nc, gdim, nc, gdim)``.
+
+        Args:
+            e: facets.
+            open_force: forces times gaps, and these times ``t + 2 n``, or n unless they are ``high`` ``(p, 1 + gdim)``.
+            high: whether gaps are heights over a mesh, which grow with the area vectors.
+        """
+        turn, n, size = self.turning[e], self.planes.normal[e], self.planes.size[e]
+        square = np.einsum("pigh,pjgk->pihjk", turn, turn)
+        if high:
+            square *= 2.0
+        else:
+            grown = (n[:, None, None] @ turn)[:, :, 0]
+            square -= grown[:, :, :, None, None] * grown[:, None, None]
+        out = (open_force[:, 0] / size**2)[:, None, None, None, None] * square
+        if turn.shape[2] == 3:
+            ring = ring_of(self.shape)
+            c = len(ring)
+            vector = self.sign[e, None] * open_force[:, 1:] / size[:, None]
+            out[:, :c, :, :c] -= 0.5 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
+        return np.asarray(out)
+
+    def _slides(
+        self, motions: Motions, shape: FacetShape, tab: Tabulated, y: Array, n: Array, t: Array
+    ) -> Iterator[tuple[Array, Array]]:
+        """How the points opposite slide on their facets ``y (q, nt, gdim)``, and what changes with that, for each of the coordinates."""
+        tangent = tangents(tab, y)
+        over = dual_tangents(tangent, n)
+        slides = [motions.along(over[:, f]) for f in range(shape.dim)]
+        for f, slide in enumerate(slides):
+            change = np.zeros(slide.shape)
+            change[:, motions.nc :] = -tab.dN[:, :, f, None] * t[:, None]
+            if not shape.affine:
+                shape_operator = np.einsum("qg,qag,qae->qe", t, y, tab.ddN[:, :, f])
+                change -= 0.5 * sum(shape_operator[:, e, None, None] * other for e, other in enumerate(slides))
+            yield slide, change
+
+    def sides(self, shape: FacetShape, which: Ints, cuts: bool = False) -> Sides:
+        """Points on sides of target facets over contactor facets.
+
+        Args:
+            shape: of the target's facets.
+            which: pairs ``(p,)``.
+            cuts: where sides leave contactor facets, rather than quadrature points.
+        """
+        e, y = self.facet[which], self.y[which]
+        planes = self.planes.take(e)
+        own, its = planes.coordinates(self.x[e]), planes.coordinates(y)
+        s = ends(own, shape, its) if shape.dim == 1 else edges(self.shape, own, shape, its, cuts)
+        pair = s.pair
+        # a side that two facets of the target share is found twice over a contactor facet
+        code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], s.corners], axis=1)])
+        _, first, same = np.unique(code, axis=0, return_index=True, return_inverse=True)
+        same = same.ravel()
+        alone = ~np.isin(np.arange(len(first)), same[pair != pair[first][same]])[same]
+        xi = locate(self.shape, own[pair, :, :-1], s.at)
+        # segments end at the chord of a curved side, which moves with its corners; gaps are those of the target there
+        linear = facet_shape(shape.cell, 1)
+        eta = s.eta if shape.degree == 1 else locate(shape, its[pair, :, :-1], s.at)
+        tab, phi, nc = shape.tabulate(eta), self.shape.functions(xi), linear.nodes.shape[0]
+        chord, shift = np.zeros((2, *tab.N.shape))
+        chord[:, :nc] = linear.functions(s.eta)
+        shift[:, :nc] = np.einsum("qaf,qf->qa", linear.tabulate(s.eta).dN, s.stride)
+        above = np.einsum("qa,qa->q", phi, own[pair, :, -1])
+        outward, ahead, cut = (np.einsum("qf,qfg->qg", v, planes.axes[pair, :-1]) for v in (s.outward, s.ahead, s.cut))
+        t = to_gap(area_vectors(tab, y[pair]), planes.normal[pair])
+        gap, height = (np.einsum("qa,qa->q", N, its[pair, :, -1]) - above for N in (tab.N, chord))
+        motions = Motions(phi, chord, height / planes.size[pair], self.turning[e][pair])
+        weight = s.weight
+        if self.radius is not None:
+            weight = 2 * np.pi * np.einsum("qa,qa->q", phi, self.x[e[pair], :, 0]) * weight
+        return Sides(
+            pair=pair, xi=xi, b=basis_of(self.shape).at(xi), N=tab.N, gap=gap, offset=self._offset_at(e[pair], phi), t=t,
+            slope=np.einsum("qg,qg->q", t, outward),
+            outward=outward, motions=motions, way=motions.along(outward), ahead=ahead,
+            shift=shift, cut=cut, weight=weight, end=alone,
+        )  # fmt: skip

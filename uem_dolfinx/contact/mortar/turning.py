@@ -1,0 +1,222 @@
+"""How mortar's forces of friction change with the displacement: with the traction's direction and size, and with what it is handed to.
+
+The traction ``sum psi_j sigma_j`` is handed to both sides with their shape functions. Where the points opposite slide, target nodes get
+other shares. The traction turns with the derivative of the weighted gap with the contactor's own displacement, and grows with its size;
+these are the second derivatives of the gap of this contactor alone. Parts of quadratic facets do not all grow as these do. Where the
+target ends over a facet, what is covered changes, and dual functions with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.mortar.duals import add_up, basis_of, products
+from uem_dolfinx.contact.mortar.ends import curvature
+from uem_dolfinx.contact.mortar.rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
+from uem_dolfinx.contact.mortar.segment_motions import Motions, dual_tangents, sum_of_products
+from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.geometry.shapes import FacetShape, tangents
+
+
+@dataclass(frozen=True)
+class Frictional:
+    """Contactors with friction, covered by the target.
+
+    Attributes:
+        which: places among the contactors, ascending ``(k,)``.
+        normal: directions of their equations ``(k, gdim)``.
+        tau: friction, handed on by the weights that they follow other nodes with ``(k, gdim)``.
+        slips: those that slip, whose friction grows with the force across the target ``(k,)``.
+    """
+
+    which: Ints
+    normal: Array
+    tau: Array
+    slips: Bools
+
+
+def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
+    """Derivatives of the nodal forces of a traction whose values at the contactors stay, on both sides.
+
+    Args:
+        at: points of the segments.
+        traction: at the contactor facets' nodes, a force per area ``(m, nc, gdim)``.
+
+    Returns:
+        Lists of global nodes ``(p, c)`` and blocks ``(p, c gdim, c gdim)``.
+    """
+    s, g = at.segments, at.to_gap.shape[1]
+    some = np.bincount(s.pair, minlength=len(at.facet)) > 0
+    which = np.flatnonzero(traction[at.facet].any(axis=(1, 2)) & some)
+    e, k = at.facet[which], len(which)
+    place = np.full(len(at.facet), -1, dtype=np.int64)
+    place[which] = np.arange(k)
+    q = np.flatnonzero(place[s.pair] >= 0)
+    pair = place[s.pair[q]]
+    amount = np.einsum("pjb,pjg->pbg", at.duals.A[e], traction[e])
+    force = s.weight[q, None] * np.einsum("qb,qbg->qg", at.b[q], amount[pair])
+    n, size = at.planes.normal[e], at.planes.size[e]
+    motions = Motions(at.phi[q], at.N[q], s.gap[q] / size[pair], at.turning[e][pair])
+    share, one = np.concatenate([at.phi[q], -at.N[q]], axis=1), np.ones(len(q))
+    # all grow with the facet
+    blocks = sum_of_products(pair, one, share[:, :, None] * force[:, None], motions.of_area((n / size[:, None])[pair]), k)
+    if at.unequal:
+        blocks += _stretched(at, traction, which, q, pair)
+    if at.other is not None:
+        tab = at.other.tabulate(s.eta[q])
+        over = dual_tangents(tangents(tab, at.y[which][pair]), n[pair])
+        for f in range(at.other.dim):
+            moved = np.zeros((len(q), share.shape[1], g))
+            moved[:, motions.nc :] = -tab.dN[:, :, f, None] * force[:, None]
+            blocks += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
+    made = [(np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks)]
+    return made if at.other is None else made + _at_ends(at, at.other, traction)
+
+
+def _at_ends(at: SegmentPoints, other: FacetShape, traction: Array) -> list[tuple[Ints, Array]]:
+    """What ``handing_on`` has from ends of the target, of facets of the shape ``other``: of each pair, and through the facet's mean."""
+    which = at.partly_covered()
+    which = which[traction[at.facet[which]].any(axis=(1, 2))]
+    s = at.sides(other, which).at_ends()
+    if not len(s.pair):
+        return []
+    facet, k, (nc, g), nt = at.facet[which], len(which), traction.shape[1:], at.opposite.shape[1]
+    of_share, of_mean = at.duals.spread(facet[s.pair], s.b, traction)
+    left = np.concatenate([s.motions.phi, -s.N], axis=1)[:, :, None] * of_share[:, None]
+    left[:, :nc] += basis_of(at.shape).T.T @ of_mean
+    local = sum_of_products(s.pair, -s.weight, left, s.way, k)
+    width = (nc + nt) * g
+    means = add_up(s.pair, products(of_mean.reshape(-1, nc * g), (-s.way * s.weight[:, None, None]).reshape(-1, width)), k)
+    # the target's shape functions are projected onto the whole facet, with all that is opposite of it
+    here = np.flatnonzero(means.any(axis=1))
+    i, j = np.nonzero(facet[here, None] == facet[None, :])
+    i = here[i]
+    projected = at.duals.inverse[facet[j]] @ at.covered.N[which[j]]
+    out = np.zeros((len(i), nc + 2 * nt, g, nc + 2 * nt, g))
+    out[:, nc + nt :, :, : nc + nt] = -np.einsum("pbl,pbgah->plgah", projected, means.reshape(k, nc, g, nc + nt, g)[i])
+    nodes = np.concatenate([at.nodes[facet], at.opposite[which]], axis=1)
+    size = (nc + 2 * nt) * g
+    return [(nodes, local), (np.concatenate([nodes[i], at.opposite[which[j]]], axis=1), out.reshape(-1, size, size))]
+
+
+def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: Ints) -> Array:
+    """What ``handing_on`` has from parts of facets that do not grow as these do.
+
+    Args:
+        at: points of the segments.
+        traction: as for ``handing_on``.
+        which: pairs ``(p,)``.
+        q: their points.
+        pair: of these, among them.
+    """
+    e, k, (m, nc, g), nt = at.facet[which], len(which), traction.shape, at.opposite.shape[1]
+    weight, grown = at.segments.weight[q], at.stretching[q].reshape(len(q), nc * g)
+    of_share, of_mean = at.duals.spread(e[pair], at.b[q], traction)
+    share = np.concatenate([at.phi[q], -at.N[q]], axis=1)
+    left = share[:, :, None] * of_share[:, None]
+    left[:, :nc] += basis_of(at.shape).T.T @ of_mean
+    out = np.zeros((k, nc + nt, g, nc + nt, g))
+    width = (nc + nt) * g
+    out[:, :, :, :nc] = add_up(pair, products(weight[:, None] * left.reshape(-1, width), grown), k).reshape(k, nc + nt, g, nc, g)
+    if nt:
+        means = add_up(e[pair], products(weight[:, None] * of_mean.reshape(len(q), nc * g), grown), m).reshape(m, nc, g, nc, g)
+        projected = at.duals.inverse[e] @ at.covered.N[which]
+        out[:, nc:, :, :nc] -= np.einsum("kbl,kbgah->klgah", projected, means[e])
+    return out.reshape(k, width, width)
+
+
+def turning(
+    elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
+) -> list[tuple[Ints, Array]]:
+    """Derivatives of forces of friction: with the coefficients of those that slip and the multipliers of others kept (collective).
+
+    Args:
+        elimination: of the contactors.
+        rows: equations of all contactors, where they were made.
+        dofs: local nodes of the contactor facets ``(m, nc)``.
+        frictional: the contactors with friction.
+        weights: by what all contactors follow other nodes.
+
+    Returns:
+        Lists of global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
+    """
+    at, config, (which, normal, tau) = rows.points, elimination.config, (frictional.which, frictional.normal, frictional.tau)
+    n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
+    assert rows.whole is not None and rows.slope is not None and rows.push is not None and rows.parts is not None
+    whole = rows.whole[which, None]
+    mine = np.zeros((n, 1 + g))
+    # directions and their changes are the same for any force across the target: one that makes the plain row's multiplier 1
+    mine[which] = np.column_stack([rows.share[which] / rows.area[which], tau / whole])
+    there = config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(m, nc, 1 + g)
+    # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
+    unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
+    grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * unit[:, None]
+    if at.unequal:
+        s = at.segments
+        stretched = products(s.weight[:, None] * at.b, at.stretching.reshape(len(at.b), nc * g))
+        on_facet = add_up(at.facet[s.pair], stretched, m).reshape(m, nc, nc, g)
+        grown += np.einsum("mjb,bj,mbag->mjag", (at.duals.C != 0).astype(float), basis_of(at.shape).T, on_facet)
+    parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g + g)), grown], axis=3))]
+    if at.other is not None:
+        ends = at.partly_covered()
+        sides = at.sides(at.other, ends).at_ends()
+        pair = ends[sides.pair]
+        e = at.facet[pair]
+        share = sides.weight[:, None] * np.einsum(
+            "qjb,bj,qb->qj", (at.duals.C[e] != 0).astype(float), basis_of(at.shape).T, sides.b
+        )
+        grown = -share[:, :, None, None] * sides.way[:, None]
+        over = np.concatenate([at.nodes[e], at.opposite[pair]], axis=1)
+        parts.append(terms_of(at.nodes[e], over, np.concatenate([np.zeros((*grown.shape[:3], g * g + g)), grown], axis=3)))
+    length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
+    outward = rows.parts / np.where(length > 0, length, 1.0)
+    for j in range(nc):
+        alone = np.zeros((m, nc))
+        alone[:, j] = there[:, j, 0]
+        for nodes, blocks in curvature(at, alone):
+            p, width = nodes.shape
+            own = -blocks[:, j * g : (j + 1) * g].reshape(p, g, width, g).swapaxes(1, 2)
+            longer = np.einsum("pg,pwgh->pwh", outward[_places(at.nodes, nodes[:, :nc]), j], own)
+            columns = [own.reshape(p, width, g * g), longer, np.zeros((p, width, g))]
+            parts.append(terms_of(nodes[:, j : j + 1], nodes, np.concatenate(columns, axis=2)[:, None]))
+    row, term, value = elimination.at_owners(parts, np.ones(n))
+    values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + 2 * g))
+    values[: len(row), 1:] = value
+    values[len(row) :, 0] = np.concatenate([-weights[2], np.ones(len(which))])
+    rows_of_terms, terms = (
+        np.concatenate(part)
+        for part in ((row, weights[0], which), (term, weights[1], config.to_global(elimination.nodes[which])))
+    )
+    nodes, values = _table(add_up_terms((rows_of_terms, terms, values)), which, n)
+    k, c = nodes.shape
+    gradient, longer, of_whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
+    along = longer * (frictional.slips / rows.push[which])[:, None, None]
+    across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / rows.slope[which, None, None]
+    change = np.einsum("kg,kch->kgch", tau, along - of_whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
+    blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
+    return [*handing_on(at, there[:, :, 1:]), (nodes, blocks)]
+
+
+def _places(facets: Ints, which: Ints) -> Ints:
+    """Places in ``facets (m, nc)`` of facets told by the same nodes ``(p, nc)``."""
+    _, number = np.unique(np.concatenate([facets, which]), axis=0, return_inverse=True)
+    place = np.zeros(len(number), dtype=np.int64)
+    place[number[: len(facets)]] = np.arange(len(facets))
+    return place[number[len(facets) :]]
+
+
+def _table(terms: Terms, which: Ints, n: int) -> tuple[Ints, Array]:
+    """Terms of rows ``which (k,)`` of ``n``, one row each: followed nodes, -1 for none ``(k, c)``, and values ``(k, c, ...)``."""
+    row, term, value = terms
+    place = np.full(n, -1, dtype=np.int64)
+    place[which] = np.arange(len(which))
+    kept = place[row] >= 0
+    row, term, value = place[row[kept]], term[kept], value[kept]
+    column = np.arange(len(row)) - np.searchsorted(row, np.arange(len(which)))[row]
+    nodes = np.full((len(which), int(column.max(initial=-1)) + 1), -1, dtype=np.int64)
+    values = np.zeros((*nodes.shape, value.shape[1]))
+    nodes[row, column], values[row, column] = term, value
+    return nodes, values

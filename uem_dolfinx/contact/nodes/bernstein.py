@@ -1,0 +1,274 @@
+"""Node to surface on contactors of degree 2: control gaps take the place of nodal gaps.
+
+A quadratic facet's shape functions are partly negative, so that under a pressure its
+nodal forces are zero or negative at vertices, and tell nothing about contact. In Bernstein's basis, which is positive, the same
+gap has the coefficients
+
+    g_v at a vertex,    2 g_m - (g_1 + g_2) / 2 in the middle of an edge,    and likewise in the middle of a quadrilateral,
+
+and its forces are integrals of the pressure with positive weights. So contact is decided by these control gaps and control
+forces: ``control gap >= 0, control force >= 0``, one of them zero. Where all nodes of a facet are active this unites the same
+nodes as nodal gaps do; at the rim it keeps active sets stable and pressures positive. The equations scale a contactor's own
+coefficient to one, so that its control gap is ``g_m - (g_1 + g_2) / 4``; the control forces are those of Bernstein's basis, and
+add up to the resultant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
+
+#: Nodes on the same side of a target share a quadratic gap if it rises no steeper than this from one to the other.
+#: [convention; slope; test_bernstein.py::test_pressed_on_an_arch]
+STEEPEST = 0.2
+
+
+@dataclass(frozen=True)
+class Family:
+    """Which contactors in the middle of an edge or a facet depend on which vertices and middles around them.
+
+    Every term subtracts ``weight`` times the gap of a parent, a vertex or an edge's middle, from the gap of a child, a contactor in
+    the middle of an edge or a facet. Parents may live on other ranks; children are always this rank's own.
+
+    Attributes:
+        config: configuration of the displacement, of degree 2.
+        nodes: owned contactor nodes ``(n,)``.
+        child: place of the term's contactor ``(k,)``.
+        parent: local node of the term's parent ``(k,)``.
+        weight: ``(k,)``.
+        of_facet: whether the term leads from the middle of a facet to the middle of an edge ``(k,)``.
+    """
+
+    config: Configuration
+    nodes: Indices
+    child: Ints
+    parent: Ints
+    weight: Array
+    of_facet: Bools
+
+    def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
+        """Terms that count where the contactors are (collective).
+
+        Args:
+            projection: of the contactors.
+            usable: contactors over the target that no corner holds ``(n,)``; only their gaps count.
+        """
+        p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
+        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
+        seen = self.config.from_owners(self.nodes, rows, self.parent)
+        gap, normal, i = seen[:, 0], seen[:, 2 : 2 + g], self.child
+        length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
+        smooth = np.abs(gap - p.gap[i]) <= STEEPEST * length
+        smooth &= np.einsum("kg,kg->k", normal, p.normal[i]) > 0.0
+        smooth &= usable[i] & (seen[:, 1] > 0)
+        alone = np.zeros(len(self.nodes), dtype=bool)
+        alone[i[~smooth]] = True
+        targets, weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
+        return ControlGaps(self, ~alone[i], gap, normal, targets, weights)
+
+    def spread(self, values: Array) -> Array:
+        """Integrals of Bernstein's basis times what ``values (n,)`` are integrals of with the shape functions (collective)."""
+        k, g = len(self.child), self.config.gdim
+        every: Bools = np.ones(k, dtype=bool)
+        all_shared = ControlGaps(self, every, np.zeros(k), np.zeros((k, g)), np.zeros((k, 0), np.int64), np.zeros((k, 0)))
+        return all_shared.areas(values)
+
+
+@dataclass(frozen=True)
+class ControlGaps:
+    """The terms of a family at one displacement.
+
+    Attributes:
+        family: whose terms they are.
+        shared: whether the gap is quadratic from the child to all its parents ``(k,)``.
+        gap: of the parents ``(k,)``.
+        normal: of the parents ``(k, gdim)``.
+        targets: global nodes that the parents follow ``(k, nn)``.
+        weights: their weights ``(k, nn)``.
+    """
+
+    family: Family
+    shared: Bools
+    gap: Array
+    normal: Array
+    targets: Ints
+    weights: Array
+
+    def of(self, gap: Array) -> Array:
+        """Control gaps from nodal gaps ``(n,)``."""
+        k, f = self.shared, self.family
+        return gap - np.bincount(f.child[k], f.weight[k] * self.gap[k], minlength=len(gap))
+
+    def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
+        """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
+        control = np.where(active, multipliers, 0.0)
+        return self.scale * control, control - self.handed_on(control, self.shared)
+
+    @property
+    def scale(self) -> Array:
+        """Bernstein's basis functions over those that belong to the scaled gaps ``(n,)``."""
+        f = self.family
+        scale = np.ones(len(f.nodes))
+        scale[f.child[self.shared]] = 0.5
+        scale[f.child[self.shared & f.of_facet]] = 0.25
+        return scale
+
+    def extend(self, equations: UnitingEquations) -> UnitingEquations:
+        """Add the terms of the parents to the equations of all contactors."""
+        f, k = self.family, np.flatnonzero(self.shared)
+        own = f.weight[k, None] * self.normal[k]
+        a, b = np.nonzero(self.targets[k] >= 0)
+        row = f.child[k]
+        return replace(
+            equations,
+            row=np.concatenate([equations.row, row, row[a]]),
+            followed=np.concatenate([equations.followed, f.config.to_global(f.parent[k]), self.targets[k][a, b]]),
+            coefficients=np.concatenate([equations.coefficients, own, -self.weights[k][a, b][:, None] * own[a]]),
+        )
+
+    def areas(self, areas: Array) -> Array:
+        """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
+        areas = areas + self.handed_on(areas, self.shared & self.family.of_facet)
+        return self.scale * (areas + self.handed_on(areas, self.shared & ~self.family.of_facet))
+
+    def forces_back(self, weights: Array, active: Bools) -> Array:
+        """The transpose of the map from multipliers to control forces, for weights of these ``(n,)``."""
+        return np.where(active, self.scale * weights, 0.0)
+
+    def areas_back(self, weights: Array) -> Array:
+        """The transpose of ``areas`` (collective)."""
+        weights = self.scale * weights
+        weights = weights + self._handed_back(weights, self.shared & ~self.family.of_facet)
+        return weights + self._handed_back(weights, self.shared & self.family.of_facet)
+
+    def _handed_back(self, values: Array, terms: Bools) -> Array:
+        """The transpose of ``handed_on`` (collective)."""
+        f = self.family
+        at_parent = f.config.from_owners(f.nodes, values[:, None], f.parent)[:, 0]
+        return np.asarray(np.bincount(f.child, np.where(terms, f.weight * at_parent, 0.0), minlength=len(f.nodes)), dtype=float)
+
+    def handed_on(self, values: Array, terms: Bools) -> Array:
+        """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
+        f = self.family
+        amounts = np.where(terms, f.weight * values[f.child], 0.0)
+        return f.config.to_owners(f.parent, amounts)[f.nodes]
+
+
+class Bernstein(NodeToSurface):
+    """Implements ``Discretisation`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
+
+    #: A contactor in the middle of an edge or a facet follows contactors around it.
+    chained = True
+    pointwise = False
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
+        super().__init__(config, nodes, target, **how)
+        self.family = Family(config, nodes, *_family(config, nodes))
+
+    def spread(self, values: Array) -> Array:
+        """Integrals with Bernstein's basis (collective)."""
+        return self.family.spread(values)
+
+    def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
+        """The kinematics with control gaps (collective)."""
+        k, gap = kinematics, kinematics.projection.gap
+        usable = ~k.off(state) & ~state.in_corner
+        control = self.family.control_gaps(k.projection, usable)
+        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left)
+        return ControlKinematics(*plain, control=control)
+
+
+@dataclass(frozen=True)
+class ControlKinematics(NodalKinematics):
+    """``NodalKinematics`` with control gaps.
+
+    Attributes:
+        control: the terms that lead to them.
+    """
+
+    control: ControlGaps = field(kw_only=True)
+
+    def weights(self) -> tuple[Ints, Ints, Array]:
+        """Those of the feet, and what leads from the control gaps to the nodal ones."""
+        row, followed, weight = super().weights()
+        c = self.control
+        f, k = c.family, np.flatnonzero(c.shared)
+        t, a = np.nonzero(c.targets[k] >= 0)
+        return (
+            np.concatenate([row, f.child[k], f.child[k][t]]),
+            np.concatenate([followed, f.config.to_global(f.parent[k]), c.targets[k][t, a]]),
+            np.concatenate([weight, f.weight[k], -f.weight[k][t] * c.weights[k][t, a]]),
+        )
+
+    @property
+    def force_per_multiplier(self) -> Array:
+        """Bernstein's basis functions over those that belong to the scaled gaps."""
+        return self.control.scale
+
+    def _normal_rows(self, weights: Array) -> UnitingEquations:
+        return self.control.extend(super()._normal_rows(weights))
+
+    def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
+        return self.control.forces(multipliers, state.active)
+
+    def nodal_friction(self, tau: Array) -> Array:
+        """Handed on from the control points to the nodes; what targets get that are contactors themselves is not theirs (collective)."""
+        return np.column_stack([along - self.control.handed_on(along, self.control.shared) for along in tau.T])
+
+    def areas(self, areas: Array, current: bool) -> Array:
+        """Integrals of Bernstein's basis (collective)."""
+        return self.control.areas(areas)
+
+    def areas_along(self, areas: Array) -> Array:
+        """Of Bernstein's basis (collective)."""
+        return self.control.areas(areas)
+
+    def areas_back(self, weights: Array) -> Array:
+        """From Bernstein's basis (collective)."""
+        return self.control.areas_back(weights)
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """From control forces (collective)."""
+        return self.control.forces_back(weights, state.active)
+
+
+def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:
+    """Places of the children, local nodes of the parents, weights, and whether a term leads from facet to edge, ``(k,)`` each."""
+    place = np.full(config.n_local, -1, dtype=np.int64)
+    place[nodes] = np.arange(len(nodes))
+    layout = config.V.dofmap.dof_layout
+    cells = compat.cell_dofs(config.V)
+    topology = forms.reference_topology(compat.cell_name(config.mesh))
+    vertex = [layout.entity_dofs(0, v)[0] for v in range(len(topology[0]))]
+    edge = [layout.entity_dofs(1, e)[0] for e in range(len(topology[1]))]
+    relations = [(edge[e], [vertex[v] for v in ends], [0.25, 0.25], [False] * 2) for e, ends in enumerate(topology[1])]
+    if config.tdim == 3:
+        for f, corners in enumerate(topology[2]):
+            if not len(layout.entity_dofs(2, f)):
+                continue
+            sides = [e for e, ends in enumerate(topology[1]) if set(ends) <= set(corners)]
+            parents = [edge[e] for e in sides] + [vertex[v] for v in corners]
+            relations.append((layout.entity_dofs(2, f)[0], parents, [0.25] * 4 + [-0.0625] * 4, [True] * 4 + [False] * 4))
+    children, parents_of, weights, of_facet = [], [], [], []
+    for middle, parents, w, to_edge in relations:
+        at = place[cells[:, middle]]
+        # a middle lies in several cells, all of which know its parents
+        first, row = np.unique(at, return_index=True)
+        row = row[first >= 0]
+        children.append(np.repeat(at[row], len(parents)))
+        parents_of.append(cells[row][:, parents].ravel())
+        weights.append(np.tile(w, len(row)))
+        of_facet.append(np.tile(to_edge, len(row)))
+    child, parent = np.concatenate(children), np.concatenate(parents_of).astype(np.int64)
+    _, once = np.unique(np.column_stack([child, parent]), axis=0, return_index=True)
+    return child[once], parent[once], np.concatenate(weights)[once], np.concatenate(of_facet)[once]

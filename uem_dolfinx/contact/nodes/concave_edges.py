@@ -1,0 +1,192 @@
+"""Which facets contactors rest on where normals jump from facet to facet: changes across bends, corners entered and left.
+
+States are handed in and out; only the geometry of the target is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.nodes.corners import find_corners
+from uem_dolfinx.contact.seam.corners import Corners
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import reduced
+
+#: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
+#: [heuristic; changes in a step; test_polygons.py::test_sliding_along_a_polygon]
+HOLD_AFTER = 2
+#: A concave bend whose facets rise above each other by more holds a contactor at once: nothing slides on across it.
+#: [heuristic; slope; test_concave_corners.py::test_a_block_pressed_into_a_corner]
+SHARP = 0.5
+#: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
+#: [heuristic; changes in a step; test_polygons.py::test_sliding_along_a_polygon]
+MOST_CHANGES = 8
+
+
+def create_concave_edges(config: Configuration, target: Target, free: Bools) -> ConcaveEdges | None:
+    """What follows contactors from facet to facet; None where normals do not jump between facets."""
+    return ConcaveEdges(config, cast("MeshTarget", target), free) if target.faceted else None
+
+
+class ConcaveEdges:
+    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges.
+
+    Args:
+        config: configuration of the displacement.
+        target: whose facets they are.
+        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+    """
+
+    def __init__(self, config: Configuration, target: MeshTarget, free: Bools):
+        self.config, self.target, self.free = config, target, free
+        #: Coefficients of friction of the contactors ``(n,)``.
+        self.mu: Array = np.zeros(len(free))
+        #: How far from the facets contactors are held ``(n,)``; None on them.
+        self.offset: Array | None = None
+
+    def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
+        """Put contactors that a corner holds into it, and give those that change facets too often averaged normals (collective).
+
+        Args:
+            nearest: the contactors on their nearest facets.
+            points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair.
+
+        Returns:
+            The projection, and the corners that hold contactors, None if no rank has any.
+        """
+        projection = with_averaged_normals(nearest, state.changes >= MOST_CHANGES, points)
+        held = np.flatnonzero(state.in_corner)
+        c = self._corners_of(state, points, held, state.held[held])
+        if c is None:
+            return projection, None
+        at_corner: dict[str, Any] = {"normal": c.axes[:, 0], "gap": c.gaps(points[held])[:, 0], "facet": state.facet[held]}
+        at_corner |= {"nodes": c.nodes, "weights": c.weights, "foot": c.foot, "beyond": c.beyond}
+        return projection.with_rows(held, at_corner), c
+
+    def place_again(
+        self, nearest: Projection, left: Bools, points: Array, state: PairState
+    ) -> tuple[Projection, Projection, Corners | None]:
+        """Place contactors that have entered or left corners, their positions being the same (collective).
+
+        Args:
+            nearest: the contactors on their nearest facets.
+            left: those that have just left a corner ``(n,)``.
+            points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair.
+
+        Returns:
+            ``nearest``, and what ``place`` returns. A contactor that has just left is still as near to the facet that it left.
+        """
+        nearest = cast("FacetProjection", nearest)
+        i = np.flatnonzero(left & ~state.in_corner)
+        if reduced(self.config.comm, len(i)):
+            own = self.target.project_on(points[i], state.facet[i])
+            own = replace(own, normal=self.target.outward(own))
+            height = np.einsum("ng,ng->n", own.normal, points[i] - own.foot)
+            own = replace(own, gap=height if self.offset is None else height - self.offset[i])
+            nearest = nearest.with_those(i, own)
+        return nearest, *self.place(nearest, points, state)
+
+    def leave(self, corners: Corners | None, state: PairState) -> tuple[PairState, Bools]:
+        """Let go of the facet of a corner that would have to pull.
+
+        Args:
+            corners: that hold contactors.
+            state: of the pair.
+
+        Returns:
+            The new state, and which contactors have let go ``(n,)``.
+        """
+        left = np.zeros(len(self.free), dtype=bool)
+        if corners is None or not len(corners.which):
+            return state, left
+        i = corners.which
+        pulls = corners.pulls(state.force[i], self.mu[i])
+        leaving = (pulls < 0).any(axis=1) | ~state.active[i]
+        facets = np.column_stack([state.facet[i], state.held[i]])
+        rows = np.flatnonzero(leaving)
+        facets[rows, np.argmin(pulls[rows], axis=1)] = -1
+        facets = _moved_up(facets)
+        facet, held = state.facet.copy(), state.held.copy()
+        facet[i], held[i] = facets[:, 0], facets[:, 1:]
+        held[~state.active] = -1
+        left[i[leaving]] = True
+        return replace(state, facet=facet, held=held), left
+
+    def follow(self, nearest: Projection, left: Bools, points: Array, state: PairState) -> tuple[PairState, bool]:
+        """Follow contactors onto new facets; into a concave corner they take the old facet with them (collective).
+
+        Args:
+            nearest: the contactors on their nearest facets.
+            left: those that have just left a corner ``(n,)``.
+            points: current positions of the contactors ``(n, gdim)``.
+            state: of the pair, after ``leave``.
+
+        Returns:
+            The new state, and whether a contactor on this rank has entered a corner or left it for good.
+        """
+        number = nearest.facet
+        known = (state.facet == number) | (state.held == number[:, None]).any(axis=1) | (state.facet < 0)
+        moved = ~known & state.active & ~left & (state.changes < MOST_CHANGES)
+        i = np.flatnonzero(moved)
+        facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
+        settled = ~moved & ~left & ~state.in_corner
+        facet[settled] = number[settled]
+        # first together with all facets that it is on, then with the first of them alone
+        together = _moved_up(np.column_stack([state.held[i], number[i]]))[:, : held.shape[1]]
+        full = (state.held[i] >= 0).all(axis=1)
+        alone = np.full_like(together, -1)
+        alone[:, 0] = number[i]
+        taken = np.zeros(len(i), dtype=bool)
+        entered = False
+        for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)):
+            ask = np.flatnonzero(allowed & ~taken)
+            c = self._corners_of(state, points, i[ask], others[ask])
+            if c is None:
+                continue
+            at_once = (state.changes[c.which] >= HOLD_AFTER) | (c.rising > SHARP)
+            hold = c.concave & self._can_be_held(c) & at_once
+            held[c.which[hold]] = others[ask[hold]]
+            taken[ask[hold]] = True
+            changes[c.which[~c.flat]] += 1
+            entered |= bool(hold.any())
+        switch = i[~taken]
+        facet[switch], held[switch] = number[switch], -1
+        # one that is still led past the end of what holds it goes on with averaged normals
+        past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
+        facet[past], held[past] = number[past], -1
+        return replace(state, facet=facet, held=held, changes=changes), entered or bool(past.any())
+
+    def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
+        """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
+        c = find_corners(self.config.comm, self.target, points[which], which, np.column_stack([state.facet[which], others]))
+        return c if c is None or self.offset is None else replace(c, offset=self.offset[which])
+
+    def _can_be_held(self, c: Corners) -> Bools:
+        """Corners whose contactor has a free direction for every facet ``(k,)``."""
+        asked = np.arange(self.config.gdim) < c.count[:, None]
+        A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
+        return (np.linalg.svd(A, compute_uv=False) > MOSTLY_PRESCRIBED).sum(axis=1) == c.count
+
+
+def with_averaged_normals(nearest: Projection, which: Bools, points: Array) -> FacetProjection:
+    """The projection with averaged normals for some contactors ``(n,)`` at ``points (n, gdim)``."""
+    p = cast("FacetProjection", nearest)
+    gap = np.einsum("ng,ng->n", p.averaged, points - p.foot)
+    if p.offset is not None:
+        gap -= p.offset
+    return replace(p, normal=np.where(which[:, None], p.averaged, p.normal), gap=np.where(which, gap, p.gap))
+
+
+def _moved_up(facets: Ints) -> Ints:
+    """Rows with their facets first, then the empty places."""
+    return np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)

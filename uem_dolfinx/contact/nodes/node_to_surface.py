@@ -1,0 +1,389 @@
+"""Node to surface: each contactor node is united to the point of the target below it, the paper's coupling [UEM, 4.1-4.3].
+
+Targets may be meshed or rigid. Where the normals of a meshed target jump from facet to facet, ``concave_edges`` says which facets hold a
+contactor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.seam.base import OnTarget
+from uem_dolfinx.contact.seam.ends import END_HOLDS, past_end
+from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.relative_motion import Ties
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.nodes.concave_edges import ConcaveEdges
+    from uem_dolfinx.contact.seam.corners import Corners
+
+
+class NodeToSurface(OnTarget):
+    """Implements ``Discretisation``: contactor nodes against the surface of one target; arguments as those of ``OnTarget``.
+
+    Args:
+        chords: trial rows with the weights of the straight pieces between a curved target's nodes [UEM, 4.5].
+    """
+
+    chained, two_pass = False, True
+    pointwise = at_feet = True
+    #: Whether it can be told ``far``.
+    can_be_far = True
+    #: Whether an end of the target holds contactors that came to it there, one or each ``(n,)``.
+    ends_hold: bool | Bools = True
+
+    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
+        self.concave_edges: ConcaveEdges | None = None
+        super().__init__(config, nodes, target, **how)
+        self.chords = chords
+        from uem_dolfinx.contact.nodes.concave_edges import create_concave_edges
+
+        self.concave_edges = create_concave_edges(config, target, self.free) if self.sliding == "finite" else None
+
+    @classmethod
+    def like(cls, other: OnTarget) -> NodeToSurface:
+        """The same contactors and target with nodal gaps, for methods that push nodes."""
+        how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
+        return cls(other.config, other.nodes, other.target, free=other.free_of_owned, **how)
+
+    def hold(self, free: Bools) -> None:
+        """Take which components have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        super().hold(free)
+        #: Nodes that contactors followed last ``(n, nt)``, and which of their components may move ``(n, nt, gdim)``.
+        self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
+        if self.concave_edges is not None:
+            self.concave_edges.free = self.free
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``, at corners too; contactors are to be placed again."""
+        super().set_offset(offset)
+        if self.concave_edges is not None:
+            self.concave_edges.offset = offset
+
+    def with_friction(self, mu: Array) -> None:
+        """Take the slopes of the cones ``(n,)``, with which contactors leave corners."""
+        super().with_friction(mu)
+        if self.concave_edges is not None:
+            self.concave_edges.mu = mu
+
+    def place(self, points: Array, state: PairState) -> NodalKinematics:
+        """Project contactors (collective); see ``Discretisation``."""
+        if self.far:
+            return NothingNear.at(self, points)
+        corners = None
+        if self.sliding == "finite":
+            nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)
+            if self.concave_edges is not None:
+                projection, corners = self.concave_edges.place(nearest, points, state)
+        else:
+            if self.anchor is None:
+                nearest = projection = self.take_feet(points)
+            else:
+                nearest = projection = self.on_target(points, self.anchor)
+        moves = self._target_moves(projection) if self.prescribed else None
+        return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves), state)
+
+    def measured(self, kinematics: NodalKinematics, state: PairState) -> NodalKinematics:
+        """The kinematics with the gaps that decide on contact (collective)."""
+        return kinematics
+
+    def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
+        """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
+        i = np.flatnonzero(state.active & state.at_end & (nearest.beyond != 0).any(axis=1))
+        return self.target.continued(nearest, i) if len(i) else nearest
+
+    def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
+        """Put the feet of contactors that friction holds where they stick, so that no bend leads them astray (collective)."""
+        f = state.friction
+        if f is None or not isinstance(self.target, MeshTarget) or not isinstance(nearest, FacetProjection):
+            return nearest
+        i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
+        own = self.raised(self.target.at(points[i], f.facet[i], f.xi[i]), i)
+        return nearest.with_those(i, replace(own, beyond=np.zeros_like(own.beyond)))
+
+    def _target_moves(self, p: Projection) -> Bools | None:
+        """Which targets can move along the normal (collective)."""
+        if not p.nodes.shape[1]:
+            return None
+        nodes = np.maximum(p.nodes, 0)
+        if reduced(self.config.comm, int(not np.array_equal(nodes, self._followed))):
+            self._followed, shape = nodes, (*nodes.shape, self.config.gdim)
+            self._may_move = self.config.ask_owners(nodes.ravel(), self.free_of_owned.astype(float)).reshape(shape)
+        free = self._may_move
+        return np.abs(p.weights[:, :, None] * p.normal[:, None] * free).max(axis=(1, 2)) > MOSTLY_PRESCRIBED
+
+
+@dataclass(frozen=True)
+class NodalKinematics:
+    """Implements ``Kinematics``: nodes on the surface of one target.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        points: of the contactors ``(n, gdim)``.
+        projection: of the contactors; those that a corner holds are in the corner.
+        nearest: of the contactors, on their nearest facets.
+        gap: that decides on contact ``(n,)``.
+        corners: of the target that hold contactors; None if no rank has any.
+        target_moves: whether the target can move along the normal ``(n,)``; None where no contactor is prescribed.
+        left: contactors that have just left a corner ``(n,)``; None if none has.
+    """
+
+    of: NodeToSurface
+    points: Array
+    projection: Projection
+    nearest: Projection
+    gap: Array
+    corners: Corners | None
+    target_moves: Bools | None
+    left: Bools | None = None
+
+    @property
+    def idle(self) -> bool:
+        """No: the target is one for all."""
+        return False
+
+    @property
+    def normal(self) -> Array:
+        """The normals at the feet ``(n, gdim)``."""
+        return self.projection.normal
+
+    @cached_property
+    def movable(self) -> Bools:
+        """Contactors that can move along the normal, or whose target can ``(n,)``."""
+        own = np.linalg.norm(self.projection.normal * self.of.free, axis=1) > MOSTLY_PRESCRIBED
+        return own if self.target_moves is None else own | self.target_moves
+
+    @cached_property
+    def ties(self) -> Ties:
+        """With the shape functions at the feet; see ``Kinematics``."""
+        of = self.of
+        return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, of.at_feet)
+
+    def weights(self) -> tuple[Ints, Ints, Array]:
+        """Places of contactors, global nodes that they follow and weights, ``(k,)`` each."""
+        p = self.projection
+        row, a = np.nonzero(p.nodes >= 0)
+        return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
+
+    @property
+    def force_per_multiplier(self) -> Array:
+        """The whole multiplier ``(n,)``."""
+        return np.ones(len(self.points))
+
+    @cached_property
+    def cone(self) -> Array:
+        """What facets push with, over their force along the contactor's normal: more on an edge ``(n,)`` (first time: collective)."""
+        cone, target, p = np.ones(len(self.points)), self.of.target, self.projection
+        if self.of.frictional and target.faceted and isinstance(target, MeshTarget) and isinstance(p, FacetProjection):
+            averaged = (p.facet >= 0) & (p.averaged == p.normal).all(axis=1)
+            if reduced(self.of.config.comm, bool(averaged.any()), op=MPI.LOR):
+                cone = np.where(averaged, target.spread(p), 1.0)
+        if self.corners is not None:
+            cone[self.corners.which] = np.linalg.norm(self.corners.summing, axis=1)
+        return cone
+
+    # -- the same contactors in another state ----------------------------------------------------------------------------
+
+    def placed_again(self, state: PairState) -> NodalKinematics:
+        """Put contactors that have entered or left a corner where they now belong (collective)."""
+        if self.of.concave_edges is None:
+            return self
+        left = np.zeros(len(self.points), dtype=bool) if self.left is None else self.left
+        nearest, projection, corners = self.of.concave_edges.place_again(self.nearest, left, self.points, state)
+        there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
+        return self.of.measured(there, state)
+
+    def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
+        """Follow contactors across bends, into corners and out of them (collective)."""
+        if self.of.concave_edges is None:
+            return self, state, False
+        state, left = self.of.concave_edges.leave(self.corners, state)
+        state, entered = self.of.concave_edges.follow(self.nearest, left, self.points, state)
+        return replace(self, left=left), state, bool(left.any()) or entered
+
+    # -- what decides ----------------------------------------------------------------------------------------------------
+
+    def off(self, state: PairState) -> Bools:
+        """Past an open end of the target in a direction in which contactors can move, or round it behind a thin target."""
+        return past_end(self.projection, state, self.of.thickness)
+
+    def at_end(self, state: PairState) -> Bools:
+        """Contactors that come to the target at its end, where edges coincide, are held there until they slide away from it.
+
+        One that let go of the target as soon as it is the least bit past the end would sink into it, and come back with a blow.
+        """
+        near = (self.projection.from_end <= END_HOLDS) & ~self.off(state) & self.of.ends_hold
+        return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def gap_rows(self) -> GapRows:
+        """One row along the normal for each contactor, then one along each further axis of a corner that holds it."""
+        p, c, of = self.projection, self.corners, self.of
+        found = GapRows.along_normals(of.config, self._normal_rows(p.weights), np.ones(len(self.points)), of.free)
+        if of.chords:
+            weights = np.array(of.target.chords(p))
+            if c is not None:
+                weights[c.which] = p.weights[c.which]
+            found = replace(found, moved=self._normal_rows(weights))
+        if c is None:
+            return found
+        gaps, more, contactors, kinds = c.gaps(self.points[c.which]), [], [found.contactor], [found.kind]
+        for r in range(1, of.config.gdim):
+            j = np.flatnonzero(r < c.count)
+            w, none = c.which[j], np.zeros(len(j), bool)
+            more.append(UnitingEquations.along(of.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], none))
+            contactors.append(w)
+            kinds.append(np.full(len(w), r))
+        lists = (
+            None if rows is None else UnitingEquations.join([rows, *more], of.config.gdim)
+            for rows in (found.equations, found.moved)
+        )
+        equations, moved = lists
+        assert equations is not None
+        return GapRows(of.config, equations, found.scale, of.free, np.concatenate(contactors), np.concatenate(kinds), moved)
+
+    def _normal_rows(self, weights: Array) -> UnitingEquations:
+        """Equations of all contactors along the normals, with these weights of the target's nodes ``(n, nn)``."""
+        p, none = self.projection, np.zeros(len(self.points), bool)
+        return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """Contact forces along the normals, of all facets of a corner together (collective)."""
+        lam = np.zeros(len(self.points))
+        normal = equations.kind == NORMAL
+        lam[equations.contactor[normal]] = multipliers[normal]
+        (lam, nodal), c = self._nodal(state, lam), self.corners
+        force = nodal[:, None] * self.projection.normal
+        for r in range(1, self.of.config.gdim):
+            j = np.flatnonzero(equations.kind == r)
+            force[equations.contactor[j]] += multipliers[j, None] * equations.test.direction[j]
+        lam = lam * self.cone
+        if c is not None:
+            lam[c.which] = np.einsum("kg,kg->k", force[c.which], c.summing)
+        return Traction(lam, nodal, force)
+
+    def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
+        """Deciding and nodal forces along the normals from the multipliers of all contactors, each ``(n,)`` (collective)."""
+        return multipliers, multipliers
+
+    def nodal_friction(self, tau: Array) -> Array:
+        """Each its own."""
+        return tau
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """On each contactor its force, on the target's nodes the opposite with the weights of the foot."""
+        p, i, config = self.projection, np.flatnonzero((state.force != 0).any(axis=1)), self.of.config
+        nodes = np.concatenate([config.to_global(self.of.nodes[i])[:, None], p.nodes[i]], axis=1)
+        share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
+        return nodes.ravel(), (share[..., None] * state.force[i, None, :]).reshape(-1, config.gdim)
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Second derivatives of the gaps of contactors that push; those in a corner keep to its edge."""
+        p, c, nodes = self.projection, self.corners, self.of.nodes
+        i = np.flatnonzero(((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner)
+        own, followed, blocks = nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
+        if c is not None:
+            own = np.concatenate([own, nodes[c.which]])
+            followed = np.concatenate([followed, c.nodes])
+            blocks = np.concatenate([blocks, -c.hessians(state.force[c.which])])
+        return [(np.column_stack([self.of.config.to_global(own), followed]), blocks)]
+
+    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
+        """Derivatives of the rows along forces of friction, of contactors that no corner holds."""
+        plain = ~state.in_corner[which]
+        i, p = which[plain], self.projection
+        return [(np.column_stack([self.of.config.to_global(self.of.nodes[i]), p.nodes[i]]), p.turnings(i, tau[plain]))]
+
+    def areas(self, areas: Array, current: bool) -> Array:
+        """A nodal force is the integral of the pressure over the node's shape function."""
+        return areas
+
+    def heights(self) -> Array:
+        """Of the nodes."""
+        return self.projection.height
+
+    def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
+        """At the nodes themselves, and at their feet."""
+        n = len(self.points)
+        return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)
+
+    def mean_areas(self, areas: Array, current: bool) -> Array:
+        """Integrals of the shape functions."""
+        return areas
+
+    def areas_along(self, areas: Array) -> Array:
+        """The same."""
+        return areas
+
+    def areas_back(self, weights: Array) -> Array:
+        """The same."""
+        return weights
+
+    def forces_back(self, state: PairState, weights: Array) -> Array:
+        """The same."""
+        return weights
+
+    def stretching(self, current: bool) -> None:
+        """Pressures change with the areas alone."""
+        return None
+
+
+class NothingNear(NodalKinematics):
+    """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
+
+    @classmethod
+    def at(cls, of: NodeToSurface, points: Array) -> NothingNear:
+        """Of contactors at ``points (n, gdim)``."""
+        p = of.target.nowhere(points) if isinstance(of.target, MeshTarget) else of.target.project(points)
+        return cls(of, points, p, p, p.gap, None, None)
+
+    @property
+    def idle(self) -> bool:
+        """Yes: nothing is near."""
+        return True
+
+    @property
+    def movable(self) -> Bools:  # type: ignore[override]
+        """None can close its gap ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    @property
+    def cone(self) -> Array:  # type: ignore[override]
+        """There are no facets to push ``(n,)``."""
+        return np.ones(len(self.gap))
+
+    def placed_again(self, state: PairState) -> NodalKinematics:
+        """They stay where they are."""
+        return self
+
+    def off(self, state: PairState) -> Bools:
+        """None is past an end ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    def at_end(self, state: PairState) -> Bools:
+        """None is held by an end ``(n,)``."""
+        return np.zeros(len(self.gap), bool)
+
+    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """There are none."""
+        none = np.zeros(len(self.gap))
+        return Traction(none, none, np.zeros(self.points.shape))
+
+    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Nothing turns."""
+        return []

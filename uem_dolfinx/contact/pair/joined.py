@@ -1,0 +1,134 @@
+"""Many contacts as one interface: what is placed, decided and solved is asked once for all of them.
+
+What users see of one of the contacts is its ``Member``.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.joined_nodes import JoinedNodes, JoinedSliding
+from uem_dolfinx.contact.pair.member import Member
+from uem_dolfinx.contact.pair.rows_of_states import joined, renumbered, rows, with_rows
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.parallel import reduced
+
+
+class JoinedInterface(Interface):
+    """Several contacts as one interface (collective).
+
+    Args:
+        own: interfaces of the contacts, which are alike but for surfaces, friction's values, offsets and bounds on overlaps.
+
+    Attributes:
+        own: likewise.
+        members: what they are seen as.
+        label: number of the contact of each contactor ``(n,)``.
+    """
+
+    discretisation: JoinedNodes
+
+    def __init__(self, own: Sequence[Interface]):
+        first, ties = own[0], [pair.discretisation for pair in own]
+        nodal = JoinedNodes(ties)  # type: ignore[arg-type]
+        sliding = [pair.friction for pair in own if pair.friction is not None]
+        friction = JoinedSliding(sliding, nodal) if sliding else None
+        super().__init__(
+            first.config, nodal.nodes, nodal, friction, name=first.name, sliding=first.sliding,
+            max_penetration=first.max_penetration, thickness=first.thickness,
+        )  # fmt: skip
+        self.own = list(own)
+        self.mutual: Any = np.zeros(len(self.nodes), dtype=bool)
+        self.mutual_of = np.zeros(len(own), dtype=bool)
+        ends = np.cumsum([0, *(len(pair.nodes) for pair in own)])
+        self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        self._members: list[weakref.ref[Member]] = []
+        facets, surface = nodal.target.facets, nodal.surface_of
+        parts = [renumbered(p.committed, lambda f, s=s: facets.here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
+        self.trial = self.committed = joined(parts)
+        self.reserved, self.redundant, self.barred = (
+            np.concatenate([getattr(pair, name) for pair in own]) for name in ("reserved", "redundant", "barred")
+        )
+        self._reserved, self._redundant = self.reserved, self.redundant
+
+    @property
+    def members(self) -> Sequence[Interface]:
+        """Its contacts."""
+        return [one for member in self._members if (one := member()) is not None]
+
+    def make_members(self) -> list[Member]:
+        """What the contacts are seen as; who asks keeps them, and they keep this."""
+        members = [Member(self, k, pair) for k, pair in enumerate(self.own)]
+        self._members = list(map(weakref.ref, members))
+        return members
+
+    @property
+    def label(self) -> Ints:
+        """Number of the contact of each contactor ``(n,)``."""
+        return self.discretisation.label
+
+    def turns(self) -> Sequence[Any]:
+        """Of active contactors first those of the first contact of each node, then of the second (collective)."""
+        i = np.flatnonzero(self.trial.active)
+        i = i[np.argsort(self.nodes[i], kind="stable")]
+        turn = np.arange(len(i)) - np.searchsorted(self.nodes[i], self.nodes[i])
+        return [i[turn == k] for k in range(reduced(self.config.comm, int(turn.max(initial=-1)), op=MPI.MAX) + 1)]
+
+    def name_at(self, i: int) -> str:
+        """Name of the contact of a contactor."""
+        return self.own[self.label[i]].name
+
+    def state_of(self, k: int, state: PairState) -> PairState:
+        """A contact's part of a state, with facets as its target alone numbers them."""
+        facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
+        return renumbered(rows(state, self.rows_of[k]), lambda facet: facets.alone(facet, surface))
+
+    def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
+        """The state with a contact's part."""
+        facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
+        return with_rows(state, self.rows_of[k], renumbered(part, lambda facet: facets.here(facet, surface)))
+
+    @property
+    def far_of(self) -> Bools:
+        """Which contacts are not looked at ``(n_contacts,)``."""
+        return self.discretisation.far_of
+
+    @far_of.setter
+    def far_of(self, far: Bools) -> None:
+        self.discretisation.look_at(far)
+
+    def commit(self) -> None:
+        """Make the trial state the committed one, but of contacts that are not looked at; to be followed by ``project``."""
+        before, far = self.committed, self.discretisation.far_of[self.label]
+        super().commit()
+        if far.any():
+            self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
+
+    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+        """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
+        self.discretisation.far = False
+        super().remember(memory)
+
+    def part(self) -> list[Interface]:
+        """The contacts with interfaces of their own again, in their committed states; to be followed by ``project`` (collective)."""
+        for k, (pair, member) in enumerate(zip(self.own, self.members)):
+            if pair.friction is not None:
+                pair.friction.free = self.discretisation.free[self.rows_of[k]]
+            pair.initial_overlap, pair.mutual = member.initial_overlap, member.mutual
+            pair.remember(self.memory_of(k, self.memory()))
+            pair.trial = self.state_of(k, self.trial)
+        return self.own
+
+    def memory_of(self, k: int, memory: tuple[PairState, Bools, Bools, Bools]) -> tuple[PairState, Bools, Bools, Bools]:
+        """A contact's part of what ``memory`` returned."""
+        reserved, redundant, barred = (a[self.rows_of[k]] for a in memory[1:])
+        return self.state_of(k, memory[0]), reserved, redundant, barred

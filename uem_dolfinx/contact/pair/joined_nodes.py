@@ -1,0 +1,177 @@
+"""Contactors of many contacts, one contact after the other, each against its own target, and their friction.
+
+A node of several contacts stands here several times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.friction.limits import Limits
+from uem_dolfinx.contact.friction.sliding import Sliding
+from uem_dolfinx.contact.friction.slip_front import Front
+from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface, NothingNear
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.parallel import reduced
+
+
+class JoinedNodes(NodeToSurface):
+    """Implements ``Discretisation``: contactors of several contacts (collective).
+
+    Args:
+        own: what ties the contactors of each contact to its target.
+
+    Attributes:
+        label: number of the contact of each contactor ``(n,)``.
+        far_of: which contacts are not looked at ``(n_contacts,)``.
+    """
+
+    target: JoinedTarget
+
+    def __init__(self, own: Sequence[NodeToSurface]):
+        first, targets = own[0], [one.target.facets for one in own]  # type: ignore[attr-defined]
+        surfaces = list({id(facets): facets for facets in targets}.values())
+        number = {id(facets): k for k, facets in enumerate(surfaces)}
+        self.label: Ints = np.repeat(np.arange(len(own)), [len(one.nodes) for one in own])
+        self.surface_of = [number[id(facets)] for facets in targets]
+        self.far_of: Bools = np.zeros(len(own), dtype=bool)
+        facets = JoinedFacets(first.config, surfaces)
+        target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
+        how: dict[str, Any] = {"free": first.free_of_owned, "sliding": first.sliding, "thickness": first.thickness}
+        super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
+        self._own = own
+        if any(one.offset is not None for one in own):
+            self.set_offset(np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
+
+    def hold(self, free: Bools) -> None:
+        """Take which components have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        super().hold(free)
+        for one in getattr(self, "_own", ()):
+            one.hold(free)
+
+    @property
+    def far(self) -> bool:  # type: ignore[override]
+        """Whether no contact is looked at."""
+        return bool(self.far_of.all())
+
+    @far.setter
+    def far(self, far: bool) -> None:
+        self.look_at(np.full(len(self.far_of), far))
+
+    def look_at(self, far: Bools) -> None:
+        """Take which contacts are not looked at from now on ``(n_contacts,)``."""
+        self.far_of, self._projected = far, None
+        if hasattr(self, "target"):
+            self.target.asked = ~far[self.label]
+
+    def across(self, found: FacetProjection, points: Array) -> FacetProjection:
+        """See ``OnTarget``, of contacts that have offsets alone."""
+        i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
+        assert self.offset is not None
+        return found.with_those(i, found.take(i).across_edges(points[i], self.offset[i]))
+
+    def look_farther(self) -> bool:
+        """Look at contacts that are far apart, from the next placement on: whether any were."""
+        was = bool(self.far_of.any())
+        self.far = False
+        return was
+
+    def commit(self) -> None:
+        """Contacts that are far apart stay so."""
+
+    def place(self, points: Array, state: PairState) -> NodalKinematics:
+        """Project contactors (collective); see ``Discretisation``."""
+        return NothingNear.at(self, points) if self.far else super().place(points, state)
+
+
+class JoinedLaw:
+    """A law of friction of each of several contacts, all of one kind, as of ``FrictionLaw``.
+
+    Args:
+        laws: of the contacts.
+        label: number of the contact of each contactor ``(n,)``.
+    """
+
+    def __init__(self, laws: Sequence[FrictionLaw], label: Ints):
+        self.laws, self.field = list(laws), laws[0].field
+        self.per_area = any(law.per_area for law in laws)
+        kinds = {repr(parameters(law)[1:]): law for law in laws}
+        self._kinds = list(kinds.values())
+        self._kind = np.array([list(kinds).index(repr(parameters(law)[1:])) for law in laws])[label]
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """Of each contactor by the law of its contact."""
+        if len(self._kinds) == 1:
+            return self._kinds[0].limit(value, lam, area)
+        found = np.zeros((2, len(value)))
+        for k, law in enumerate(self._kinds):
+            own = self._kind == k
+            found[:, own] = law.limit(value[own], lam[own], area[own])
+        return found[0], found[1]
+
+
+class JoinedSliding(Sliding):
+    """Friction of the contactors of several contacts.
+
+    Args:
+        own: friction of each contact.
+        discretisation: of all of them.
+    """
+
+    def __init__(self, own: Sequence[Sliding], discretisation: JoinedNodes):
+        first, label = own[0], discretisation.label
+        self.front = partial(Fronts, label)
+        ends = np.cumsum([0, *(len(one.value) for one in own)])
+
+        def areas(normal: Array | None) -> Array:
+            parts = [None] * len(own) if normal is None else [normal[a:b] for a, b in pairwise(ends)]
+            return np.concatenate([one.limits.areas_of(part) for one, part in zip(own, parts)])
+
+        super().__init__(
+            first.config,
+            discretisation.nodes,
+            discretisation,
+            law=JoinedLaw([one.limits.law for one in own], label),
+            value=np.concatenate([one.value for one in own]),
+            limits=Limits(areas, first.limits.duration),
+            free=discretisation.free,
+            keeps_feet=first.keeps_feet,
+            value_now=lambda kinematics: None,
+        )
+
+
+class Fronts:
+    """Where contactors of several contacts begin to slip; arguments as of ``Front`` and ``JoinedNodes``."""
+
+    def __init__(self, label: Ints, comm: MPI.Comm):
+        self._comm, self._label = comm, label
+        self._fronts: dict[int, Front] = {}
+
+    def along(self, begin: Bools, back: Bools, force: Array, points: Array) -> tuple[Bools, Array]:
+        """Which contactors go along ``(n,)``, of the same contact alone, and forces they take over ``(n, gdim)`` (collective).
+
+        Args:
+            begin: contactors that begin to slip ``(n,)``.
+            back: contactors that went along last and have been held again ``(n,)``.
+            force: along the target ``(n, gdim)``.
+            points: where contactors are ``(n, gdim)``.
+        """
+        n = int(reduced(self._comm, int(self._label.max(initial=-1)), op=MPI.MAX)) + 1
+        some = reduced(self._comm, np.bincount(self._label[begin], minlength=n))
+        along, taken = np.zeros(len(points), dtype=bool), np.zeros(points.shape)
+        for k in np.flatnonzero(some).tolist():
+            own = self._label == k
+            front = self._fronts.setdefault(k, Front(self._comm))
+            along[own], taken[own] = front.along(begin[own], back[own], force[own], points[own])
+        return along, taken

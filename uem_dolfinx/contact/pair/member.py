@@ -1,0 +1,188 @@
+"""One of the contacts that are treated together, with the interface of a single contact for users, results and checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NothingNear
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.joined_nodes import JoinedLaw
+from uem_dolfinx.contact.seam.corners import Corners
+from uem_dolfinx.contact.seam.placement import Kinematics
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.projection import FacetProjection
+
+
+def _rows_of(name: str) -> Any:
+    """A member's rows of an array of the whole, to be asked for and to be set."""
+
+    def get(member: Member) -> Any:
+        return getattr(member.joined, name)[member._rows]
+
+    def put(member: Member, value: Any) -> None:
+        member._set(name, value)
+
+    return property(get, put)
+
+
+class Member(Interface):
+    """A part of a ``JoinedInterface`` as an interface of its own: states are the whole's rows, facets are numbered as by its target alone.
+
+    Args:
+        whole: the ``JoinedInterface`` that it is a part of.
+        k: number of the contact.
+        own: its interface as it was made, with its own target.
+    """
+
+    def __init__(self, whole: Any, k: int, own: Interface):
+        self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
+        self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
+        self.name, self.sliding, self.max_penetration, self.thickness = own.name, own.sliding, own.max_penetration, own.thickness
+        self.tie, self.heats, self.initial_overlap = None, [], own.initial_overlap
+        self._known: tuple[Kinematics, PairState, Kinematics] | None = None
+
+    @property
+    def whole(self) -> Interface:
+        """What it is a part of."""
+        return self.joined
+
+    # -- states ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def trial(self) -> PairState:  # type: ignore[override]
+        """State of the present iteration."""
+        return self.joined.state_of(self._k, self.joined.trial)
+
+    @trial.setter
+    def trial(self, state: PairState) -> None:
+        self.joined.trial = self.joined.with_state_of(self._k, self.joined.trial, state)
+
+    @property
+    def committed(self) -> PairState:  # type: ignore[override]
+        """State of the last step."""
+        return self.joined.state_of(self._k, self.joined.committed)
+
+    @committed.setter
+    def committed(self, state: PairState) -> None:
+        self.joined.committed = self.joined.with_state_of(self._k, self.joined.committed, state)
+
+    def _set(self, name: str, value: Any) -> None:
+        every = getattr(self.joined, name).copy()
+        every[self._rows] = value
+        setattr(self.joined, name, every)
+
+    #: As of ``Interface``, each its rows of the whole's ``(n,)``.
+    reserved = _rows_of("reserved")
+    redundant = _rows_of("redundant")
+    barred = _rows_of("barred")
+    _reserved = _rows_of("_reserved")
+    _redundant = _rows_of("_redundant")
+
+    @property
+    def mutual(self) -> bool:  # type: ignore[override]
+        """Whether contactor and target follow each other, of this contact."""
+        return bool(self.joined.mutual_of[self._k])
+
+    @mutual.setter
+    def mutual(self, value: bool) -> None:
+        self.joined.mutual_of[self._k] = value
+        self._set("mutual", value)
+
+    @property
+    def united(self) -> Bools:
+        """Contactors that are active ``(n,)``."""
+        return self.joined.trial.active[self._rows]
+
+    def largest_gap_here(self) -> float:
+        """Largest gap of an active contactor of this rank, or distance from where it is to stick, a length."""
+        whole = self.joined
+        here = float(np.abs(self.gap[self.united & ~self.redundant]).max(initial=0.0))
+        if whole.acting is None:
+            return here
+        return max(here, float(whole.acting.distances(whole.trial, whole.redundant)[self._rows].max(initial=0.0)))
+
+    # -- where the contactors stand --------------------------------------------------------------------------------------
+
+    def project(self) -> None:
+        """Project the contactors of all contacts onto their targets (collective)."""
+        self.joined.project()
+
+    @property
+    def far(self) -> bool:
+        """Whether it is not looked at."""
+        return bool(self.joined.discretisation.far_of[self._k])
+
+    @far.setter
+    def far(self, far: bool) -> None:
+        of = self.joined.discretisation.far_of.copy()
+        of[self._k] = far
+        self.joined.discretisation.look_at(of)
+
+    @property
+    def kinematics(self) -> Kinematics:  # type: ignore[override]
+        """Of its contactors; made when it is first asked for."""
+        whole: Any = self.joined.kinematics
+        if self._known is None or self._known[0] is not whole:
+            self._known = whole, self.joined.trial, self._kinematics_of(whole)
+        return self._known[2]
+
+    def _kinematics_of(self, whole: Any) -> Kinematics:
+        some, points = self._rows, whole.points[self._rows]
+        of: Any = self.discretisation
+        if whole.idle or self.far:
+            return NothingNear.at(of, points)
+        nearest = self._alone(whole.nearest)
+        projection = nearest if whole.projection is whole.nearest else self._alone(whole.projection)
+        moves, left = (None if a is None else a[some] for a in (whole.target_moves, whole.left))
+        return NodalKinematics(of, points, projection, nearest, whole.gap[some], self._corners_of(whole.corners), moves, left)
+
+    def _alone(self, p: FacetProjection) -> FacetProjection:
+        nodal = self.joined.discretisation
+        parts = {f.name: v[self._rows] for f in fields(p) if (v := getattr(p, f.name)) is not None}
+        parts["facet"] = nodal.target.facets.alone(parts["facet"], nodal.surface_of[self._k])
+        return replace(p, **parts)
+
+    def _corners_of(self, corners: Corners | None) -> Corners | None:
+        if corners is None:
+            return None
+        some = (corners.which >= self._rows.start) & (corners.which < self._rows.stop)
+        parts = {f.name: v[some] for f in fields(corners) if (v := getattr(corners, f.name)) is not None}
+        parts["which"] = parts["which"] - self._rows.start
+        return replace(corners, **parts)
+
+    # -- what is set between steps ---------------------------------------------------------------------------------------
+
+    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+        """Go on from a memory, to be followed by ``project`` where bodies and target were then."""
+        self.far = False
+        super().remember(memory)
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again (collective)."""
+        self.discretisation.set_offset(offset)
+        nodal = self.joined.discretisation
+        every = np.zeros(len(nodal.nodes)) if nodal.offset is None else nodal.offset.copy()
+        every[self._rows] = 0.0 if offset is None else offset
+        others = any(pair.discretisation.offset is not None for pair in self.joined.own)
+        nodal.set_offset(every if others else None)
+
+    def know_friction(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law of friction, and values of its parameter ``(n,)``, with which the committed state has been reached (collective)."""
+        assert self.friction is not None and self.joined.friction is not None
+        self.friction.set(law, value)
+        self.joined.friction.set(*self._friction_of_all())
+
+    def set_friction(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law of friction, and other values of its parameter ``(n,)``, between two steps (collective)."""
+        assert self.friction is not None
+        self.friction.set(law, value)
+        self.joined.set_friction(*self._friction_of_all())
+
+    def _friction_of_all(self) -> tuple[FrictionLaw, Array]:
+        own = [pair.friction for pair in self.joined.own if pair.friction is not None]
+        return JoinedLaw([one.limits.law for one in own], self.joined.label), np.concatenate([one.value for one in own])

@@ -1,0 +1,222 @@
+"""What an interface tells of its contactors, those that are tied among them, for results, checks and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.laws.law import FrictionLaw
+    from uem_dolfinx.contact.ties.tie import Tie
+
+
+class Told:
+    """What results, checks and checkpoints ask; attributes as those of ``Interface``."""
+
+    name: str
+    config: Configuration
+    nodes: Indices
+    trial: PairState
+    friction: Sliding | None
+    tie: Tie | None
+    committed: PairState
+    reserved: Bools
+    redundant: Bools
+    barred: Bools
+    kinematics: Kinematics
+    discretisation: Discretisation
+
+    @property
+    def frictional(self) -> bool:
+        """Whether there is friction."""
+        return self.friction is not None
+
+    @property
+    def acting(self) -> Sliding | None:
+        """Friction, where it can act: None also where no contactor of any rank has anything near."""
+        return None if self.kinematics.idle else self.friction
+
+    @property
+    def members(self) -> Sequence[Any]:
+        """Interfaces of single contacts that it consists of: itself, unless several are treated together."""
+        return [self]
+
+    @property
+    def whole(self) -> Any:
+        """What it is treated with: itself, unless it is one of several."""
+        return self
+
+    @property
+    def label(self) -> Ints:
+        """Number of the contact of each contactor among ``members`` ``(n,)``."""
+        return np.zeros(len(self.nodes), np.int64)
+
+    def turns(self) -> Sequence[Any]:
+        """Rows of contactors that are returned to the target together, each node once, in turn (collective)."""
+        return [slice(None)]
+
+    def name_at(self, i: int) -> str:
+        """Name of the contact of a contactor."""
+        return self.name
+
+    @property
+    def far(self) -> bool:
+        """Whether it is not looked at, since the surfaces are far apart."""
+        return self.discretisation.far
+
+    @far.setter
+    def far(self, far: bool) -> None:
+        self.discretisation.far = far
+
+    @property
+    def far_of(self) -> Bools:
+        """Which of the ``members`` are not looked at ``(n_members,)``."""
+        return np.array([self.far])
+
+    @far_of.setter
+    def far_of(self, far: Bools) -> None:
+        self.far = bool(far[0])
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Take other offsets ``(n,)``; contactors are to be placed again (collective)."""
+        self.discretisation.set_offset(offset)
+
+    def know_friction(self, law: FrictionLaw, value: Array) -> None:
+        """Take a law of friction, and values of its parameter ``(n,)``, with which the committed state has been reached (collective)."""
+        assert self.friction is not None
+        self.friction.set(law, value)
+
+    @property
+    def target(self) -> Target:
+        """What the contactors may touch."""
+        return self.discretisation.target
+
+    @property
+    def points(self) -> Array:
+        """Current positions of the contactors ``(n, gdim)``."""
+        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+
+    @property
+    def projection(self) -> Projection:
+        """Of the contactors, as last placed."""
+        return self.kinematics.projection
+
+    @property
+    def gap(self) -> Array:
+        """Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
+        return self.kinematics.gap
+
+    @property
+    def off(self) -> Bools:
+        """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""
+        return self._past_end if self.tie is None else self._past_end | self.tie.excluded
+
+    @property
+    def _past_end(self) -> Bools:
+        return self.kinematics.off(self.trial) | self.barred
+
+    @property
+    def movable(self) -> Bools:
+        """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
+        return self.kinematics.movable
+
+    @property
+    def pattern(self) -> Ints:
+        """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
+        told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
+        return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
+
+    def stiffness_across(self, stiffness: Array | None) -> Array:
+        """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
+        assert stiffness is not None
+        return np.asarray(np.einsum("ng,ng->n", self.projection.normal**2, np.abs(stiffness[self.nodes])))
+
+    @property
+    def traction(self) -> Traction:
+        """Contact forces of the trial state."""
+        t = self.trial
+        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
+
+    def largest_gap_here(self) -> float:
+        """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
+        here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
+        if self.acting is not None:
+            here = max(here, float(self.acting.distances(self.trial, self.redundant).max(initial=0.0)))
+        return here if self.tie is None else max(here, self.tie.largest_gap_here())
+
+    def largest_gap(self) -> float:
+        """``largest_gap_here`` over all ranks, a length (collective)."""
+        return float(reduced(self.config.comm, self.largest_gap_here(), op=MPI.MAX))
+
+    @property
+    def tied(self) -> Bools:
+        """Contactors that are united with the target in all components for good ``(n,)``."""
+        return np.zeros(len(self.nodes), dtype=bool) if self.tie is None else self.tie.tied
+
+    @property
+    def united(self) -> Bools:
+        """Contactors that are active or tied ``(n,)``."""
+        return self.trial.active | self.tied
+
+    @property
+    def n_active(self) -> int:
+        """Number of active contactors over all ranks (collective)."""
+        return int(reduced(self.config.comm, int(self.united.sum())))
+
+    def pressing(self) -> tuple[Array, Array]:
+        """Forces across ``(n,)`` and along ``(n, gdim)`` the target that belong to ``areas`` (collective)."""
+        t = self.trial
+        tau = 0.0 * t.force if t.friction is None else t.friction.tau
+        return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
+
+    def areas(self, areas: Array, current: bool, reference: Array) -> Array:
+        """As of ``Kinematics``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
+        found = self.kinematics.areas(areas, current)
+        return found if self.tie is None else self.tie.areas(areas, reference, found)
+
+    def kept_gaps(self) -> Array:
+        """Heights over the target that tied contactors keep, of this rank ``(k,)``."""
+        return np.zeros(0) if self.tie is None else self.tie.kept_gaps()
+
+    def torn(self) -> Array:
+        """How far contactors are from where they are tied if their equations were left out ``(n,)``."""
+        return np.zeros(len(self.nodes)) if self.tie is None else self.tie.torn()
+
+    @property
+    def chained(self) -> bool:
+        """Whether contactors may follow each other."""
+        return self.discretisation.chained or (self.tie is not None and self.tie.chained)
+
+    @property
+    def works(self) -> bool:
+        """Whether its forces do work by themselves, as where a rigid target moves."""
+        return self.discretisation.target.motion is not None or (self.tie is not None and self.tie.works)
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without any (collective)."""
+        return None if self.tie is None else self.tie.applied_forces()
+
+    @property
+    def functions(self) -> dict[str, fem.Function]:
+        """Further Functions that a run goes on from, by name; they are read before ``from_checkpoint`` is called."""
+        return {} if self.tie is None else {"displacement it was tied at": self.tie.at}
+
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
+        kept |= self.committed.to_checkpoint(self.target.keys_of)
+        return kept if self.tie is None else kept | self.tie.to_checkpoint()

@@ -1,0 +1,104 @@
+"""What contactors and what they face have of a field: means over both sides of a contact, where contactors have been placed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.contact.laws.conductance import value
+from uem_dolfinx.contact.seam.placement import Kinematics
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.fields import ConfigurationAmongFields
+from uem_dolfinx.geometry.nodal_fields import nodal_field
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.geometry.projection import Projection
+
+
+class Placed(Protocol):
+    """What is asked of an interface."""
+
+    config: Configuration
+    kinematics: Kinematics
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Both sides of contactors at one placement.
+
+    Attributes:
+        projection: of the contactors there.
+        halo: of the nodes that count.
+        node: global numbers of these, of each term ``(k,)``.
+        row: place of the contactor of each term ``(k,)``.
+        own: weights of the contactor's mean, zero in those of the target ``(k,)``.
+        theirs: weights of the target's mean ``(k,)``.
+    """
+
+    projection: Projection
+    halo: Halo
+    node: Ints
+    row: Ints
+    own: Array
+    theirs: Array
+
+    def sum(self, terms: Array) -> Array:
+        """Of each contactor's terms ``(k,)``: ``(n,)``."""
+        return np.asarray(np.bincount(self.row, terms, minlength=len(self.projection.gap)), dtype=float)
+
+    def means(self, weights: Array, nodal: Array) -> Array:
+        """Of values at owned nodes ``(n_owned,)``, with the terms' weights ``(n,)`` (collective)."""
+        return self.sum(weights * self.halo.take(nodal[:, None].__getitem__)[:, 0])
+
+    def hand_on(self, weights: Array, amounts: Array) -> Array:
+        """The transpose of ``means``: amounts of contactors ``(n,)`` at owned nodes ``(n_owned,)`` (collective)."""
+        return np.asarray(self.halo.add((weights * amounts[self.row])[:, None])[:, 0])
+
+
+def sides_of(pair: Placed) -> Sides:
+    """Both sides of contactors where they have been placed (collective)."""
+    k = pair.kinematics
+    (row, node, weight), (their_row, their_node, their_weight) = k.means()
+    none, others, every = np.zeros(len(row)), np.zeros(len(their_row)), np.concatenate([node, their_node])
+    return Sides(
+        k.projection,
+        Halo(pair.config, every),
+        every,
+        np.concatenate([row, their_row]),
+        np.concatenate([weight, others]),
+        np.concatenate([none, their_weight]),
+    )
+
+
+def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: str, pair: Any, heats: Any) -> Array:
+    """Mean of the temperatures of contactors and of what they face ``(n,)`` (collective).
+
+    Args:
+        config: of a displacement among other fields.
+        nodes: contactors ``(n,)``.
+        field: number of the part that is the temperature.
+        name: of the contact.
+        pair: interface; until its contactors have been placed, or for None, their own temperatures count.
+        heats: conductances, of which one of the field may tell a rigid target's temperature.
+
+    Raises:
+        InputError, SpaceError: if there is no such temperature.
+    """
+    words = f"contact '{name}': friction"
+    if not isinstance(config, ConfigurationAmongFields):
+        raise InputError(
+            f"{words} follows a temperature, and there is none among the unknowns: expected a mixed Function with displacement= its "
+            "displacement's part"
+        )
+    T = nodal_field(config, field, words).values
+    if not hasattr(pair, "kinematics"):
+        return np.asarray(T[nodes])
+    at = sides_of(pair)
+    both = at.own + at.theirs
+    # nothing is opposite to rigid surfaces' contactors, and to those of many bodies that are near none
+    mean = at.means(both, T) / at.sum(both)
+    known = [value(one.temperature) for one in heats if one.field == field and one.temperature is not None]
+    return np.asarray(0.5 * (mean + known[0]) if known else mean)

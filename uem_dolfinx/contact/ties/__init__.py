@@ -1,0 +1,1 @@
+"""Surfaces that are tied to each other, and preloaded sections."""

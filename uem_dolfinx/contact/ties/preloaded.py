@@ -1,0 +1,242 @@
+"""The tie of a preloaded section: two facing surfaces that are tied but for an opening along an axis, which all tied rows share.
+
+With the tied rows r, which vanish where nothing opens, the axis a and the opening d,
+
+    r_ic = s_ic a_c d    for every contactor i and component c,
+
+where s are the shares of ``TiedRows``. While the section carries a given force, d is unknown: one row, the leading one 0, tells it, and
+the others follow,
+
+    r_ic - (s_ic a_c / s_0 a_0) r_0 = 0,    d = r_0 / (s_0 a_0),
+
+so that the motion that opens the section is what the leading row leaves free. The force F, positive in tension, acts on it by the pair of
+forces whose virtual work is -F times that of d: as a multiplier -F / (s_0 a_0) of the leading row. Once locked, d is a number and all
+rows hold. In both cases the multipliers are forces of the tie, and ``-sum lam_ic s_ic a_c`` is the force that the section carries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.contact.ties.tie import Tie
+from uem_dolfinx.contact.ties.tied_rows import TiedRows
+from uem_dolfinx.errors import InputError, SurfaceError
+from uem_dolfinx.geometry.projection import Projection
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import agree, gathered, reduced
+
+
+class Preloaded(Tie):
+    """A section that opens along an axis, tied in all else; other arguments as those of ``Tie``.
+
+    Args:
+        axis: direction of length one ``(gdim,)``; None is the mean normal of the target.
+        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+
+    Attributes:
+        axis: the direction that points out of the target ``(gdim,)``, known once the section has been tied.
+        force: that the section carries while it is not locked, positive in tension.
+        locked: whether the opening is a number.
+        opening: how much farther the faces are apart along the axis than drawn, negative in a bolt that is shortened.
+    """
+
+    def __init__(self, *between: Any, axis: Array | None, free: Bools, **of: Any):
+        super().__init__(*between, **of)
+        self._given_axis, self._free = axis, free
+        self.axis: Array = np.zeros(self.config.gdim)
+        self.force, self.locked, self.opening = 0.0, False, 0.0
+        #: What an opening of one makes of every row ``(m,)``.
+        self._along: Array = np.zeros(0)
+        #: Number of the leading row, -1 on ranks that do not have it, and the rank that does.
+        self._lead, self._root = -1, 0
+
+    # -- the axis and the leading row ------------------------------------------------------------------------------------
+
+    def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
+        """As of ``Tie`` (collective).
+
+        Raises:
+            InputError: if the axis lies in the section.
+            SurfaceError: if conditions hold all of it along the axis.
+        """
+        n = projection.normal[self._within_reach(state)].sum(axis=0)
+        n = np.asarray(reduced(self.config.comm, n))
+        n = n / (np.linalg.norm(n) or 1.0)
+        axis = n if self._given_axis is None else self._given_axis
+        if abs(axis @ n) < MOSTLY_PRESCRIBED and n.any():
+            raise InputError(
+                f"{self.name}: the axis {axis} lies in the section, whose normal is {n}: expected the direction of the bolt"
+            )
+        axis = np.where(np.abs(axis) > NEGLIGIBLE, axis, 0.0) * (1.0 if axis @ n > 0 else -1.0)
+        self.axis = axis / (np.linalg.norm(axis) or 1.0)
+        united = super().unite(state, projection, off, which)
+        if loose := int(reduced(self.config.comm, int((~self.tied).sum()))):
+            logger.warning("%s: %d contactors of the section are not opposite to the target, and are not tied", self.name, loose)
+        return united
+
+    def _within_reach(self, state: PairState) -> Bools:
+        """As of ``Tie``, and contactors at the rim: below them facets are continued past their sides (collective)."""
+        p = self.target.project(self._points)
+        return np.maximum(np.abs(p.gap), p.way_beyond) <= p.facet_size
+
+    def _take_rows(self, rows: TiedRows, off: Bools) -> None:
+        super()._take_rows(rows, off)
+        self.whole = True
+        i, c = np.nonzero(rows.has)
+        self._along = rows.share[i, c] * self.axis[c]
+        comm, main = self.config.comm, int(np.argmax(np.abs(self.axis)))
+        if not reduced(comm, len(i)):
+            return
+        can = self._free[i, c] & (c == main)
+        # rows that follow no other contactor make no rings
+        alone = can & ~np.isin(i, rows.terms[0][self._is_contactor(rows.terms[1])])
+        if reduced(comm, bool(alone.any()), op=MPI.LOR):
+            can = alone
+        X, here = self.config.X[self.nodes[i]], np.flatnonzero(can)
+        middle = reduced(comm, np.append(X[here].sum(axis=0), len(here)))
+        error = None
+        if not middle[-1]:
+            error = SurfaceError(
+                f"{self.name}: Dirichlet conditions hold all of the section along the axis {self.axis}, so that it cannot open: cut the "
+                "bolt elsewhere, or leave the conditions out"
+            )
+        agree(comm, error)
+        away = np.linalg.norm(X[here] - middle[:-1] / middle[-1], axis=1)
+        nearest = gathered(comm, float(away.min(initial=np.inf)))
+        self._root = int(np.argmin(nearest))
+        self._lead = int(here[np.argmin(away)]) if comm.rank == self._root else -1
+
+    def _is_contactor(self, nodes: Ints) -> Bools:
+        """Which of these global nodes are contactors of any rank ``(k,)`` (collective)."""
+        mark = np.zeros((self.config.n_owned, 1))
+        mark[self.nodes] = 1.0
+        return np.asarray(self.config.ask_owners(nodes, mark)[:, 0] > 0)
+
+    # -- rows ------------------------------------------------------------------------------------------------------------
+
+    @property
+    def excluded(self) -> Bools:
+        """As of ``Tie``: all, as loose contactors of the section are in no contact either."""
+        return np.ones(len(self.nodes), dtype=bool)
+
+    @property
+    def knows_conditions(self) -> bool:
+        """As of ``Tie``: the leading row is of a component that is free."""
+        return True
+
+    @property
+    def chained(self) -> bool:
+        """As of ``Told``: all rows follow the contactor of the leading one."""
+        return True
+
+    def _equations(self) -> UnitingEquations:
+        """As of ``Tie``, gaps counted from the present opening, which is found where it is free (collective)."""
+        if self._here is None:
+            here = super()._equations()
+            if not self.locked:
+                own = here.gap[self._lead] / self._along[self._lead] if self._lead >= 0 else None
+                self.opening = float(self.config.comm.bcast(own, root=self._root))
+            self._here = replace(here, gap=here.gap - self.opening * self._along)
+        return self._here
+
+    def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
+        """As of ``Tie``; while the opening is free, all rows but the leading one, which they follow (collective)."""
+        here, (i, c) = self._equations(), np.nonzero(self._has)
+        if self.locked:
+            return here, i, c
+        own = None
+        if self._lead >= 0:
+            of = here.row == self._lead
+            node = self.config.to_global(here.node[[self._lead]])
+            vectors = np.concatenate([-here.direction[[self._lead]], here.coefficients[of]]) / self._along[self._lead]
+            own = np.append(node, here.followed[of]), vectors
+        nodes, vectors = self.config.comm.bcast(own, root=self._root)
+        others = np.arange(len(here)) != self._lead
+        follow = np.flatnonzero(others & (self._along != 0))
+        row = np.concatenate([here.row, np.repeat(follow, len(nodes))])
+        followed = np.concatenate([here.followed, np.tile(nodes, len(follow))])
+        more = -self._along[follow, None, None] * vectors
+        coefficients = np.concatenate([here.coefficients, more.reshape(-1, self.config.gdim)])
+        # what follows its own node belongs to its direction
+        direction, itself = here.direction.copy(), followed == self.config.to_global(here.node)[row]
+        np.add.at(direction, row[itself], -coefficients[itself])
+        made = replace(
+            here, direction=direction, row=row[~itself], followed=followed[~itself], coefficients=coefficients[~itself]
+        )
+        return made.select(others), i[others], c[others]
+
+    def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
+        """As of ``Tie``; the leading row bears what the given force leaves to it (collective)."""
+        bond = super()._bond(contactor, kind, multipliers)
+        return bond if self.locked else bond + self._by_lead(self.force - self._pull(bond))
+
+    def _pull(self, bond: Array) -> float:
+        """Force across the section of multipliers ``bond (n, gdim)``, positive in tension (collective)."""
+        return -float(reduced(self.config.comm, float(self._along @ bond[self._has])))
+
+    def _by_lead(self, force: float) -> Array:
+        """Multipliers ``(n, gdim)`` of which the leading row alone has one, so that the section carries ``force`` by it."""
+        alone = np.zeros(self._has.shape)
+        if self._lead >= 0:
+            i, c = np.nonzero(self._has)
+            alone[i[self._lead], c[self._lead]] = -force / self._along[self._lead]
+        return alone
+
+    @property
+    def works(self) -> bool:
+        """As of ``Told``: while the opening is free."""
+        return not self.locked
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """As of ``Told``: the pair of forces that pulls the faces together while the opening is free (collective)."""
+        if self.locked:
+            return None
+        assert self.rows is not None
+        return self.rows.handed_on(self._equations(), self._by_lead(self.force))
+
+    @property
+    def _has(self) -> Bools:
+        assert self.rows is not None
+        return self.rows.has
+
+    # -- what is told, and from step to step -----------------------------------------------------------------------------
+
+    def carried(self, state: PairState) -> float:
+        """Force across the section in a state, positive in tension (collective)."""
+        return 0.0 if state.bond is None else self._pull(state.bond)
+
+    def find_opening(self) -> float:
+        """The opening where the bodies are (collective)."""
+        self._equations()
+        return self.opening
+
+    def lock(self) -> None:
+        """Keep the opening that there is (collective)."""
+        self.find_opening()
+        self.locked, self._here = True, None
+
+    def release(self) -> None:
+        """Let the opening be free."""
+        self.locked, self._here = False, None
+
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
+        """As of ``Tie``, with the opening, and whether it is locked (collective)."""
+        n, opening = len(self.nodes), self.find_opening()
+        return super().to_checkpoint() | {"locked": np.full(n, self.locked), "opening": np.full(n, opening)}
+
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]], off: Bools) -> None:
+        """As of ``Tie`` (collective)."""
+        locked, opening = np.array(kept["locked"]), np.array(kept["opening"])
+        self.locked = bool(reduced(self.config.comm, bool(locked.any()), op=MPI.LOR))
+        self.opening = float(reduced(self.config.comm, float(opening.max(initial=-np.inf)), op=MPI.MAX))
+        super().from_checkpoint(kept, off)

@@ -1,0 +1,1 @@
+"""What contacts warn of while steps are taken."""

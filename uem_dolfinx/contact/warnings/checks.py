@@ -1,0 +1,262 @@
+"""What is refused about a contact pair: deep overlaps at the start, contactors that are stuck inside the target; what is warned of.
+
+Every check speaks on all ranks or on none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TOUCHING
+from uem_dolfinx.errors import ConflictError, OverdeterminedError, PenetrationError, SpaceError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.tags import Tag, locate_dofs
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import agree, reduced
+
+#: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
+#: [convention; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
+LEFT_OUT = 1e-6
+#: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
+#: [convention; slope; test_warnings.py::test_corners_are_no_curves]
+CORNER = 0.5
+#: Surfaces that come nearer than their facets sag on more facets than this, in every direction, conform.
+#: [convention; facets; test_warnings.py::test_surfaces_that_conform]
+CONFORMING = 4
+#: With mortar a contactor's node holds off all of its facets in their mean if their areas sum up to less than this, over the length of
+#: their vector sum: facets of a tip that meet at 39 degrees.
+#: [convention; areas; test_warnings.py::test_slim_tips]
+SLIM = 3.0
+#: Contactors that have slid off the target's end are told of if they have more than this part of the surface in contact.
+#: [convention; area; test_warnings.py::test_contactors_that_slip_off]
+SLIPPED = 0.05
+
+
+def check_initial(pair: Interface) -> None:
+    """Refuse an initial penetration beyond the bound, and tell about any other (collective).
+
+    Raises:
+        PenetrationError: naming the deepest node of the first rank that has one.
+    """
+    gap = np.where(pair.off, np.inf, pair.projection.gap)
+    error = None
+    if len(pair.members) > 1:
+        if reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR):
+            for one in pair.members:
+                check_initial(one)
+        return
+    if len(gap) and gap.min() < -pair.max_penetration:
+        i = int(gap.argmin())
+        error = PenetrationError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} starts {-gap[i]:.4g} inside the target, "
+            f"more than max_penetration = {pair.max_penetration:.4g}: move the bodies apart, restrict the surfaces to the parts "
+            "that can touch, or raise max_penetration if this interference is meant"
+        )
+    agree(pair.config.comm, error)
+    inside = gap < -TOUCHING * pair.config.size
+    depth = reduced(pair.config.comm, float(-gap.min(initial=0.0)), op=MPI.MAX)
+    count = reduced(pair.config.comm, int(inside.sum()))
+    if count:
+        pair.initial_overlap = depth
+        logger.warning(
+            "%s: %d contactors start up to %.4g inside the target; the first step presses the bodies apart by this interference",
+            pair.name, count, pair.initial_overlap,
+        )  # fmt: skip
+
+
+def check_prescribed(pair: Interface) -> None:
+    """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
+
+    Or away from where it is tied.
+
+    Raises:
+        ConflictError: naming the deepest or farthest such node of the first rank that has one.
+        OverdeterminedError: likewise, if the node and its target may move and other contacts alone fight its equation.
+    """
+    if pair.kinematics.idle:
+        return
+    left_out = pair.trial.active & pair.redundant
+    depth = -pair.projection.gap / pair.config.size
+    inside = ~pair.off & ((~pair.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
+    error = None
+    if inside.any():
+        i = int(np.argmin(np.where(inside, pair.projection.gap, np.inf)))
+        where = f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))}"
+        by = f"{-pair.projection.gap[i]:.4g} inside the target"
+        error = (
+            OverdeterminedError(
+                f"{where} ends {by}: other contacts and conditions of these nodes leave no freedom for its equation; take shorter "
+                "steps or finer surfaces there, release a Dirichlet condition, or drop one of several contacts"
+            )
+            if pair.movable[i]
+            else ConflictError(
+                f"{where} is prescribed to be {by}, where a Dirichlet condition or another contact fights the uniting equation and "
+                "neither body can give way: release the condition along the normal, or drop one of the contacts"
+            )
+        )
+    torn = pair.torn()
+    if torn.max(initial=0.0) > LEFT_OUT * pair.config.size:
+        i = int(torn.argmax())
+        error = ConflictError(
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is held {torn[i]:.4g} away from where it is tied, "
+            "by Dirichlet conditions or other contacts on both sides of the tie, and neither can give way: release one of them"
+        )
+    agree(pair.config.comm, error)
+
+
+def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -> None:
+    """Tell that a displacement of degree 1 makes straight facets of surfaces that the mesh has curved (collective).
+
+    Args:
+        config: configuration of the displacement.
+        name: of the contact.
+        tags: its meshed surfaces.
+    """
+    mesh, g = config.mesh, config.gdim
+    n_vertices = len(forms.reference_topology(compat.cell_name(mesh))[0])
+    curved_cells = compat.geometry_dofs(mesh).shape[1] > n_vertices
+    if config.degree > 1 or not curved_cells:
+        return
+    V = compat.function_space(mesh, 2, (g,))
+    straight, X = fem.Function(V), fem.Function(config.V)
+    X.x.array[:] = config.X.ravel()
+    straight.interpolate(X)
+    curved = V.tabulate_dof_coordinates()[:, :g]
+    on = np.concatenate([locate_dofs(V, tag) for tag in tags]).astype(np.int64)
+    off = np.linalg.norm(curved[on] - straight.x.array.reshape(-1, g)[on], axis=1).max(initial=0.0)
+    off = reduced(config.comm, float(off), op=MPI.MAX)
+    if off > TOUCHING * config.size:
+        logger.warning(
+            "%s: a displacement of degree 1 makes straight facets of the curved ones of this mesh, up to %.3g off them: take one of "
+            "degree 2, uem.function_space(mesh, 2, (%d,))",
+            name, off, g,
+        )  # fmt: skip
+
+
+def facet_curvatures(target: MeshTarget) -> Array:
+    """How the normal of the surface behind each of this rank's facets changes along it, and the facet's does not ``(m, gdim, gdim)``.
+
+    Positive where the target is convex; zero at corners and on facets that are curved themselves (collective).
+    """
+    data = target.facets.current()
+    arms, turns = data.x - data.x.mean(axis=1, keepdims=True), data.nodal_normals - target.facets.normals()
+    turns[np.linalg.norm(turns, axis=2) > CORNER] = 0.0
+    # turn = B arm in the mean
+    squares = np.einsum("mag,mah->mgh", arms, arms)
+    return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)
+
+
+def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
+    """Contactors whose clearance is less than the straight facets of the target sag, how far these do, and the clearances (collective).
+
+    Of ``n`` contactors, ``(n,)`` each; none of a target that is no mesh.
+    """
+    target, p = pair.target, pair.projection
+    if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
+        none = np.zeros(len(pair.nodes))
+        return none > 0.0, none, none
+    arms = p.x - p.foot[:, None]
+    sag = 0.5 * np.einsum("na,nag,ngh,nah->n", p.weights, arms, target.of_facets(p.facet, facet_curvatures(target)), arms)
+    clearance, rounding = np.abs(p.gap - sag), TOUCHING * pair.config.size
+    close = (clearance < np.abs(sag)) & (np.abs(sag) > rounding) & (np.abs(p.beyond).max(axis=1) < rounding)
+    return close, sag, clearance
+
+
+def warn_of_sagging_facets(pair: Interface) -> None:
+    """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
+    if not isinstance(pair.target, MeshTarget):
+        return
+    (close, sag, clearance), p = sagging(pair), pair.projection
+    assert isinstance(p, FacetProjection)
+    comm = pair.config.comm
+    facets = len(set().union(*comm.allgather(set(p.facet[close].tolist()))))
+    if facets > CONFORMING ** (pair.config.gdim - 1):
+        worst = comm.allgather((float(np.abs(sag[close]).max(initial=0.0)), float(clearance[close].max(initial=0.0))))
+        logger.warning(
+            "%s: the surfaces conform, but %d straight facets of the target sag by up to %.3g, more than the clearance of %.3g there: "
+            "the contact zone depends on the facets; refine the target, give both surfaces the same nodes, or take mesh and displacement "
+            "of degree 2",
+            pair.name, facets, *np.max(worst, axis=0),
+        )  # fmt: skip
+
+
+def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -> None:
+    """Tell that mortar has one equation for facets of a tip that all but face each other (collective).
+
+    Args:
+        config: configuration of the displacement.
+        name: of the contact.
+        surface: of the contactor.
+    """
+    comm, spread = config.comm, surface.spread()
+    slim = surface.dofs[spread > SLIM]
+    slim = slim[slim < config.n_owned]
+    (place,) = [p for p in comm.allgather(config.describe(int(slim.min())) if len(slim) else None) if p][:1] or [None]
+    if place is not None:
+        logger.warning(
+            "%s: the contactor's facets at %s meet at less than 40 degrees, and mortar has one equation for all of them, along their mean "
+            "normal: such a tip may pass into a target on one of its sides; take coupling = 'node_to_surface'",
+            name, place,
+        )  # fmt: skip
+
+
+def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
+    """Tell that contactors have slid off the end of the target, and their share of the surface with them (collective).
+
+    Args:
+        pair: in equilibrium.
+        before: contactors that were past an end at the start ``(n,)``.
+        areas: tributary areas ``(n,)``.
+
+    Returns:
+        Whether there was something to tell.
+    """
+    p = pair.projection
+    near = p.way_beyond < 0.5 * p.facet_size
+    slipped = pair.off & ~before & near & (p.gap < 0.0)
+    lost, held, count = reduced(
+        pair.config.comm, np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
+    )
+    if lost <= SLIPPED * (lost + held):
+        return False
+    logger.warning(
+        "%s: %d contactors have slid off the end of the target, and with them %.0f %% of the surface in contact carry no force: let the "
+        "target reach farther, swap contactor and target, or refine the surfaces at the end",
+        pair.name, int(count), 100.0 * lost / (lost + held),
+    )  # fmt: skip
+    return True
+
+
+def check_new(contacts: Sequence[Any]) -> None:
+    """Refuse contacts that belong to a problem already, or stand in the list twice.
+
+    Raises:
+        SpaceError: naming the first such contact.
+    """
+    for i, contact in enumerate(contacts):
+        if contact.taken or any(contact is other for other in contacts[:i]):
+            where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and occurs earlier in the list"
+            raise SpaceError(f"contact '{contact.name}' {where}: expected new ones; make a new Contact for every problem")
+
+
+def check_moved(pair: Interface) -> None:
+    """Refuse a rigid target that is not in the same place on all ranks by an InputError (collective)."""
+    if pair.target.n_nodes or pair.config.comm.size == 1:
+        return
+    m = pair.target.motion
+    where = "not moved" if m is None else " ".join(f"{x:.9g}" for x in np.concatenate([m.translation, m.Q.ravel(), m.about]))
+    given.alike(
+        pair.config.comm, f"contact '{pair.name}', move() of its rigid target", **{"translation, rotation and point": where}
+    )

@@ -1,0 +1,209 @@
+"""Convex corners of a target that enter the contactors' facets: nodes on facets do not see them, so they are looked for and told of.
+
+Between two contactors nothing keeps a target's corner out of the facet. How deep it is in there, times the stiffness of both bodies at
+this place, is force that the contact lacks; beside the contact force it tells how wrong the answer is, whatever the load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TIED
+from uem_dolfinx.errors import OrientationError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
+from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
+from uem_dolfinx.geometry.search import MeshTarget, nearest_of
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import reduced
+
+#: A node of a target is at a convex corner if a facet falls away from the mean of the normals there by more than this.
+#: [convention; sine; test_target_corners.py::test_what_is_a_corner]
+FALLS = 0.15
+#: Corners that are no deeper in a facet than this part of its size lie on it.
+#: [convention; size of the facet; test_target_corners.py::test_what_is_told]
+ON_FACET = 1e-2
+#: Corners are told of where the contact lacks more than this part of its force by them: resultants are then wrong by a per cent or more.
+#: [convention; largest contact force so far; test_target_corners.py::test_what_is_told]
+LACKING = 0.1
+
+
+@dataclass(frozen=True)
+class CornerInside:
+    """Corners of a target inside the contactors' surface.
+
+    Attributes:
+        place: where the one that is deepest for its facet was drawn, as text.
+        depth: of this one, a length.
+        part: of the facet's size that it is deep.
+        lacking: force that the contact lacks by all of them, over the largest contact force so far.
+        both: whether contactors at corners or ends of their own surface press as well, and would not see facets were they the target.
+    """
+
+    place: str
+    depth: float
+    part: float
+    lacking: float
+    both: bool = False
+
+    def __str__(self) -> str:
+        remedy = "take coupling = 'mortar', as the contactor has corners in contact, too"
+        if not self.both:
+            remedy = "swap the two, or take coupling = 'mortar'"
+        return (
+            f"a convex corner of the target, at {self.place}, is {self.depth:.3g} inside a facet of the contactor, "
+            f"{100 * self.part:.2g} % of its size, between contactors, which do not see it: {remedy}"
+        )
+
+
+class TargetCorners:
+    """The convex corners of targets of contacts, and the contactors' surfaces that they may enter (collective).
+
+    Args:
+        pairs: with equations at nodes, which are treated together.
+        tags: of the contactors' facets of each.
+    """
+
+    def __init__(self, pairs: Sequence[Interface], tags: Sequence[Tag]):
+        self.pairs, self.whole = pairs, pairs[0].whole
+        config = self._config = self.whole.config
+        known: dict[Any, Indices] = {}
+        for pair in pairs:
+            if isinstance(pair.target, MeshTarget) and id(pair.target.facets) not in known:
+                known[id(pair.target.facets)] = corner_nodes(config, pair.target.facets)
+        own = [known[id(p.target.facets)] if isinstance(p.target, MeshTarget) else np.zeros(0, np.int32) for p in pairs]
+        #: Owned nodes of the targets at corners and ends ``(k,)`` with their contacts, and which contacts have one on any rank.
+        self.nodes = np.concatenate(own)
+        self.label: Ints = np.repeat(np.arange(len(pairs)), [len(nodes) for nodes in own])
+        self.some: Bools = np.asarray(reduced(config.comm, np.bincount(self.label, minlength=len(pairs))) > 0)
+        n = len(pairs)
+        #: The largest contact force so far, and sizes of the largest and of the smallest facet of each contact, lengths ``(n_pairs,)``.
+        self.largest, self.reach, self.smallest = np.zeros(n), np.zeros(n), np.full(n, np.inf)
+        self._tags = tags
+        sizes: dict[Any, tuple[float, float]] = {}
+        for k, tag in enumerate(tags):
+            if self.some[k] and id(tag) not in sizes:
+                x = config.x[nodes_of_facets(config, tag).dofs]
+                sides = np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+                sizes[id(tag)] = np.ptp(x, axis=1).max(initial=0.0), sides.min(initial=np.inf)
+            if self.some[k]:
+                self.reach[k], self.smallest[k] = sizes[id(tag)]
+        extremes = np.concatenate([self.reach, -self.smallest])
+        config.comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
+        self.reach, self.smallest = extremes[:n], -extremes[n:]
+
+    @cached_property
+    def surface(self) -> tuple[JoinedTarget | None, Ints]:
+        """Surfaces of the contactors, and which of these each contact has ``(n_pairs,)``; -1 inside a body (first time: collective).
+
+        That has no outside which a corner could come from.
+        """
+        found: dict[Any, TargetFacets | None] = {}
+        for tag in (tag for tag, some in zip(self._tags, self.some) if some and id(tag) not in found):
+            try:
+                found[id(tag)] = facets_of(self._config, tag, "contactor")
+            except OrientationError:
+                found[id(tag)] = None
+        place = {key: k for k, key in enumerate(key for key, facets in found.items() if facets is not None)}
+        of_contact = np.array([place.get(id(tag), -1) for tag in self._tags])
+        surfaces = [facets for facets in found.values() if facets is not None]
+        return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact) if surfaces else None, of_contact
+
+    @timed("corners of the target")
+    def find(self, stiffness: Array, asked: Bools) -> dict[int, CornerInside]:
+        """The corners that are inside where the bodies are now, of contacts in which they matter, by their numbers (collective).
+
+        Args:
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
+            asked: contacts that are looked at ``(n_pairs,)``.
+        """
+        whole, config, comm, n = self.whole, self._config, self._config.comm, len(self.pairs)
+        asked = asked & self.some & ~np.array([pair.mutual for pair in self.pairs])
+        if not asked.any():
+            return {}
+        near, label = self._near(asked)
+        pressing = sums_of_rows(whole.label, whole.trial.lam[:, None], n)[:, 0]
+        some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
+        # bodies that part press hardly any more
+        self.largest[asked] = np.maximum(force, self.largest)[asked]
+        if not some.any():
+            return {}
+        # beside a contactor none is deeper than it is away from there
+        least = ON_FACET * float(self.smallest[asked].min())
+        away = 4.0 * config.size * np.arange(1, n + 1)
+        places, points = (np.column_stack([x, away[k]]) for x, k in ((config.x[near], label), (whole.points, whole.label)))
+        distance, _ = nearest_of(comm, places, points, least, np.zeros((len(points), 1)))
+        near, label = near[distance > least], label[distance > least]
+        if not reduced(comm, len(near)):
+            return {}
+        surface, of_contact = self.surface
+        outside = of_contact[label] >= 0
+        near, label = near[outside], label[outside]
+        if surface is None:
+            return {}
+        p = surface.project_onto(config.x[near], of_contact[label])
+        depth, part = -p.gap, -p.gap / p.facet_size
+        inside = (part > ON_FACET) & (p.from_end > 0.0) & (p.beyond == 0.0).all(axis=1)
+        # deeper than the cell behind the facet it may as well be behind the body
+        inside &= depth < surface.of_facets(p.facet, surface.facets.depth)
+        if not reduced(comm, int(inside.sum())):
+            return {}
+        stiffness = np.abs(stiffness)
+        of_facet = config.ask_owners(p.nodes.ravel(), stiffness).reshape(*p.nodes.shape, config.gdim)
+        theirs, own = (
+            np.einsum("na,nag,ng->n", p.weights, of_facet, p.normal**2),
+            np.einsum("ng,ng->n", stiffness[near], p.normal**2),
+        )
+        both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
+        lacking = reduced(comm, sums_of_rows(label, (both * depth)[:, None], n)[:, 0])
+        told = {}
+        for k in np.flatnonzero(lacking > LACKING * self.largest):
+            which = np.flatnonzero(inside & (label == k))
+            found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
+            everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
+            # of equals the one that no rounding and no partition chooses
+            deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
+            size, place, deep = next(one for one in everywhere if one[1] == deepest)
+            missing = lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf
+            told[int(k)] = CornerInside(place, deep, size, missing, self._at_own_corners(int(k)))
+        return told
+
+    def _at_own_corners(self, k: int) -> bool:
+        """Whether contactors of a contact at corners or ends of their own surface press (collective)."""
+        pair, config = self.pairs[k], self._config
+        corners = corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
+        return bool(reduced(config.comm, int(np.isin(pair.nodes[pair.trial.active], corners).sum())))
+
+    def _near(self, asked: Bools) -> tuple[Indices, Ints]:
+        """Corners in the box of the contactors that are no farther from the target than a facet is large, and contacts (collective)."""
+        whole, config, g = self.whole, self._config, self._config.gdim
+        points, label = whole.points, whole.label
+        near = asked[label] & (np.linalg.norm(points - whole.projection.foot, axis=1) <= self.reach[label])
+        bounds = np.full((len(self.pairs), 2 * g), -np.inf)
+        np.maximum.at(bounds, label[near], np.column_stack([-points, points])[near])
+        config.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
+        x, reach, bounds = config.x[self.nodes], self.reach[self.label, None], bounds[self.label]
+        inside = asked[self.label] & ((x >= -bounds[:, :g] - reach) & (x <= bounds[:, g:] + reach)).all(axis=1)
+        return self.nodes[inside], self.label[inside]
+
+
+def corner_nodes(config: Configuration, facets: TargetFacets) -> Indices:
+    """Owned nodes of a surface at its convex corners and edges, and at its ends ``(k,)`` (collective)."""
+    data = facets.current()
+    arms = data.x[:, None] - data.x[:, :, None]
+    length = np.linalg.norm(arms, axis=3)
+    falls = -np.einsum("mabg,mag->mab", arms, data.nodal_normals) > FALLS * length
+    falls &= length > 0.0
+    at_corner = falls.any(axis=2) | facets.open_nodes
+    marked = config.to_owners(facets.dofs[at_corner], np.ones(int(at_corner.sum())))
+    return np.flatnonzero(marked[: config.n_owned] > 0).astype(np.int32)

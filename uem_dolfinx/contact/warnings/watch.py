@@ -1,0 +1,197 @@
+"""What a contact is looked at for while steps are taken, and warns of once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.results import ContactResults
+from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
+from uem_dolfinx.errors import UEMError
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.offsets import Offsets
+    from uem_dolfinx.contact.pair.interface import Interface
+    from uem_dolfinx.contact.seam.state import PairState
+    from uem_dolfinx.contact.warnings.target_corners import CornerInside, TargetCorners
+
+
+class WatchedContact(ContactResults):
+    """A contact of a problem, whose ends, corners and wear are looked at after every step.
+
+    Attributes:
+        adjust: whether gaps at the start have been closed, and how far.
+    """
+
+    adjust: float | bool
+    _offsets: Offsets | None
+
+    def begin(self) -> None:
+        """Take the contact for that of a problem that is complete (collective)."""
+        self.taken, self._slipped, self._on = True, False, True
+        #: A convex corner of the target by which the contact has lacked force.
+        self._corner: CornerInside | None = None
+        self._off_at_start = self.pair.off.copy()
+
+    def take_pair(self, pair: Interface) -> None:
+        """Take another interface for the contact's."""
+        self._pair = pair
+        if self._offsets is not None:
+            self._offsets.pair = pair
+
+    @property
+    def on(self) -> bool:
+        """Whether it is switched on."""
+        return self._on
+
+    def switch(self, on: bool) -> None:
+        """Switch it on or off; its pair is the caller's."""
+        self._on = on
+
+    @property
+    def sees_corners(self) -> bool:
+        """Whether convex corners of the target may enter facets between contactors."""
+        return self.pair.discretisation.at_feet and self.contactor.dim > 0
+
+    @property
+    def corner(self) -> CornerInside | None:
+        """A convex corner of the target by which the contact has lacked force, once one has been told of."""
+        return self._corner
+
+    def note_corner(self, corner: CornerInside) -> None:
+        """Tell of a convex corner of the target by which the contact lacks force."""
+        self._corner = corner
+        logger.warning("%s: %s", self.name, corner)
+
+    @property
+    def watches_ends(self) -> bool:
+        """Whether contactors that slide off the target's end are still to be told of."""
+        return not self._slipped and self.pair.target.n_nodes > 0
+
+    @property
+    def off_at_start(self) -> Bools:
+        """Contactors that were past an end of the target at the start ``(n,)``."""
+        return self._off_at_start
+
+    def warn_of_ends(self) -> None:
+        """Tell that contactors have slid off the target's end, if they are many (collective)."""
+        self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
+
+    def look_at_wear(self, before: PairState | None, stiffness: Array | None) -> None:
+        """Warn, once, if the step from the state ``before`` has worn too much; ``stiffness`` as of ``Watch.look`` (collective)."""
+        wear = None if self.pair.friction is None else self.pair.friction.wear
+        if wear is not None and before is not None and stiffness is not None:
+            wear.look_at_step(before, self.pair.committed, self.pair.kinematics.normal, stiffness)
+
+
+class Watch:
+    """The contacts of a problem that is complete, looked at together after every step (collective).
+
+    Args:
+        contacts: of the problem, which have begun.
+    """
+
+    def __init__(self, contacts: Sequence[WatchedContact]):
+        self._contacts = contacts
+        self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
+        self._off_at_start: dict[int, Bools] = {}
+        self.begin()
+        for group in _by_interface([c for c in contacts if not c.adjust]).values():
+            _warn_of_sagging_facets(group)
+
+    def begin(self) -> None:
+        """Begin with the interfaces that contacts have now, or go on with them (collective)."""
+        from uem_dolfinx.contact.warnings.target_corners import TargetCorners
+
+        forces = {id(c): f for corners, group in self._corners.values() for c, f in zip(group, corners.largest)}
+        self._corners = {}
+        for key, group in _by_interface([c for c in self._contacts if c.sees_corners]).items():
+            corners = TargetCorners([c.pair for c in group], [c.contactor for c in group])
+            corners.largest = np.array([forces.get(id(c), 0.0) for c in group])
+            self._corners[key] = corners, group
+        own = {id(c.pair): c.off_at_start for c in self._contacts}
+        wholes = {key: group[0].pair.whole for key, group in _by_interface(self._contacts).items()}
+        self._off_at_start = {key: np.concatenate([own[id(m)] for m in whole.members]) for key, whole in wholes.items()}
+
+    def look(self, before: Mapping[int, PairState], stiffness: Array | None) -> None:
+        """Look at contacts that are on after a step (collective).
+
+        Args:
+            before: states from which the step led, by ``id`` of interfaces that are treated alone.
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None where it is not known yet.
+        """
+        looked_at = [c for c in self._contacts if c.on and not c.pair.far]
+        for group in _by_interface(looked_at).values():
+            self._look_at_ends(group)
+        self._look_at_corners([c for c in looked_at if c.corner is None], stiffness)
+        for contact in looked_at:
+            contact.look_at_wear(before.get(id(contact.pair)), stiffness)
+
+    def _look_at_ends(self, group: Sequence[WatchedContact]) -> None:
+        """Warn of contactors that have slid off the ends of targets, of contacts that are treated together (collective)."""
+        group = [c for c in group if c.watches_ends]
+        if not group:
+            return
+        whole = group[0].pair.whole
+        gone = whole.off & ~self._off_at_start[id(whole)] & ~whole.tied
+        some = dict(zip(map(id, whole.members), np.bincount(whole.label[gone], minlength=len(whole.members)) > 0))
+        mine = np.array([some[id(c.pair)] for c in group])
+        for contact, some in zip(group, reduced(whole.config.comm, mine, op=MPI.LOR)):
+            if some:
+                contact.warn_of_ends()
+
+    def _look_at_corners(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> None:
+        """Note and warn of a convex corner of a target inside the contactor, once for each contact (collective)."""
+        for contact, corner in self.corners_inside(contacts, stiffness).items():
+            contact.note_corner(corner)
+
+    def corners_inside(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> dict[WatchedContact, CornerInside]:
+        """Convex corners of targets inside contactors by which contacts lack force; ``stiffness`` as of ``look`` (collective)."""
+        if stiffness is None:
+            return {}
+        found: dict[WatchedContact, CornerInside] = {}
+        asked = set(map(id, contacts))
+        for corners, group in self._corners.values():
+            told = corners.find(stiffness, np.array([id(c) in asked for c in group]))
+            found |= {group[k]: corner for k, corner in told.items()}
+        return found
+
+    def name_corner(self, stiffness: Array | None, error: UEMError) -> None:
+        """Tell in an error of a convex corner of a target inside contactors, if there is one (collective).
+
+        A corner by which a contact lacks force, or lacked it before; ``stiffness`` as of ``look``.
+        """
+        now = self.corners_inside([c for c in self._contacts if c.on], stiffness)
+        for contact in self._contacts:
+            corner = now.get(contact) or contact.corner
+            if corner is not None:
+                error.amend(f"{contact.name}: {corner}")
+                return
+
+
+def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
+    """Warn of targets too coarse for their contactors, of contacts that are treated together (collective)."""
+    whole = group[0].pair.whole
+    some = np.ones(len(whole.members), dtype=bool)
+    if len(some) > 1:
+        near = np.bincount(whole.label[sagging(whole)[0]], minlength=len(some)) > 0
+        some = reduced(whole.config.comm, near, op=MPI.LOR)
+    asked = {id(member) for member, one in zip(whole.members, some) if one}
+    for contact in group:
+        if id(contact.pair) in asked:
+            warn_of_sagging_facets(contact.pair)
+
+
+def _by_interface(contacts: Sequence[WatchedContact]) -> dict[int, list[WatchedContact]]:
+    """Contacts by ``id`` of what they are treated as."""
+    groups: dict[int, list[WatchedContact]] = {}
+    for contact in contacts:
+        groups.setdefault(id(contact.pair.whole), []).append(contact)
+    return groups

@@ -1,0 +1,450 @@
+"""The united problem linearised at a state of equilibrium, forwards along changes of controls, and backwards from a functional.
+
+With the residual F of the bodies, contact forces ``T' lam`` and gaps g, a change m' of the controls moves the bodies by
+
+    du = P dq + c(m'),    P'(K + G)P dq = -P' [ dF/dm m' + (K + G) c(m') ]
+
+where G is the curvature of the contact, and c what the Dirichlet values ask for. A functional J of u and m therefore has
+
+    P'(K + G)P mu = P' dJ/du,    a = P mu                                              the adjoint problem
+    dJ/dm m' = dJ/dm|u m' - a' dF/dm m' + [ dJ/du - (K + G)' a ]' c(m')
+
+Gaps see the places X of the nodes as they see u: with ``x' = du + X'`` in place of du,
+
+    x' = P dq + c(X'),    P'(K + G)P dq = -P' [ (dF/dX - K) X' + (K + G) c(X') ]
+    dJ/dX = dJ/dX|u - dJ/du - (dF/dX - K)' a + [ dJ/du - (K + G)' a ]' c
+
+Contact forces are read from the residual at the contactors, by L and the series S of P, and so are their changes. A functional of lam, too,
+has a further load that moves contactors against their targets, by which the forces of the adjoint problem are those that J asks for:
+
+    lam' = L'S' [ (K + G) du + dF/dm m' ],    w = S L dJ/dlam
+    dJ/du + (K + G) w in place of dJ/du,    a - w in place of a where it meets dF/dm or dF/dX - K
+
+Parameters of a contact change gaps and contact forces alone: c closes the gaps, and what forces at the same multipliers change by counts
+as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/du``, and (K + G)' stands for (K + G) in what goes back.
+Among other fields u is all of them; contacts, and the places of nodes, have a part in the displacement's rows alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.entries import is_symmetric
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.form_checks import Control
+from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
+from uem_dolfinx.gradients.parameters import ContactParameter, motion_of, rubbed, thickened, turned_by
+from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.norms import ratio
+from uem_dolfinx.solve.bodies.tangent import curvature_of
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.taken import in_rows, wanted_by_step
+from uem_dolfinx.solve.united.rows import BodyState, Rows
+from uem_dolfinx.solve.united.system import CLOSED, BodySystem
+
+#: A residual this many times what steps leave is of other parameters than the step's.
+#: [convention; norm of the residual; test_gradient.py::test_parameters_that_have_changed]
+MORE_THAN_LEFT = 1e3
+
+
+class Motion(NamedTuple):
+    """What moves with changes of controls.
+
+    Attributes:
+        du: change of the displacement, and of all other fields.
+        shape: of the places of the nodes where they were drawn.
+        reactions: of the forces that contacts and Dirichlet conditions bear, on the bodies.
+    """
+
+    du: fem.Function
+    shape: fem.Function
+    reactions: PETSc.Vec
+
+
+#: Derivatives of problems, compiled for their gradients so far.
+_KEPT: WeakKeyDictionary[UnitedProblem, Derivatives] = WeakKeyDictionary()
+
+
+def _derivatives_of(problem: UnitedProblem) -> Derivatives:
+    """Of its residual and of functionals, those of the last gradient among them."""
+    F, kept = problem.bodies.F, _KEPT.get(problem)
+    if kept is None or kept.F is not F:
+        kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
+    kept.begin()
+    return kept
+
+
+class Linearised:
+    """The united problem linearised at the state of equilibrium, which is left as it was in the end (collective).
+
+    Attributes:
+        F: the residual in UFL.
+        derivatives: of it and of functionals.
+        P: restriction matrix of the active contactors.
+        rows: their equations.
+        multipliers: of all equations of contacts, and of users ``(m,)``.
+        ramp: share that Dirichlet values have of those that they are led to, in the rows of vectors ``(n_rows, gdim)``.
+    """
+
+    P: Restriction
+    rows: Rows
+    multipliers: Array
+
+    def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None, held: Array | float | None = None):
+        self.problem, self.config = problem, problem.config
+        self.ramp = in_rows(problem, problem.progress.taken.held if held is None else held)
+        self.K = self._K_back = problem.bodies.tangent.K
+        # of the displacement's components here, which are the first of vectors
+        self._n = problem.config.n_owned * problem.config.gdim
+        self.F = problem.bodies.F
+        self.derivatives = derivatives or _derivatives_of(problem)
+
+    def __enter__(self) -> Linearised:
+        try:
+            self._linearise()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def _linearise(self) -> None:
+        system, state = self.problem.system, self._state()
+        assert isinstance(system, BodySystem)
+        self._refuse_other_parameters(state)
+        # no step begins: a factorisation of the same matrix goes on serving
+        system.linearise(state, 1)
+        self.K, self.G = self.problem.bodies.tangent.K, system.curvature
+        self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
+        self._tell_idle()
+
+    def _state(self) -> BodyState:
+        """Equations and multipliers where the problem is (collective)."""
+        bodies, system = self.problem.bodies, self.problem.system
+        assert isinstance(system, BodySystem)
+        bodies.wanted[:] = self.problem.u.x.array
+        system.place()
+        bodies.assemble()
+        state = system.assemble_constraints(lambda norm, scale, rounding: True)
+        assert isinstance(state, BodyState)
+        self.P, self.rows = state.trial, state.rows
+        self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
+        return state
+
+    def _refuse_other_parameters(self, state: BodyState) -> None:
+        """Refuse a displacement that is no equilibrium of the present parameters (collective)."""
+        problem, bodies = self.problem, self.problem.bodies
+        largest, found = np.maximum(state.scale, problem.largest_forces), ""
+        if np.any(state.norm > MORE_THAN_LEFT * np.maximum(problem.rtol * largest, state.rounding)):
+            found = f"forces are not in equilibrium, with a residual of {ratio(state.norm, largest):.1g} of the forces at work"
+        if (wanted := wanted_by_step(problem)) is not None:
+            bodies.wanted[:] = wanted
+            if not bodies.dirichlet_met():
+                found = "the displacement has other values than Dirichlet conditions prescribe"
+            bodies.wanted[:] = problem.u.x.array
+        if not found and not state.closed:
+            found = "contactors are not where their targets are"
+        if found:
+            raise InputError(
+                f"the displacement is not that of the present parameters: {found}; expected Constants, Functions, Dirichlet values, "
+                "targets and nodes as the last step left them; put them back, or solve again"
+            )
+
+    def _tell_idle(self) -> None:
+        """Count contactors at which functionals have a gradient on either side (collective)."""
+        bodies, system, idle = self.problem.bodies, self.problem.system, 0
+        assert isinstance(system, BodySystem)
+        for pair in system.pairs:
+            now, rounding = pair.trial, bodies.rounding_at(pair.nodes)
+            touches = ~now.active & ~pair.off & (np.abs(pair.gap) <= CLOSED * self.config.size)
+            idle += int(((now.active & (now.lam <= rounding)) | touches).sum())
+        if idle := reduced(self.config.comm, idle):
+            logger.warning(
+                "%d contactor(s) have neither force nor gap: the functional has another gradient on either side, and this is that of "
+                "the contactors that are active now", idle,
+            )  # fmt: skip
+
+    def __exit__(self, *error: object) -> None:
+        solver = self.problem.solver
+        # multigrid learns from one matrix for the next, and steps may not depend on whether a gradient was asked for
+        if solver.iterative or not solver.lasting or self._K_back is not self.K:
+            self.problem.system.forget()
+        self.problem.restore()
+
+    def pressures(self, contact: Contact) -> PressureSlopes:
+        """Derivatives of a contact's pressures (collective).
+
+        Raises:
+            InputError: where they have none.
+        """
+        if self.rows.independent is not None and self.rows.independent.found:
+            raise InputError(
+                f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "
+                "replaced by others, so that pressures have no derivatives here; let nodes be contactors of one contact, with free normals"
+            )
+        return PressureSlopes(contact, self.rows.equations[self.problem.contacts.index(contact)])
+
+    def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
+        """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective with weights)."""
+        if not weights:
+            # what equations are replaced by that conflict may be of other ranks
+            return self.config.vector()
+        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.rows.equations)]
+        return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
+
+    def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
+        """A vector with what the displacement's owned nodes have ``(n_owned, gdim)``, zero in other fields."""
+        v = self.config.unknowns.vector()
+        v.array[: self._n] = np.ravel(at_nodes)
+        return v
+
+    def assembled(self, form: ufl.Form) -> Array:
+        """A linear form of all unknowns in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        values = forms.assemble_array(self.problem.u.function_space, forms.form(form))
+        return np.asarray(self.config.rows(values).ravel())
+
+    def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
+        """``P dq`` under forces, P being Q without friction (collective)."""
+        # as accurately as an iterative solver can
+        dq, _ = self.problem.solver.solve(self.P.transpose(forces))
+        return self.P.expand(dq)
+
+    def held(self, v: PETSc.Vec) -> PETSc.Vec:
+        """Without what bodies that contact alone holds move along it, where steps leave them; its own transpose (collective)."""
+        assert isinstance(self.problem.system, BodySystem)
+        out = v.copy()
+        out.array[: self._n] = self.problem.system.floating.without_open_motions(np.array(v.array_r[: self._n]))
+        return out
+
+    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
+        """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
+        return curvature_of([self.problem.pairs[k] for k in which], self.config.unknowns.vector(), True, False)
+
+    def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
+        """``a = Q mu`` of the adjoint problem under forces (collective)."""
+        if self._K_back is not self.K:
+            self.problem.solver.set_operator(self.P, self._K_back, self.G)
+        return self.solve(forces)
+
+    def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G) du`` (collective)."""
+        return forms.product(self.K, du, self.G)
+
+    def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G)' a`` (collective)."""
+        return forms.product(self._K_back, a, self.G)
+
+    def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``K' a`` (collective)."""
+        return forms.product(self._K_back, a)
+
+    def share(self, m: Control | ContactParameter) -> float:
+        """How much of a change of a control the state has seen: all of it, unless load steps lead it there."""
+        one = m.contact if isinstance(m, ContactParameter) and m.parameter == "offset" else m
+        return self.problem.progress.taken.of(one)
+
+    def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
+        """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).
+
+        A rigid surface that moves by b(x) leaves bodies behind as if it were at rest and these moved by -b, and rotates its forces.
+
+        Returns:
+            Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
+        """
+        k, pair, config = self.problem.contacts.index(m.contact), m.contact.pair, self.config
+        gaps, first = np.zeros_like(self.multipliers), sum(len(own) for own in self.rows.equations[:k])
+        if m.parameter == "friction":
+            return gaps, rubbed(pair)
+        if self.P.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+            raise InputError(
+                f"contact '{m.contact.name}': equations follow each other in rings, or conflict, so that its {m.parameter} has no "
+                "derivative here; let nodes be contactors of one contact, with free normals"
+            )
+        own, rows = slice(first, first + len(self.rows.equations[k])), self.rows.equations[k].trial
+        if m.parameter == "offset":
+            gaps[own], forces = thickened(pair, self.multipliers[own])
+            return gaps, forces
+        b, pushed = motion_of(m, config.x[: config.n_owned], entry), np.zeros((config.n_owned, config.gdim))
+        there = np.einsum("kg,kg->k", rows.coefficients, config.ask_owners(rows.followed, b))
+        gaps[own] = np.bincount(rows.row, there, len(rows)) - np.einsum("mg,mg->m", rows.direction, b[rows.node])
+        if m.parameter == "turn":
+            nodes, force = pair.nodal_forces(pair.trial)
+            pushed = config.add_at_owners(nodes, turned_by(entry, force))
+        if (stiffness := self.stiffness_of([k])) is not None:
+            pushed = pushed + forms.product(stiffness, self.vector(b)).array_r[: self._n].reshape(-1, config.gdim)
+        return gaps, -pushed
+
+    def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
+        """What moves with changes of controls (collective)."""
+        config, bodies = self.config, self.problem.bodies
+        forces, prescribed, shape = self.vector(), np.zeros(bodies.free_rows.shape), fem.Function(config.V)
+        gaps = np.zeros_like(self.multipliers)
+        for m, change in direction:
+            if isinstance(m, ContactParameter):
+                for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):
+                    opened, pushed = self.changes(m, entry)
+                    gaps += self.share(m) * size * opened
+                    forces.array[: self._n] -= self.share(m) * size * pushed.ravel()
+                continue
+            if isinstance(m, ufl.SpatialCoordinate):
+                shape.x.array[:] += values_in(config.V, change)
+                if (form := forms.by_places(self.F, config.mesh, change)) is not None:
+                    forces.array[:] -= self.assembled(form)
+                continue
+            if isinstance(m, fem.Constant):
+                change = self.share(m) * np.asarray(change, dtype=float)
+            if (form := along(self.F, m, change)) is not None:
+                forces.array[:] -= self.assembled(form)
+            values = values_in(m.function_space, change) if isinstance(m, fem.Function) else change
+            prescribed += self.ramp * self.prescribed_by(m, values)
+        shape.x.scatter_forward()
+        drawn = self.vector(shape.x.array[: self._n])
+        forces.axpy(1.0, forms.product(self.K, drawn))
+        c = self.P.carried(prescribed + np.where(bodies.free_rows, 0.0, drawn.array_r.reshape(-1, config.gdim)))
+        c.axpy(-1.0, self.P.read_back(gaps))
+        way = self.solve(forces - self.stiffness(c))
+        way.axpy(1.0, c)
+        reactions = self.stiffness(way) - forces
+        return Motion(self.function(self.held(way - drawn)), shape, reactions)
+
+    def function(self, v: PETSc.Vec) -> fem.Function:
+        """A Function of the problem's space with these values (collective)."""
+        f, values = fem.Function(self.problem.u.function_space), self.config.from_rows(v.array_r)
+        f.x.array[: len(values)] = values
+        f.x.scatter_forward()
+        return f
+
+    def pressed(self, contact: Contact, motion: Motion) -> fem.Function:
+        """How a contact's pressure changes with a motion (collective)."""
+        slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
+        multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
+        ends = np.cumsum([len(own) for own in self.rows.equations])
+        found = fem.Function(contact.pressure.function_space)
+        part = multipliers[ends[k] - len(self.rows.equations[k]) : ends[k]]
+        found.x.array[contact.nodes] = slopes.along(part, motion.du, motion.shape)
+        found.x.scatter_forward()
+        return found
+
+    def prescribed_by(self, m: Any, values: Array) -> Array:
+        """What the ``values`` of a control make of Dirichlet values in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        bodies, found = self.problem.bodies, []
+        before = np.array(forms.values_of(m))
+        for now in (values, 0.0 * values):
+            out = np.zeros(len(self.problem.u.x.array))
+            forms.values_of(m)[...] = now
+            compat.set_bc_values(out, bodies.bcs)
+            found.append(out)
+        forms.values_of(m)[...] = before
+        change = np.where(bodies.held, found[0] - found[1], 0.0)
+        return np.asarray(self.config.rows(change[: len(bodies.residual_of_all)]))
+
+
+class Adjoint:
+    """The adjoint problem of one functional (collective).
+
+    Args:
+        at: the problem, linearised.
+        J: the functional.
+        pressing: contacts whose pressures it holds.
+        handed: derivative by the places of the owned nodes through what later steps remember of them ``(n_owned, gdim)``.
+
+    Attributes:
+        a: what forces do to J, less what they do to contact forces by themselves, a Function of the problem's space.
+        left: derivative by a change of the displacement with everything else at rest, what the adjoint forces have not taken up.
+        terms: J with its areas, and the work of the residual along a, with their signs.
+        by_values: derivative of J by the prescribed value of every component of vectors, zero where free ``(n_rows, gdim)``.
+    """
+
+    def __init__(self, at: Linearised, J: ufl.Form | None, pressing: Sequence[Contact] = (), handed: npt.ArrayLike | float = 0.0):
+        self.at, self.config = at, at.config
+        config, functionals, weights = at.config, [] if J is None else [J], {}
+        now, drawn = at.vector(), at.vector()
+        for contact in pressing:
+            p = contact.pressure
+            of_p = at.derivatives.by_values(functionals[0], p)
+            found = at.pressures(contact).back(np.zeros(len(contact.nodes)) if of_p is None else of_p[contact.nodes])
+            weights[contact] = found.multipliers
+            functionals += [] if found.areas is None else [found.areas]
+            now.axpy(1.0, at.vector(found.now))
+            drawn.axpy(1.0, at.vector(found.drawn))
+        of_u = at.vector()
+        for functional in functionals:
+            if (part := at.derivatives.by_values(functional, at.problem.u, at.derivatives.test)) is not None:
+                of_u.array[:] += config.rows(part).ravel()
+        of_u = at.held(of_u)
+        lift = at.lift(weights)
+        drive = of_u + at.stiffness_back(lift) + now + at.vector(handed)
+        whole = at.solve_back(drive)
+        left = whole - lift
+        self.a = at.derivatives.a
+        self.terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
+        self.left = drive - at.stiffness_back(whole)
+        at.derivatives.along(config.from_rows(left.array_r))
+        self.by_values = np.where(at.problem.bodies.free_rows, 0.0, at.P.carried_back(self.left))
+        #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
+        by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
+        self._by_places = by_places[: config.n_owned * config.gdim]
+
+    @cached_property
+    def by_gaps(self) -> Array:
+        """Derivative by the gaps of all equations ``(m,)`` (first time: collective)."""
+        return -self.at.P.multipliers(self.at.P.pass_on(self.left))
+
+    def by(self, m: Control | ContactParameter) -> Array | fem.Function:
+        """Derivative by a control."""
+        if isinstance(m, ContactParameter):
+            return self._by_contact(m)
+        if isinstance(m, fem.Constant):
+            return self._by_constant(m)
+        return self._by_function(m) if isinstance(m, fem.Function) else self._by_shape(m)
+
+    def _by_contact(self, m: ContactParameter) -> Array:
+        """An array of its shape."""
+        found = np.zeros(m.shape(self.config.gdim))
+        a = self.config.of(self.a.x.array)[: self.config.n_owned]
+        for entry in np.ndindex(found.shape):
+            opened, pushed = self.at.changes(m, entry)
+            found[entry] = self.at.share(m) * (self.by_gaps @ opened - (a * pushed).sum())
+        return np.asarray(reduced(self.config.comm, found))
+
+    def _by_constant(self, m: fem.Constant) -> Array:
+        """An array of its shape."""
+        found = np.asarray(self.at.derivatives.by_constant(self.terms, m))
+        for entry in np.ndindex(found.shape):
+            unit = np.zeros(found.shape)
+            unit[entry] = 1.0
+            work = float((self.by_values * self.at.ramp * self.at.prescribed_by(m, unit)).sum())
+            found[entry] += float(reduced(self.config.comm, work))
+        return np.asarray(self.at.share(m) * found)
+
+    def _by_function(self, m: fem.Function) -> fem.Function:
+        """A Function of its space."""
+        found, added = self.at.derivatives.by_function(self.terms, m), fem.Function(m.function_space)
+        # conditions that take its values tell which
+        which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
+        own = which > 0.5
+        np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, (self.at.ramp * self.by_values)[own])
+        forms.sum_ghosts(added)
+        found.x.array[:] += added.x.array
+        return found
+
+    def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
+        """A Function of the displacement's space."""
+        found = self.at.derivatives.by_places(self.terms, X)
+        found.x.array[: len(self._by_places)] += self._by_places
+        found.x.scatter_forward()
+        return found

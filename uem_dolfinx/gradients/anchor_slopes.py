@@ -1,0 +1,163 @@
+"""How a step with friction depends on the anchors that it began with, and these on where contactors were before; backwards alone.
+
+A contactor that sticks is at its anchor A, a point of the target, in all components,
+
+    x_i = A(xi) = sum_a N_a(xi) x_a,        A' = t xi',        t = sum_a dN_a x_a
+
+so that its equations' gaps change by ``-d . A'`` for a direction d, and its force f acts on the target's nodes with ``N_a + dN_a xi'``.
+The direction of one that slips in space changes with its way w from A by a stiffness S, ``tau' = -S w'``. An anchor of a contactor that
+does not stick is its foot, whose coordinates change with contactor and target as the derivative of the closest point has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Constraints
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.projection import FacetProjection, foot_slopes
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.parallel import reduced
+
+
+class AnchorSlopes:
+    """Derivatives of one converged step of a contact with friction of nodes, by its anchors (collective).
+
+    Args:
+        pair: the interface, in the trial state of the step.
+        name: of its contact, for messages.
+
+    Attributes:
+        stuck: contactors at their anchors ``(n,)``.
+
+    Raises:
+        InputError: where corners or edges of the target hold contactors, or slip turns that has no way.
+    """
+
+    def __init__(self, pair: Interface, name: str):
+        assert pair.friction is not None
+        self._pair, self._sliding, self._name = pair, pair.friction, name
+        self._config, state = pair.config, pair.trial
+        active = self._sliding.active(state)
+        assert state.friction is not None
+        held = self._sliding.frame.free_tangents.any(axis=(1, 2))
+        self.stuck: Bools = active & state.friction.stick & ~pair.redundant & held
+        self._slips = self._sliding.slipping(state)
+        self._anchor, friction = self._tangents_at_anchors(), self._sliding
+        at_edges = self._slips & (pair.kinematics.cone != 1.0)
+        self._refuse(active & (state.in_corner | friction.frame.cornered | at_edges), "corner of the target holds")
+        self._refuse(self.stuck & friction.left_out.any(axis=1), "dependent equation along the target holds")
+        if self._config.gdim == 3:
+            self._turn_by_slip()
+
+    def _refuse(self, which: Bools, words: str) -> None:
+        count = int(reduced(self._config.comm, int(which.sum())))
+        if count:
+            raise InputError(
+                f"contact '{self._name}': a {words} {count} contactor(s), through which histories have no derivatives; take another mesh, "
+                "other steps, or differences of two solutions"
+            )
+
+    def _turn_by_slip(self) -> None:
+        """Let directions turn by slip and force in equal parts, on which the stiffness of a turn does not depend in equilibrium."""
+        w, bound, state = self._sliding.frame.slip, self._sliding.bound(self._pair.trial), self._pair.trial
+        way = np.linalg.norm(w, axis=1)
+        self._refuse(self._slips & ((way == 0.0) | (bound == 0.0)), "slip without way or without force turns")
+        c = np.where(self._slips, bound / np.where(way > 0.0, way, 1.0), 0.0)
+        assert state.friction is not None
+        q = c[:, None] * w - self._sliding.frame.tangential(state.friction.tau)
+        self._sliding.pivot = replace(self._sliding.pivot, stiffness=c, q=q)
+
+    def leaning(self) -> list[tuple[Ints, Array]]:
+        """What Newton's tangent leaves out in space, lists of global nodes and blocks as of ``Interface.curvature``.
+
+        A way w over a curved surface leans from the tangent plane, so that its part in that plane changes by ``- (n . w) n'``.
+        """
+        if self._config.gdim == 2:
+            return []
+        i, p, kinematics = np.flatnonzero(self._slips), self._pair.kinematics.projection, self._pair.kinematics
+        _, _, stiffness = self._sliding.turning(self._pair.trial, kinematics)
+        lean = np.einsum("ng,ng->n", kinematics.normal, self._sliding.frame.away)[i]
+        turned = -lean[:, None, None] * np.einsum("kgh,khi->kgi", stiffness, p.normal_slopes(i))
+        share = np.column_stack([np.ones(len(i)), -p.weights[i]])
+        blocks = np.einsum("ka,kgi->kagi", share, turned).reshape(len(i), turned.shape[2], turned.shape[2])
+        return [(np.column_stack([self._config.to_global(self._pair.nodes[i]), p.nodes[i]]), blocks)]
+
+    def without_stuck(self) -> PairState:
+        """The state in which contactors at their anchors have no force: they turn none of their equations."""
+        return replace(self._pair.trial, nodal=np.where(self.stuck, 0.0, self._pair.trial.nodal))
+
+    def _tangents_at_anchors(self) -> Array:
+        """Derivatives of the anchors ``(n, k, gdim)`` by what tells them (collective)."""
+        target, f = self._pair.target, self._pair.trial.friction
+        assert f is not None
+        if isinstance(target, MeshTarget):
+            own = target.facets.current()
+            return np.einsum("naf,nag->nfg", target.shape.tabulate(f.xi).dN, target.of_facets(f.facet, own.x))
+        turn = np.eye(self._config.gdim) if target.motion is None else target.motion.Q.T
+        return np.broadcast_to(turn, (len(f.stick), *turn.shape))
+
+    @property
+    def size(self) -> int:
+        """How many numbers tell an anchor."""
+        return self._anchor.shape[1]
+
+    def by_anchors(self, by_gaps: Array, equations: Constraints, a: Array) -> Array:
+        """Derivative by the anchors ``(n, k)`` (collective).
+
+        Args:
+            by_gaps: derivative by the gaps of the pair's ``equations (m,)``.
+            equations: of the pair.
+            a: of the adjoint problem, at the owned nodes ``(n_owned, gdim)``.
+        """
+        pair, kinematics, n = self._pair, self._pair.kinematics, len(self._pair.nodes)
+        pulled = np.zeros((n, self._config.gdim))
+        np.add.at(pulled, equations.contactor, -by_gaps[:, None] * equations.trial.direction)
+        found = np.where(self.stuck[:, None], np.einsum("nkg,ng->nk", self._anchor, pulled), 0.0)
+        p = kinematics.projection
+        if isinstance(p, FacetProjection):
+            there = self._config.ask_owners(np.maximum(p.nodes, 0).ravel(), a).reshape(*p.nodes.shape, self._config.gdim)
+            work = np.einsum("nag,ng,naf->nf", there, pair.trial.force, np.where(p.nodes[..., None] >= 0, p.dN, 0.0))
+            found -= np.where(self.stuck[:, None], work, 0.0)
+        if self._config.gdim == 3:
+            i, (_, _, stiffness) = np.flatnonzero(self._slips), self._sliding.turning(pair.trial, kinematics)
+            handed = np.einsum("kgh,kg->kh", stiffness, self._sliding.frame.ties.relative(a)[i])
+            found[i] += np.einsum("nkg,ng->nk", self._anchor[i], handed)
+        return found
+
+    def back(self, by_anchors: Array, first: bool) -> tuple[Array, Array]:
+        """What derivatives by the anchors that the step ends with ``(n, k)`` are by places, and by the anchors it began with (collective).
+
+        ``first`` tells of the state before the first step, where all anchors are feet.
+
+        Returns:
+            By the places of the owned nodes ``(n_owned, gdim)``, and by the anchors that have not moved ``(n, k)``.
+        """
+        f, pair = self._pair.trial.friction, self._pair
+        assert f is not None
+        loose = ~f.stick | ~self._sliding.active(pair.trial) | first
+        i = np.flatnonzero(loose & by_anchors.any(axis=1))
+        p, own = pair.kinematics.nearest, np.zeros((self._config.n_owned, self._config.gdim))
+        if isinstance(p, FacetProjection):
+            t, D = foot_slopes(p, i)
+            off = np.einsum("kfg,kg->kf", t, pair.points[i] - p.foot[i])
+            free = np.abs(off) <= ON_SIDE * np.einsum("kfg,kfg->kf", t, t)
+            # past an end, or over a convex edge, a foot stays where it is, or keeps to the edge
+            if self._config.gdim == 3:
+                beyond = np.zeros(len(loose), dtype=bool)
+                beyond[i] = ~free.all(axis=1)
+                self._refuse(beyond, "edge of the target is nearest to")
+            forces = np.einsum("kf,kfi->ki", np.where(free, by_anchors[i], 0.0), D).reshape(-1, self._config.gdim)
+            nodes = np.column_stack([self._config.to_global(pair.nodes[i]), p.nodes[i]])
+            own = self._config.add_at_owners(nodes.ravel(), forces)
+        else:
+            along = np.einsum("nkg,nk->ng", self._anchor[i], by_anchors[i])
+            n = p.normal[i]
+            along = along - np.einsum("kg,kg->k", n, along)[:, None] * n
+            own[pair.nodes[i]] = along - p.height[i, None] * np.einsum("kgh,kg->kh", p.hessians(i), along)
+        return own, np.where(loose[:, None], 0.0, by_anchors)

@@ -1,0 +1,369 @@
+"""Derivatives at a state of equilibrium with contact: of functionals by one adjoint solve, of displacement and pressures by one forward.
+
+The active set is that of the state: where a contactor has neither force nor gap, J has a gradient on either side, and this is one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError, InputTypeError
+from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
+from uem_dolfinx.geometry.axisymmetry import revolved
+from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
+from uem_dolfinx.parallel import agreed, ask_together, reduced
+from uem_dolfinx.solve.checks import refuse_other_fields
+from uem_dolfinx.solve.loading import holds, set_by_load
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.united.system import BodySystem
+
+#: Fields of contacts, by the words in their names.
+RESULTS = ("active", "force", "gap", "pressure", "slip", "status", "traction")
+#: In words, what a functional may be differentiated by.
+A_CONTROL = "a Constant, a Function, ufl.SpatialCoordinate(mesh) or a ContactParameter"
+AnyControl: TypeAlias = Control | ContactParameter
+
+
+def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl] | AnyControl) -> list[Array | fem.Function]:
+    """Derivatives of a functional at the present equilibrium by parameters of the problem, by one adjoint solve (collective).
+
+    Exact for the discrete problem: the contact conditions are eliminated, not smoothed. With mortar on facets of hexahedra that warp
+    (by the shape: refused), and on curved rigid surfaces, it is as exact as Newton's tangent. The state is left as it is.
+
+    Args:
+        problem: in statics, without friction, heat through contacts and laws with history; its last step is the state.
+        J: functional of ``problem.u``, of the ``pressure`` of the problem's contacts and of the controls, a UFL form without test
+            functions. Among other fields ``problem.u`` is the mixed Function, and J holds parts of ``ufl.split(problem.u)``. The force
+            with which Dirichlet conditions hold a part, or that contacts exert on one, is a functional of ``problem.u``:
+            ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
+        controls: Constants and Functions that F, J or the values of Dirichlet conditions are made of: moduli, loads, fields of moduli,
+            prescribed displacements. A Function is taken by its degrees of freedom; ``ufl.SpatialCoordinate(mesh)`` stands for the places
+            of the nodes: the shape; a ``ContactParameter`` is the offset of a contact, or the place or the turn of its rigid target.
+
+    Returns:
+        For every control, in their order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter, a
+        Function of the control's space, or for the shape one of the displacement's space.
+
+    Raises:
+        InputError, InputTypeError: for a problem whose gradient needs the history of all steps, one without a step, one without the
+            consistent tangent, one whose parameters have changed since the last step, or what is no functional or no control of this
+            problem; for a J of the pressures of contactors in concave corners of the target, or of those whose equations conflict.
+        LinearSolveError: if the united matrix is singular.
+    """
+    check_problem(problem, recorded=False)
+    some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
+    with agreed(problem.comm):
+        given.kind("J", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral")
+        check_functional("J", J, problem.config.mesh)
+        check_parts("J", J, problem.u)
+    pressing = _check_results(problem, J)
+    refuse_without_state(problem, [J], [problem.u, *(contact.pressure for contact in pressing)])
+    refuse_idle_controls(problem, "controls", some, [J])
+    from uem_dolfinx.gradients.adjoint import Adjoint, Linearised
+
+    with Linearised(problem) as linearised:
+        adjoint = Adjoint(linearised, revolved(J), pressing)
+        return [adjoint.by(m) for m in some]
+
+
+def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]], of: fem.Function | None = None) -> fem.Function:
+    """How the displacement, or a contact pressure, changes with parameters of the problem, by one solve (collective).
+
+    With other fields the result contains all of them, as one Function of the mixed space.
+
+    Args:
+        problem: as of :func:`gradient`.
+        direction: pairs of a control, as of :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
+            shape, for a Function one of its space, for the places of the nodes one of the displacement's space.
+        of: the ``pressure`` of a contact of the problem; None for the displacement.
+
+    Returns:
+        The derivative along the direction.
+
+    Raises:
+        InputError, InputTypeError, LinearSolveError: see :func:`gradient`.
+    """
+    check_problem(problem, recorded=False)
+    pairs, contact = check_controls(problem, "direction", direction), None
+    refuse_idle_controls(problem, "direction", [control for control, _ in pairs])
+    if of is not None:
+        pressures = [contact.pressure for contact in problem.contacts]
+        with agreed(problem.comm):
+            which = [k for k, pressure in enumerate(pressures) if pressure is of]
+            given.kind("of", of, bool(which), "the pressure of a contact of the problem, or None for the displacement")
+        contact = problem.contacts[which[0]]
+    from uem_dolfinx.gradients.adjoint import Linearised
+
+    with Linearised(problem) as linearised:
+        motion = linearised.moved(pairs)
+        return motion.du if contact is None else linearised.pressed(contact, motion)
+
+
+def taylor_test(
+    functional: Callable[[float], float], slope: float, size: float = 1e-2, halvings: int = 4, comm: MPI.Comm = MPI.COMM_WORLD
+) -> float:
+    """Order with which ``|J(h) - J(0) - h slope|`` vanishes with h: 2 if ``slope`` is the derivative of J, else 1 (collective).
+
+    Args:
+        functional: J(h), as of controls that have been changed by h in one direction and a problem that was solved anew with them.
+        slope: the derivative of J by h at 0, as from :func:`gradient`.
+        size: the first h, a positive number.
+        halvings: how often it is halved.
+        comm: communicator of the ranks that call this: an error on one of them is raised on all.
+
+    Returns:
+        The least order of all halvings.
+
+    Raises:
+        InputTypeError: if J is no number.
+        InputError: if ``size`` is not positive, or J or the slope is not finite, or nothing is left of J at some h, which has no order.
+        UserFunctionError: if the functional raises an error.
+    """
+    given.kind("functional", functional, callable(functional), "a function of h that returns a number")
+    slope, size = (
+        given.number("slope", slope, given.Range("a number", lambda x: True)),
+        given.number("size", size, given.POSITIVE),
+    )
+    halvings = given.count("halvings", halvings)
+
+    def J(h: float) -> float:
+        """Its value, a number on all ranks."""
+        value = ask_together(comm, f"functional({h:g})", functional, h)
+        with agreed(comm):
+            return given.number(f"functional({h:g})", value, given.Range("a number", lambda x: True))
+
+    first = J(0.0)
+    left = np.array([abs(J(size / 2**k) - first - size / 2**k * slope) for k in range(halvings + 1)])
+    with agreed(comm):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            order = float(np.log2(left[:-1] / left[1:]).min())
+        if not np.isfinite(left).all() or np.isnan(order):
+            raise InputError(
+                f"taylor_test: |J(h) - J(0) - h slope| = {left} for h from {size} on has no order: expected a finite J and slope, and a J "
+                "that is not linear in h"
+            )
+    return order
+
+
+def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
+    """Refuse problems whose equations do not tell derivatives, and those of all steps unless they are ``recorded`` (collective)."""
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    with agreed(problem.comm):
+        if recorded or not problem.config.moves:
+            refuse_other_fields(
+                problem.config, "gradients of histories" if recorded else "gradients", "take differences of two solutions"
+            )
+        if problem.bodies.dead is not None:
+            raise InputError("forces that a step has not released yet depend on all steps, whose derivatives are not known")
+        for present, what in (
+            (problem.dynamics is not None, "a problem in time"),
+            (bool(problem.materials), "a law with history"),
+            (any(pair.frictional for pair in problem.pairs), "a contact with friction"),
+        ):
+            if present and not recorded:
+                raise InputError(
+                    f"the gradient of {what} depends on all steps, of which only the last is known: take the steps within "
+                    "uem.recording(problem), and use its history"
+                )
+        if not recorded:
+            refuse_kept_projections(problem, problem.progress.steps)
+        if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
+            raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
+        if any(contact.heats for contact in problem.contacts):
+            raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
+        if chords := [contact.name for contact in problem.contacts if contact.chords]:
+            raise InputError(
+                f"contact '{chords[0]}': there is no gradient with chords=True, whose rows are not the derivative of the gaps: expected "
+                "chords=False"
+            )
+        if any(contact.tied for contact in problem.contacts):
+            raise InputError(
+                "gradients do not support ties, which depend on the tied surfaces: expected contacts that are not tied"
+            )
+        if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
+            raise InputError(
+                "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
+            )
+        if problem.linear is not None or problem.bodies.points is not None:
+            raise InputError("gradients do not support equations, forces and springs of nodes: expected a problem without them")
+    from uem_dolfinx.solve.steps.parted import part_contacts
+
+    # derivatives are known of each contact
+    part_contacts(problem)
+
+
+def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:
+    """Refuse contacts that were projected where a step before the last ended, of which there is no derivative."""
+    for contact in problem.contacts:
+        if steps > 1 and contact.sliding == "small":
+            raise InputError(
+                f"contact '{contact.name}': after {steps} steps, contactors of sliding='small' are projected where an earlier step ended, "
+                "of which there is no derivative: expected one step, or sliding='finite' or 'fixed'"
+            )
+
+
+def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
+    """Refuse problems without a step, and what are not controls or pairs with their changes (collective)."""
+    with agreed(problem.comm):
+        if not problem.progress.steps:
+            raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
+        if what == "controls":
+            controls = found = given.items(what, handed, lambda one: isinstance(one, AnyControl), A_CONTROL)
+        else:
+            found = given.items(what, handed, _is_pair, f"a pair of {A_CONTROL} and its change")
+            controls = [control for control, _ in found]
+        for i, control in enumerate(controls):
+            if control is problem.u:
+                raise InputError(f"{what}[{i}] holds the displacement, which the problem solves for: expected what it is made of")
+            if isinstance(control, fem.Function) and _is_result(control):
+                raise InputError(
+                    f"{what}[{i}] holds '{control.name}', a result of a contact: expected what the problem is made of"
+                )
+            if isinstance(control, Control):
+                check_expression(f"{what}[{i}]", control, problem.config.mesh.ufl_domain(), "the displacement's mesh")
+            if isinstance(control, ufl.SpatialCoordinate):
+                _check_shape(problem)
+            if isinstance(control, ContactParameter):
+                _check_parameter(problem, f"{what}[{i}]", control)
+        for i, (control, change) in enumerate(found if what == "direction" else ()):
+            _check_change(problem, f"the change in {what}[{i}]", control, change)
+        return found
+
+
+def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
+    """The contacts whose pressures J holds; refuse other results of contacts, and those of other problems (collective)."""
+    results = [f for f in J.coefficients() if _is_result(f)]
+    pressures = [contact.pressure for contact in problem.contacts] if results else []
+    copies = problem.config.functions().values() if problem.config.unknowns.mixed else []
+    with agreed(problem.comm):
+        for f in J.coefficients():
+            if any(f is copy for copy in copies):
+                raise InputError(
+                    f"J holds '{f.name}', a copy of a part of the unknowns u: expected ufl.split(u), which J depends on"
+                )
+        for f in results:
+            if all(f is not pressure for pressure in pressures):
+                raise InputError(
+                    f"J holds '{f.name}', a result of a contact: expected none but the pressures of contacts of this problem; of the gap "
+                    "and of forces take what they are made of, the displacement and the residual"
+                )
+    return [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
+
+
+def refuse_without_state(problem: UnitedProblem, functionals: Sequence[ufl.Form], state: Sequence[fem.Function]) -> None:
+    """Refuse functionals none of which holds what the problem solves for (collective)."""
+    with agreed(problem.comm):
+        if not any(f is one for J in functionals for f in J.coefficients() for one in state):
+            raise InputError(
+                "J holds nothing that the problem solves for: expected problem.u, or pressures of its contacts; a displacement of another "
+                "problem is a field of given numbers here"
+            )
+
+
+def refuse_idle_controls(
+    problem: UnitedProblem, what: str, controls: Sequence[Any], functionals: Sequence[ufl.Form] = ()
+) -> None:
+    """Refuse Constants and Functions that neither the problem nor a functional is made of (collective)."""
+    forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials]
+    n, bcs = len(problem.u.x.array), problem.bodies.bcs
+    for i, m in enumerate(controls):
+        if not isinstance(m, (fem.Constant, fem.Function)):
+            continue
+        held = any(m is one for form in forms for one in (*form.constants(), *form.coefficients()))
+        held = held or holds(beside, m) or bool(set_by_load({m: 0.0}, bcs, n).any())
+        with agreed(problem.comm):
+            if not reduced(problem.comm, held, op=MPI.LOR):
+                raise InputError(
+                    f"{what}[{i}], {given.described(m)}, is in no form, Dirichlet condition or law of the problem, nor in J: expected "
+                    "what these are made of, by which there are derivatives"
+                )
+
+
+def refuse_results(J: ufl.Form) -> None:
+    """Refuse a functional of results of contacts."""
+    for f in J.coefficients():
+        if _is_result(f):
+            raise InputError(
+                f"J holds '{f.name}', a result of a contact: functionals of histories hold the displacement; of forces take the residual"
+            )
+
+
+def _is_result(f: fem.Function) -> bool:
+    return any(f.name.startswith(f"contact_{what}_") for what in RESULTS)
+
+
+def _is_pair(one: Any) -> bool:
+    return isinstance(one, (tuple, list)) and len(one) == 2 and isinstance(one[0], AnyControl)
+
+
+def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> None:
+    """Refuse parameters that the problem's equations do not depend on as they stand."""
+    known = any(contact is m.contact for contact in problem.contacts)
+    given.kind(what, m, known, "a parameter of a contact of the problem")
+    if m.parameter == "friction" and not m.contact.pair.frictional:
+        raise InputError(
+            f"{what} is the friction of contact '{m.contact.name}', which has none: expected a contact with friction"
+        )
+    if m.parameter == "offset" and not keeps_distance(m.contact):
+        raise InputError(f"{what} is the offset from a rigid surface: expected a plane, a sphere or a cylinder, or a mesh")
+    if m.parameter in ("place", "turn") and m.contact.adjust:
+        raise InputError(
+            f"{what} is the {m.parameter} of the target of contact '{m.contact.name}', with which gaps that are adjusted change: expected "
+            "a contact with no adjust"
+        )
+    if m.contact.sliding != "finite" and m.parameter != "offset":
+        raise InputError(
+            f"{what} is a {m.parameter}, by which contacts of sliding='{m.contact.sliding}' have no gradient: expected 'finite'"
+        )
+
+
+def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change: Any) -> None:
+    """Refuse a change that is not of the kind of its control."""
+    if not isinstance(control, (fem.Function, ufl.SpatialCoordinate)):
+        shape = np.shape(control.value) if isinstance(control, fem.Constant) else control.shape(problem.config.gdim)
+        try:
+            values = np.asarray(change, dtype=float)
+        except (TypeError, ValueError):
+            raise InputTypeError(given.sentence(what, change, f"finite numbers of shape {shape}")) from None
+        if values.shape != shape:
+            raise InputError(given.sentence(what, change, f"finite numbers of shape {shape}"))
+        if not np.isfinite(values).all():
+            raise InputError(given.sentence(what, change, "finite numbers"))
+        return
+    of, whose = problem.config.V, "the displacement's"
+    if isinstance(control, fem.Function):
+        of, whose = control.function_space, "the control's"
+    given.kind(what, change, isinstance(change, fem.Function), f"a Function of {whose} space")
+    own = change.function_space
+    if own.ufl_element() != of.ufl_element() or own.ufl_domain() != of.ufl_domain():
+        raise InputError(f"{what} is a Function of another space: expected one of {whose} space")
+
+
+def _check_shape(problem: UnitedProblem) -> None:
+    """Refuse problems whose nodes are not those that tell the shape."""
+    config = problem.config
+    if compat.geometry_dofs(config.mesh).shape[1] != compat.cell_dofs(config.V).shape[1]:
+        raise InputError("a gradient by the shape needs cells of the displacement's degree: straight ones for degree 1")
+    if any(pair.sliding != "finite" for pair in problem.pairs):
+        raise InputError(
+            "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
+        )
+    if config.gdim == 3 and config.mesh.topology.cell_name() == "hexahedron":
+        for contact in problem.contacts:
+            if contact.coupling == "mortar":
+                raise InputError(
+                    f"contact '{contact.name}': there is no gradient by the shape with coupling='mortar' on hexahedra, whose facets warp: "
+                    "expected coupling='node_to_surface', or tetrahedra"
+                )
+    if any(contact.adjust or callable(contact.offset) for contact in problem.contacts):
+        raise InputError("a gradient by the shape needs an offset that is a number, and no adjust: others change with the shape")

@@ -1,0 +1,126 @@
+"""Parameters of contacts as controls of gradients, and how gaps and contact forces change with them at the same displacement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.rigid_set import turned
+from uem_dolfinx.conditions.united_rows import forces_of
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.mortar.discretisation import Mortar
+from uem_dolfinx.contact.mortar.placement import MortarKinematics
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import reduced
+
+#: Offsets that differ by this part of a facet's side leave the same terms in rows of weighted gaps, which are linear in them.
+#: [bound; side of a facet; -]
+THICKER = 1e-3
+PARAMETERS = ("friction", "offset", "place", "turn")
+
+
+@dataclass(frozen=True, eq=False)
+class ContactParameter:
+    """A parameter of a contact, as a control of gradients.
+
+    Args:
+        contact: of the problem.
+        parameter: ``"offset"``, a uniform increment of the contact's ``offset``, a length; ``"place"``, by which a rigid target
+            moves in all directions ``(gdim,)``, a length; ``"turn"``, by which it turns about its present reference point, an angle
+            in 2D, a rotation vector ``(3,)`` in 3D; ``"friction"``, a uniform increment of the coefficient of Coulomb's law, for
+            histories.
+
+    Raises:
+        InputError, InputTypeError: for an argument that is no contact, an unknown word, or a target that is not rigid.
+    """
+
+    contact: Contact
+    parameter: str
+
+    def __post_init__(self) -> None:
+        given.kind("contact", self.contact, isinstance(self.contact, Contact), "a Contact")
+        given.word("parameter", self.parameter, PARAMETERS)
+        if self.parameter in ("place", "turn") and not hasattr(self.contact.target, "project"):
+            raise InputError(
+                f"contact '{self.contact.name}': parameter = '{self.parameter}' is one of rigid targets: move nodes instead"
+            )
+
+    def shape(self, gdim: int) -> tuple[int, ...]:
+        """Of its derivative."""
+        return {"place": (gdim,), "turn": () if gdim == 2 else (3,)}.get(self.parameter, ())
+
+
+def keeps_distance(contact: Contact) -> bool:
+    """Whether the gaps of a contact are distances from its target wherever contactors are: those of any mesh are."""
+    return not hasattr(contact.target, "project") or getattr(contact.target, "measures", False)
+
+
+def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:
+    """How points ``x (n, gdim)`` of a rigid target move with an entry of its place or turn ``(n, gdim)``."""
+    if m.parameter == "place":
+        return np.tile(np.eye(x.shape[1])[entry[0]], (len(x), 1))
+    target = m.contact.pair.target
+    return turned_by(entry, x - target.reference(x.shape[1]))
+
+
+def turned_by(entry: tuple[int, ...], v: Array) -> Array:
+    """How vectors ``(n, gdim)`` change with an angle of turn."""
+    return turned(np.eye(3)[entry[0]] if entry else np.ones(1), v)
+
+
+def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
+    """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` with the offset, in which both are linear (collective)."""
+    d, kinematics = pair.discretisation, pair.kinematics
+    more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
+    before, length = d.offset, _lengths(pair)
+    try:
+        gap, forces = _gaps_and_forces(pair, multipliers, length)
+        d.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
+        pair.project()
+        other_gap, other_forces = _gaps_and_forces(pair, multipliers, length)
+    finally:
+        d.set_offset(before)
+        pair.kinematics = kinematics
+    return (other_gap - gap) / more, (forces - other_forces) / more
+
+
+def _least_side(pair: Interface) -> float:
+    """Of a contactor's facet here, a length; the model's size where rows do not depend on the offset."""
+    if not isinstance(pair.discretisation, Mortar):
+        return pair.config.size
+    x = pair.discretisation.surface.x
+    return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).min(initial=pair.config.size))
+
+
+def _lengths(pair: Interface) -> Array:
+    """What equations across the target were divided by ``(n,)``."""
+    return pair.kinematics.rows.length if isinstance(pair.kinematics, MortarKinematics) else np.ones(len(pair.nodes))
+
+
+def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tuple[Array, Array]:
+    """Gaps of equations ``(m,)`` and contact forces at the owned nodes, as if they were divided by another ``length (n,)`` (collective)."""
+    if isinstance(pair.discretisation, Mortar) and isinstance(pair.kinematics, MortarKinematics):
+        pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
+    own, config = pair.equations(), pair.config
+    longer = (_lengths(pair) / length)[own.contactor]
+    return own.trial.gap * longer, forces_of(config, own.test, multipliers * longer)
+
+
+def rubbed(pair: Interface) -> Array:
+    """Change of the residual with the coefficient of friction ``(n_owned, gdim)`` (collective)."""
+    sliding = pair.friction
+    assert sliding is not None
+    if reduced(pair.config.comm, bool((sliding.value == 0.0).any()), op=MPI.LOR):
+        raise InputError(
+            f"{pair.name}: some contactors have no friction in a step, where the coefficient has a one-sided derivative: expected a "
+            "positive coefficient everywhere"
+        )
+    share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.force_per_multiplier
+    nodes, forces = sliding.frame.ties.handed_on(share[:, None] * sliding.directions(pair.trial))
+    return pair.config.add_at_owners(nodes, forces)

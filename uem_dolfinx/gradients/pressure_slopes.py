@@ -1,0 +1,111 @@
+"""How contact pressures change with contact forces, displacement and shape, at the state that a contact is in; and the transpose.
+
+A pressure is a force over an area, ``p = lam / A``. With lam, which multipliers of the equations make, and A, both by what surrounds the
+contactor,
+
+    p' = lam' / A - p A' / A + p s'
+
+where A' is the change of integrals of shape functions, and s' that of what :class:`Stretching` tells beside.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.seam.placement import NORMAL, Constraints
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import reduced
+
+
+class PressureWeights(NamedTuple):
+    """Derivative of ``sum w_i p_i``.
+
+    Attributes:
+        multipliers: by those of the pair's equations ``(m,)``.
+        areas: functional whose derivatives by displacement and shape are those through the areas; None of points, which have none.
+        now: by the places of the owned nodes ``(n_owned, gdim)``, forces and ``areas`` being the same.
+        drawn: likewise by the places where they were drawn, those where they are being the same.
+    """
+
+    multipliers: Array
+    areas: ufl.Form | None
+    now: Array
+    drawn: Array
+
+
+class PressureSlopes:
+    """Derivatives of the pressures of a contact without friction (collective).
+
+    Args:
+        contact: of a problem.
+        equations: of its pair, in the present state.
+
+    Raises:
+        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn; likewise at sharp
+            edges of contactors, without mortar.
+    """
+
+    def __init__(self, contact: Contact, equations: Constraints):
+        self.contact, self._pair, self._equations = contact, contact.pair, equations
+        self._config, self._current = contact.config, contact.measure == "current"
+        held = self._pair.trial.active & self._pair.trial.in_corner
+        if reduced(self._config.comm, int(held.sum())):
+            raise InputError(
+                f"contact '{contact.name}': a concave corner of the target holds contactors, whose pressures have no derivatives here; "
+                "take forces: the residual with a Function in place of its test function"
+            )
+        sharp = contact.coupling != "mortar" and self._pair.trial.active & contact.surface.at_sharp_edges(contact.nodes)
+        if reduced(self._config.comm, int(np.sum(sharp))):
+            raise InputError(
+                f"contact '{contact.name}': nodes at sharp edges of the contactor touch, and their areas towards the target have no "
+                "derivatives here: leave the facets beside the edge out of the contactor, or take forces"
+            )
+        areas, self._pressures = contact.measured_areas(), contact.pressures
+        self._over = np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)
+        self._stretching = self._pair.kinematics.stretching(self._current)
+
+    def back(self, weights: Array) -> PressureWeights:
+        """The derivative of ``sum w_i p_i`` for weights of this rank's contactors ``(n,)`` (collective)."""
+        config, nodes, kinematics = self._config, self._pair.nodes, self._pair.kinematics
+        own, eq = kinematics.forces_back(self._pair.trial, weights * self._over), self._equations
+        now, drawn = np.zeros((2, config.n_owned, config.gdim))
+        if self._stretching is not None:
+            now, drawn = self._stretching.back(weights * self._pressures)
+        by_areas = kinematics.areas_back(-weights * self._pressures * self._over)
+        areas = None
+        if self.contact.contactor.dim > 0:
+            q = fem.Function(compat.function_space(config.mesh, config.degree))
+            q.x.array[nodes] = by_areas
+            q.x.scatter_forward()
+            areas = self.contact.surface.integral(q, self._current)
+        return PressureWeights(np.where(eq.kind == NORMAL, own[eq.contactor], 0.0), areas, now, drawn)
+
+    def along(self, multipliers: Array, du: fem.Function, shape: fem.Function) -> Array:
+        """Changes of the pressures of this rank's contactors ``(n,)`` (collective).
+
+        Args:
+            multipliers: changes of those of the pair's equations ``(m,)``.
+            du: change of the displacement, and of all other fields.
+            shape: of the places of the nodes where they were drawn, in the displacement's space.
+        """
+        config, nodes, kinematics, p = self._config, self._pair.nodes, self._pair.kinematics, self._pressures
+        lam, areas = self._pair.forces(self._equations, multipliers).lam, np.zeros(len(nodes))
+        if self.contact.contactor.dim > 0:
+            V = compat.function_space(config.mesh, config.degree)
+            area = self.contact.surface.integral(ufl.TestFunction(V), self._current)
+            along_u = forms.expanded(ufl.derivative(area, config.whole, du))
+            for form in (along_u, forms.by_places(area, config.mesh, shape)):
+                if form is not None:
+                    areas += forms.assemble_array(V, forms.form(form))[nodes]
+        slopes = self._over * (lam - p * kinematics.areas_along(areas))
+        if self._stretching is not None:
+            drawn = shape.x.array.reshape(-1, config.gdim)
+            slopes += p * self._stretching.along(config.of(du.x.array) + drawn, drawn)
+        return slopes

@@ -1,0 +1,300 @@
+"""A sweep over recorded steps, from the last to the first: each linearised where it ended, with one adjoint problem.
+
+With displacements u_n, memories h_n that a step leaves behind, and a residual R of a step that began with h_{n-1},
+
+    R(u_n, h_{n-1}; m) = 0,        h_n = H(u_n, h_{n-1})
+
+derivatives are handed back,
+
+    d_n = dJ/du_n + (dH/du_n)' b_n,        b_{n-1} = (dH/dh_{n-1})' b_n + dJ/dh_{n-1} through a_n
+
+where a_n is of the adjoint problem with the load d_n, as in ``adjoint``. Memories are anchors of contactors with friction, velocities and
+accelerations, and the histories of laws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.entries import is_symmetric
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.first_acceleration import united_accelerations
+from uem_dolfinx.dynamics.rate_slopes import RateSlopes
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.gradients.adjoint import Adjoint, Linearised
+from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
+from uem_dolfinx.gradients.derivatives import Derivatives, transposed
+from uem_dolfinx.gradients.gradient import AnyControl
+from uem_dolfinx.gradients.parameters import ContactParameter, motion_of
+from uem_dolfinx.gradients.records import Record
+from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, slip_terms, together
+from uem_dolfinx.solve.memory import Memory
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.united.system import BodySystem
+
+
+class Sweep:
+    """Adds up derivatives by controls over steps, which are handed to it from the last to the first.
+
+    Args:
+        problem: of the steps.
+        controls: what there are derivatives by.
+
+    Attributes:
+        found: derivatives by the controls so far; None before the first step.
+    """
+
+    def __init__(self, problem: UnitedProblem, controls: Sequence[AnyControl]):
+        self.problem, self._controls = problem, controls
+        self.found: list[Any] = [None] * len(controls)
+        self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
+        self._by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
+        self._rates = None if problem.dynamics is None else RateSlopes(problem.dynamics)
+        laws: list[Any] = problem.materials
+        self._laws = [law.slopes(self._derivatives.a, self._derivatives.test) for law in laws]
+
+    def pass_back(self, record: Record, J: ufl.Form | None) -> None:
+        """Go back over a step, at whose end the problem has been placed, with a functional of that end (collective)."""
+        step = LinearisedStep(self.problem, record, self._derivatives, self._rates)
+        with step:
+            handed, self._by_anchors = step.handed_back(self._by_anchors)
+            load = handed.ravel()
+            if self._rates is not None:
+                self._begin_rates(self._rates, J)
+                load = load + self._rates.load()
+            for law in self._laws:
+                law.begin(None if J is None else self._derivatives.by_values(J, law.stress))
+                load = load + law.load()
+            adjoint = Adjoint(step, J, (), load)
+            for k, m in enumerate(self._controls):
+                self._add(k, adjoint.by(m))
+                if isinstance(m, ContactParameter):
+                    self._add(k, _left_behind(self.problem, m, handed))
+            self._by_anchors = step.by_anchors(adjoint, self._by_anchors)
+            if self._rates is not None:
+                a = adjoint.a.x.array[: load.size]
+                self._add_density(self._rates.by_density, a)
+                self._rates.pass_back(a, step.damped)
+            for law in self._laws:
+                self._pass_back_law(law, adjoint)
+
+    def _pass_back_law(self, law: PlasticSlopes, adjoint: Adjoint) -> None:
+        """Take derivatives by the history that a law began the step with, and by its parameters (collective)."""
+        by, by_bulk = law.pass_back(), None
+        for k, m in enumerate(self._controls):
+            if isinstance(m, fem.Constant | fem.Function) and law.is_made_of(m):
+                by_bulk = by_bulk or self._derivatives.by_function(adjoint.terms, law.bulk)
+                self._add(k, law.by_parameter(m, by, by_bulk))
+
+    def _begin_rates(self, rates: RateSlopes, J: ufl.Form | None) -> None:
+        """Take the slopes of the step, and the velocity and acceleration of its end, with what a functional makes of them (collective)."""
+        dynamics = self.problem.dynamics
+        assert dynamics is not None
+        rates.begin()
+        for f, values in zip((dynamics.velocity, dynamics.acceleration), dynamics.rates()):
+            f.x.array[: len(values)] = values
+            f.x.scatter_forward()
+        if J is not None:
+            by = [self._derivatives.by_values(J, f) for f in (dynamics.velocity, dynamics.acceleration)]
+            rates.look_at(*(0.0 * values if one is None else one for one in by))
+
+    def _add_density(self, by: Callable[[Array], float], a: Array) -> None:
+        """Add to the derivative by the density what a tells by its logarithm (collective)."""
+        dynamics = self.problem.dynamics
+        for k, m in enumerate(self._controls):
+            if isinstance(m, fem.Constant) and dynamics is not None and m is dynamics.mass.density:
+                self._add(k, np.asarray(by(a) / m.value))
+
+    def _add(self, k: int, more: Array | fem.Function) -> None:
+        """Add to the derivative by a control."""
+        if self.found[k] is None:
+            self.found[k] = more
+        elif isinstance(more, fem.Function):
+            self.found[k].x.array[:] += more.x.array
+        else:
+            self.found[k] = self.found[k] + more
+
+    def begin(self, first: Record) -> None:
+        """Add derivatives by the anchors that the first step began with, the positions of contactors before it (collective)."""
+        problem = self.problem
+        if not any(pair.frictional for pair in problem.pairs):
+            return
+        Memory.put_back(first.before, problem)
+        handed, _ = _back(problem, self._by_anchors)
+        for k, m in enumerate(self._controls):
+            if isinstance(m, ContactParameter):
+                self._add(k, _left_behind(problem, m, handed))
+            elif isinstance(m, ufl.SpatialCoordinate):
+                self.found[k].x.array[: handed.size] += handed.ravel()
+                self.found[k].x.scatter_forward()
+
+    def accelerate(self, start: Record) -> None:
+        """Add derivatives by the first acceleration and velocity, where the problem has been placed (collective).
+
+        With ``a = -P (P'MP)^-1 P'F`` under the forces F at the start, functionals that count it by b do so by ``P (P'MP)^-1 P'b`` times -F.
+        """
+        problem, dynamics, system = self.problem, self.problem.dynamics, self.problem.system
+        if dynamics is None or self._rates is None:
+            return
+        assert isinstance(system, BodySystem)
+        system.place()
+        system.floating.begin_motion()
+        self._refuse_turns()
+        b = problem.config.vector(self._rates.by_acceleration())
+        a = united_accelerations(dynamics.matrix, system.restriction(), b)
+        by_velocity = self._rates.by.v + self._rates.by.w - damped_by(problem, self._derivatives, a)
+        terms = [(self._derivatives.work, -1.0)]
+        for k, m in enumerate(self._controls):
+            if isinstance(m, fem.Constant):
+                self._add(k, start.shares.get(id(m), 1.0) * self._derivatives.by_constant(terms, m))
+            elif isinstance(m, fem.Function):
+                more = self._derivatives.by_function(terms, m)
+                if m is dynamics.start_velocity:
+                    more.x.array[: len(by_velocity)] += by_velocity
+                    more.x.scatter_forward()
+                self._add(k, more)
+        self._add_density(self._rates.by_density_at_start, a.array_r[: by_velocity.size])
+
+    def _refuse_turns(self) -> None:
+        """Refuse rigid targets as controls where contactors that touch at the start tell accelerations (collective)."""
+        for m in self._controls:
+            moves = isinstance(m, ContactParameter) and m.parameter in ("place", "turn")
+            if moves and reduced(self.problem.comm, int(m.contact.pair.trial.active.sum())):
+                raise InputError(
+                    f"contact '{m.contact.name}' touches at the start, where the first acceleration has no derivative by its "
+                    f"{m.parameter}: expected a motion that begins before it touches"
+                )
+
+
+class LinearisedStep(Linearised):
+    """The united problem linearised at the end of a recorded step, where it has been placed (collective).
+
+    Args:
+        problem: as the step left it before it was committed.
+        record: of the step.
+        derivatives: of its residual and of functionals.
+        rates: slopes of the step in time; None in statics.
+    """
+
+    def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
+        super().__init__(problem, derivatives, record.held)
+        self._led, self._rates = record.shares, rates
+        self._slopes: list[AnchorSlopes | None] = []
+        #: Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping.
+        self.damped: Array | float = 0.0
+
+    def share(self, m: Any) -> float:
+        """How much of a change of a control the step has seen."""
+        return self._led.get(id(m), 1.0)
+
+    def _linearise(self) -> None:
+        problem = self.problem
+        state, pairs = self._state(), problem.pairs
+        self._slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(pairs, problem.contacts)]
+        if state.rows.independent is not None and state.rows.independent.found and any(self._slopes):
+            raise InputError(
+                "equations of contactors with friction conflict with each other or with Dirichlet conditions, and have been replaced by "
+                "others, through which histories have no derivatives; let nodes be contactors of one contact, with free normals"
+            )
+        forms.free_petsc_garbage(problem.comm)
+        self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of(range(len(pairs)))
+        K = self.K
+        back = transposed(K) if not is_symmetric(K, self.config.unknowns) else K
+        self._K_back, self._G_back = back, None if self.G is None else transposed(self.G)
+        problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
+        self._tell_idle()
+
+    def __exit__(self, *error: object) -> None:
+        solver = self.problem.solver
+        if solver.iterative or not solver.lasting or any(self._slopes):
+            self.problem.system.forget()
+
+    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
+        """As that of ``Linearised``, with all that friction adds (collective)."""
+        pairs, slopes = [self.problem.pairs[k] for k in which], [self._slopes[k] for k in which]
+        states, like = [pair.trial for pair in pairs], self.config.unknowns.vector()
+        for pair, own in zip(pairs, slopes):
+            pair.trial = pair.trial if own is None else own.without_stuck()
+        try:
+            curvature = curvature_of(pairs, like, any(self._slopes), False)
+        finally:
+            for pair, state in zip(pairs, states):
+                pair.trial = state
+        if self.config.gdim == 2 or not any(slopes):
+            return curvature
+        turned, _ = slip_terms(pairs, like)
+        leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
+        return together(together(curvature, turned), leaning)
+
+    def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
+        """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
+        mu, _ = self.problem.solver.solve(self.P.transpose(forces))
+        return self.Q.expand(self.problem.solver.complete(mu))
+
+    def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G)' a`` (collective)."""
+        found = forms.product(self._K_back, a, self._G_back)
+        if self._rates is not None:
+            self.damped = damped_by(self.problem, self.derivatives, a)
+            found.array[:] += self._rates.beyond_tangent(np.array(a.array_r), self.damped)
+        return found
+
+    def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
+        """``K' a`` (collective)."""
+        return forms.product(self._K_back, a)
+
+    def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
+        """Derivatives by anchors at the step's end as those by its places, and by the anchors that stay (collective)."""
+        return _back(self.problem, by_anchors, self._slopes)
+
+    def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
+        """Derivatives by the anchors that the step began with, those of anchors that stay among them (collective)."""
+        n, g = self.config.n_owned, self.config.gdim
+        a, first, found = adjoint.a.x.array[: n * g].reshape(n, g), 0, []
+        for slopes, own, before in zip(self._slopes, self.rows.equations, kept):
+            part = adjoint.by_gaps[first : first + len(own)]
+            first += len(own)
+            found.append(before if slopes is None else slopes.by_anchors(part, own, a) + before)
+        return found
+
+
+def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) -> Array | float:
+    """Derivative of the work of damping along ``a``, which ``derivatives`` take, by the velocity ``(n,)``; 0 without (collective)."""
+    derivatives.along(problem.config.from_rows(a.array_r))
+    if problem.dynamics is None or problem.dynamics.damping is None:
+        return 0.0
+    found = derivatives.by_values(derivatives.work, problem.dynamics.past)
+    return 0.0 if found is None else found
+
+
+def _back(
+    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None] | None = None
+) -> tuple[Array, list[Array]]:
+    """Derivatives by anchors as those by places of the owned nodes ``(n_owned, gdim)``, and by the anchors that stay (collective)."""
+    first = slopes is None
+    if slopes is None:
+        slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
+    handed, left = np.zeros((problem.config.n_owned, problem.config.gdim)), []
+    for own, at, pair in zip(by_anchors, slopes, problem.pairs):
+        if at is not None:
+            places, own = at.back(own if own.size else np.zeros((len(pair.nodes), at.size)), first)
+            handed += places
+        left.append(own)
+    return handed, left
+
+
+def _left_behind(problem: UnitedProblem, m: ContactParameter, handed: Array) -> Array:
+    """What derivatives by places of contactors are by a motion of their target, which leaves these behind (collective)."""
+    found = np.zeros(m.shape(problem.config.gdim))
+    for entry in np.ndindex(found.shape) if m.parameter in ("place", "turn") else ():
+        found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
+    return np.asarray(reduced(problem.comm, found))

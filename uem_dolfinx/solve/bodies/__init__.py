@@ -1,0 +1,1 @@
+"""The bodies without contact: residual, tangent, norms."""

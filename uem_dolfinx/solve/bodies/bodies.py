@@ -1,0 +1,399 @@
+"""What the bodies do without contact: forces and tangent of the UFL residual, Dirichlet conditions, materials with history, inertia."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.algebra.options import check_fields
+from uem_dolfinx.arrays import AnyArray, Array, Bools
+from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.errors import InputError, NotFiniteError
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.materials.elastic import HistoryMaterial
+from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.bodies.tangent import Inversions, Tangent
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import AtPoints
+
+#: Multiple of the rounding of K u that the residual may be left with.
+#: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]
+FORCE_ROUNDING = 4.0 * np.finfo(float).eps
+#: A force is told from rounding where it is larger by this factor.
+#: [convention; rounding of K u; test_bodies.py::test_forces_told_from_rounding]
+ABOVE_ROUNDING = 100.0
+#: Dirichlet values are met if they are to this part of the largest.
+#: [derived; the largest prescribed value; test_bodies.py::test_dirichlet_values_are_met]
+VALUE_ROUNDING = 4.0 * np.finfo(float).eps
+
+
+class Bodies:
+    """Bodies in statics and dynamics, before contact.
+
+    Args:
+        config: configuration of the displacement.
+        F: UFL residual, damping included.
+        bcs: Dirichlet conditions.
+        materials: with history, whose stresses are brought up to date before the residual is assembled.
+        dynamics: inertia, or None in statics.
+        points: loads and springs at nodes, or None.
+        check_inversion: whether to look for cells turned inside out; None does so unless K is constant.
+
+    Attributes:
+        unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
+        held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
+        free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
+        free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
+        dead: forces at all unknowns that keep their direction, as of what a step releases, ghosts included ``(n,)``; None for none.
+        wanted: values that the Dirichlet conditions ask for, at their unknowns, ghosts included ``(n,)``.
+        tangent: K.
+        points: loads and springs at nodes, or None.
+        stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, by which forces are told from rounding; None until known.
+    """
+
+    def __init__(
+        self,
+        config: Configuration,
+        F: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        *,
+        materials: Sequence[HistoryMaterial] = (),
+        dynamics: Dynamics | None = None,
+        points: AtPoints | None = None,
+        check_inversion: bool | None = None,
+    ):
+        self.config, self.comm, self.u = config, config.comm, config.whole
+        self.unknowns = config.unknowns
+        self.materials, self.dynamics, self.points = list(materials), dynamics, points
+        #: The residual in UFL.
+        self.F = F
+        self.tangent = Tangent(F, config, self.materials, dynamics, points)
+        with compiling("the residual"):
+            self._F = forms.form(F)
+        self._b = compat.create_vector(self.u.function_space)
+        self._u = compat.petsc_vector(self.u)
+        self._n_owned = len(self._b.array_r)
+        self.hold(bcs)
+        self.dead: Array | None = None
+        if dynamics is not None:
+            dynamics.hold(~self.free[: config.n_owned])
+        self.wanted: Array = np.array(self.u.x.array)
+        self.stiffness: Array | None = None
+        #: The same as the last step left it, with which the next begins.
+        self.stiffness_at_start: Array | None = None
+        #: State of the values of K that it is of.
+        self._stiffness_of = -1
+        check = not self.tangent.linear if check_inversion is None else check_inversion
+        self._inversions = Inversions(config) if check and config.moves else None
+        self._fields: Any = None
+        if self.unknowns.mixed:
+            from uem_dolfinx.solve.bodies.field_scales import FieldScales
+
+            #: Sizes of the terms in the equations of other fields; None without any.
+            self._fields = FieldScales(self.unknowns, self.tangent)
+
+    def begin_step(self) -> None:
+        """Measure other fields by K of the state that the step begins with, as a run that goes on from a checkpoint does (collective)."""
+        if self._fields is not None:
+            self.tangent.update()
+
+    # -- forces --------------------------------------------------------------------------------------------------------
+
+    def assemble(self) -> bool:
+        """Residual ``F(u)`` at the present displacement: whether it is finite on all ranks (collective)."""
+        try:
+            for material in self.materials:
+                material.update()
+        except NotFiniteError:
+            return False
+        if self.dynamics is not None:
+            self.dynamics.update_rates()
+        with timed("assemble residual"):
+            forms.assemble_vector(self._b, self._F)
+            if self.points is not None:
+                self.points.add_forces(self._b.array)
+            if self.dead is not None:
+                self._b.array[:] -= self.dead[: self._n_owned]
+            if self.dynamics is not None:
+                self.config.add_to(self._b.array, self.dynamics.load().array_r)
+        return bool(np.isfinite(self._b.norm()))
+
+    @property
+    def residual(self) -> PETSc.Vec:
+        """Owned part of the assembled residual, internal minus external forces."""
+        return self.unknowns.vector(self.config.rows(self._b.array_r))
+
+    @property
+    def residual_of_all(self) -> Array:
+        """Copy of the assembled residual at all owned unknowns ``(n,)``."""
+        return np.array(self._b.array_r)
+
+    @property
+    def forces(self) -> Array:
+        """The assembled residual at the owned nodes of the displacement ``(n_owned, gdim)``."""
+        return np.asarray(self.config.rows(self._b.array_r)[: self.config.n_owned])
+
+    def forces_at_work(self, F: PETSc.Vec) -> Any:
+        """What residuals are small beside: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
+        if self._fields is None:
+            return self._beside(F.norm(), [one.size() for one in self._added])
+        return self._beside(np.maximum(self.unknowns.norms(F), self._fields.terms()), [one.size() for one in self._added])
+
+    @property
+    def _added(self) -> list[Any]:
+        """Masses at points."""
+        return [] if self.dynamics is None else self.dynamics.added
+
+    def _beside(self, norm: Any, more: Sequence[float]) -> Any:
+        """A norm of forces, or one for each field ``(n_fields,)``, with others of the displacement."""
+        if not more:
+            return norm
+        size = float(np.linalg.norm(more))
+        return np.hypot(norm, size if self._fields is None else self._first(size))
+
+    @property
+    def linear(self) -> bool:
+        """Whether the forces are linear in the displacement."""
+        return self.tangent.linear and not self.materials
+
+    def update_tangent(self) -> PETSc.Mat:
+        """K at the present displacement, and its diagonal (collective)."""
+        self.tangent.update()
+        if self.stiffness is None or self._stiffness_of != self.tangent.K.stateGet():
+            self.stiffness, self._stiffness_of = self._diagonal(), self.tangent.K.stateGet()
+        return self.tangent.K
+
+    def initial_stiffness(self) -> Array:
+        """Diagonal of K at the present displacement ``(n_owned, gdim)``, which ``stiffness`` takes no notice of (collective)."""
+        self.assemble()
+        self.tangent.update()
+        return self._diagonal()
+
+    def _diagonal(self) -> Array:
+        diagonal = self.unknowns.vector()
+        self.tangent.K.getDiagonal(diagonal)
+        return np.array(diagonal.array_r).reshape(-1, self.config.block)[: self.config.n_owned]
+
+    def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
+        """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).
+
+        With other fields one for each ``(n_fields,)``, of what is in their equations.
+
+        Args:
+            positioned: owned nodes whose position counts, not their displacement alone; repeated ones count repeatedly.
+        """
+        if self.stiffness is None:
+            return 0.0
+        rounded = np.abs(self.config.displacement[: self.config.n_owned])
+        if self.config.moves:
+            np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
+        of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
+        if self._added:
+            of_points = FORCE_ROUNDING * np.linalg.norm([one.rounding() for one in self._added])
+            of_displacement = float(np.hypot(of_displacement, of_points))
+        return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
+
+    def rounding_of_displacement(self) -> float:
+        """Norm of the forces of the displacement that its rounding, and that of its gradient, can make (collective)."""
+        return first(np.maximum(self.rounding(np.zeros(0, np.int32)), self.strain_rounding()))
+
+    def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
+        """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""
+        if self.stiffness is None:
+            return np.zeros(len(nodes))
+        return np.asarray(
+            FORCE_ROUNDING * (np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])).max(axis=1, initial=0.0)
+        )
+
+    def above_rounding(self, positioned: bool) -> Any:
+        """Norm of the forces, or one for each field, at those components where they are told from rounding (collective).
+
+        Rounding of a body's displacement is seen at all of its nodes, also where they are held.
+
+        Args:
+            positioned: whether positions count, not displacements alone.
+        """
+        F, n = self.forces, self.config.n_owned
+        if self.stiffness is None:
+            return self.unknowns.norms(self.residual)
+        body, count = find_bodies(self.config)
+        rounded = np.zeros(count)
+        np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
+        self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
+        own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
+        limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
+        told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
+        if self._fields is None:
+            return self._beside(told, [one.size() for one in self._added])
+        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
+
+    def remembered(self, positioned: bool) -> Any:
+        """Norm beside which forces of later steps may be rounding: of those above it, and of the terms of other fields (collective)."""
+        told = self.above_rounding(positioned)
+        if self._fields is None:
+            return told
+        terms, rounding = self._fields.terms(), np.maximum(FORCE_ROUNDING * self._fields.largest(), self.strain_rounding())
+        return np.maximum(told, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
+
+    def strain_rounding(self) -> Any:
+        """Norm of the forces that rounding of ``1 + grad(u)`` can make, or one for each field ``(n_fields,)`` (collective)."""
+        if self.stiffness is None or not self.config.moves:
+            return 0.0
+        size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
+        return size if self._fields is None else self._fields.strain_rounding(self.config.size) + self._first(size)
+
+    def _first(self, of_displacement: float) -> Array:
+        """A norm of the displacement's forces, none of the other fields ``(n_fields,)``."""
+        return np.append(of_displacement, np.zeros(self.unknowns.n_fields - 1))
+
+    # -- Dirichlet conditions ------------------------------------------------------------------------------------------
+
+    def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
+        """Take these Dirichlet conditions for all, from the next step on, as the owners of nodes have them (collective).
+
+        Raises:
+            InputError: for a component that a condition holds on a rank that does not own it, and none on the one that does.
+        """
+        self.bcs = list(bcs)
+        own = np.zeros(len(self.u.x.array), dtype=bool)
+        for bc in self.bcs:
+            own[compat.bc_dofs(bc)[0]] = True
+        self.held: Bools = self.of_owners(own)
+        lost = np.flatnonzero(own & ~self.held)
+        with agreed(self.comm):
+            if len(lost):
+                raise InputError(
+                    f"a Dirichlet condition holds {self.config.place_of(int(lost[0]))} on rank {self.comm.rank}, but not on the rank that "
+                    "owns the node: expected conditions at the same nodes on all ranks; locate them by uem.dirichlet, or by "
+                    "fem.locate_dofs_topological on all ranks with remote=True"
+                )
+        self.free: Bools = ~self.config.of(self.held)
+        self.free_rows: Bools = self.config.rows(~self.held[: self._n_owned])
+        self.tangent.hold(self.free_rows)
+
+    def of_owners(self, values: AnyArray) -> AnyArray:
+        """Values of all unknowns ``(n,)`` whose ghosts have what their owners have, of the same kind (collective)."""
+        if self.comm.size == 1:
+            return values
+        f = fem.Function(self.u.function_space)
+        f.x.array[:] = values
+        f.x.scatter_forward()
+        return np.array(f.x.array).astype(values.dtype)
+
+    @property
+    def prescribed(self) -> Array:
+        """Increments that the Dirichlet conditions ask for in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        n = self._n_owned
+        return np.asarray(self.config.rows(np.where(self.held[:n], self.wanted[:n] - self.u.x.array[:n], 0.0)))
+
+    def dirichlet_met(self) -> bool:
+        """Whether the Dirichlet values are there (collective)."""
+        there, field = self.u.x.array, self.unknowns.field_of if self.unknowns.mixed else None
+        parts = [self.held] if field is None else [self.held & (field == i) for i in range(self.unknowns.n_fields)]
+        both = np.array([[np.abs(a).max(initial=0.0) for a in (self.wanted[h] - there[h], self.wanted[h])] for h in parts])
+        self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
+        return bool((both[:, 0] <= VALUE_ROUNDING * both[:, 1]).all())
+
+    # -- displacement --------------------------------------------------------------------------------------------------
+
+    def check_displacement(self, facets: float) -> None:
+        """Refuse a displacement that is not finite, or so large that facets of a length are less than its rounding (collective).
+
+        Raises:
+            NotFiniteError: if it is so.
+        """
+        if not np.isfinite(size := self._u.norm()):
+            raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
+        if np.finfo(float).eps * size <= facets:
+            return
+        far = reduced(self.comm, float(np.abs(self.config.displacement).max(initial=0.0)), op=MPI.MAX)
+        if np.finfo(float).eps * far > facets:
+            raise NotFiniteError(
+                f"nodes are displaced by {far:.3g}, whose rounding is more than the facets: loads drive bodies to where nothing holds "
+                "them; take smaller load steps, hold the bodies, or give them inertia"
+            )
+
+    def displacement(self) -> PETSc.Vec:
+        """Copy of the present displacement, and of all other fields."""
+        return self.unknowns.vector(self.config.rows(self._u.array_r))
+
+    def displace(self, start: PETSc.Vec, du: PETSc.Vec, length: float) -> None:
+        """Set all unknowns to ``start + length du``; after a full step the Dirichlet values are met to the last bit (collective)."""
+        self._u.array[:] = self.config.from_rows(start.array_r + length * du.array_r)
+        if length == 1.0:
+            held = np.flatnonzero(self.held[: self._n_owned])
+            self._u.array[held] = self.wanted[held]
+        self.u.x.scatter_forward()
+
+    def inverted(self) -> str | None:
+        """Where a cell is inside out, if one is (collective)."""
+        return self._inversions.find() if self._inversions is not None else None
+
+    # -- checkpoints ---------------------------------------------------------------------------------------------------
+
+    def commit(self) -> None:
+        """Keep what materials remember, and the diagonal of K, with the present displacement."""
+        for material in self.materials:
+            material.commit()
+        self.stiffness_at_start = self.stiffness
+
+    def restore(self) -> None:
+        """Go back to what was kept, where the displacement is that of then again."""
+        for material in self.materials:
+            material.update()
+        self.stiffness, self._stiffness_of = self.stiffness_at_start, -1
+
+    def to_checkpoint(self, u: fem.Function) -> bool:
+        """Write the diagonal of K into a Function: whether it is known yet (collective)."""
+        if self.stiffness is None:
+            return False
+        u.x.array[: self.stiffness.size] = self.stiffness.ravel()
+        u.x.scatter_forward()
+        return True
+
+    def from_checkpoint(self, u: fem.Function | None) -> None:
+        """Go on from a diagonal of K that was kept, None if none was known."""
+        n = self.config.n_owned * self.config.block
+        self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.block)
+        self.stiffness_at_start = self.stiffness
+
+
+def configured(u: fem.Function, displacement: int | None) -> Configuration:
+    """Nodes of a displacement, which is u, or the part of u with this number, or of a scalar field (collective)."""
+    if displacement is None:
+        V = u.function_space
+        if V.dofmap.index_map_bs > 1 or compat.is_mixed(V):
+            return Configuration(u)
+        from uem_dolfinx.geometry.scalar import ScalarConfiguration
+
+        return ScalarConfiguration(u)
+    from uem_dolfinx.geometry.fields import ConfigurationAmongFields
+
+    return ConfigurationAmongFields(u, displacement)
+
+
+def solver_of(config: Configuration, prefix: str, options: Any) -> UnitedSolver:
+    """Solver of the united system, which knows of other fields where there are any; arguments as of ``UnitedSolver`` (collective)."""
+    kind: type[UnitedSolver] = UnitedSolver
+    if config.unknowns.mixed:
+        from uem_dolfinx.algebra.field_split import SolverOfFields
+
+        kind = SolverOfFields
+    solver = kind(config.unknowns, prefix, options)
+    with agreed(config.comm):
+        check_fields(options, config.unknowns.names if config.unknowns.mixed else ["u"])
+    return solver

@@ -1,0 +1,183 @@
+"""Contacts whose surfaces are so far apart that nothing of them can touch: they are not looked at until they come near.
+
+Boxes around the surfaces tell, of all contacts together by one reduction. It is decided anew when a step begins; within the step a contact
+that comes near, or that an increment of the bodies may bring near, is looked at from then on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.search import MeshTarget
+
+#: Meshed surfaces whose boxes are farther from each other than this are far apart.
+#: [convention; the target's longest facet; test_far_apart.py::test_what_is_far_apart]
+FACETS_AWAY = 1.0
+
+
+class Boxes(NamedTuple):
+    """How far boxes around surfaces are from each other, in one configuration; lengths.
+
+    Attributes:
+        between: along every axis, both ways round, of meshed targets ``(n_meshed, 2 gdim)``.
+        middle: of the boxes around the contactors of rigid targets ``(n_rigid, gdim)``.
+        radius: half of their diagonals ``(n_rigid,)``.
+        distance: of their middles from the targets ``(n_rigid,)``.
+    """
+
+    between: Array
+    middle: Array
+    radius: Array
+    distance: Array
+
+    @property
+    def apart(self) -> Array:
+        """No distance between the surfaces is less: meshed ones first ``(n_pairs,)``."""
+        return np.concatenate([self.between.max(axis=1), self.distance - self.radius])
+
+    def apart_until(self, then: Boxes) -> Array:
+        """Nor is any on straight ways of all nodes to where they are ``then``."""
+        # what is on one side of the other along an axis, before and after, is so on the way
+        meshed = np.minimum(self.between, then.between).max(axis=1)
+        way = np.linalg.norm(then.middle - self.middle, axis=1)
+        rigid = 0.5 * (self.distance + then.distance - way) - np.maximum(self.radius, then.radius)
+        return np.concatenate([meshed, rigid])
+
+
+class FarApart:
+    """Which contacts of a problem are not looked at (collective).
+
+    Asked are contacts of nodes at finite sliding with the facets of a mesh, or with rigid surfaces whose gap is a distance everywhere.
+
+    Args:
+        config: configuration of the displacement.
+        pairs: of all contacts.
+    """
+
+    def __init__(self, config: Configuration, pairs: Sequence[Interface]):
+        self._config = config
+        some = [one for pair in pairs if _may_be_far(pair) for one in pair.members]
+        targets = [pair.target for pair in some if isinstance(pair.target, MeshTarget)]
+        self._rigid: list[Any] = [pair.target for pair in some if not pair.target.n_nodes]
+        self._pairs = sorted(some, key=lambda pair: not pair.target.n_nodes)
+        surfaces = {id(target.facets): target.dofs for target in targets}
+        unique = {key: np.unique(dofs) for key, dofs in surfaces.items()}
+        number = {id(pair): k for k, pair in enumerate(self._pairs)}
+        #: What they are treated as, and places of its members among them.
+        self._wholes = [pair for pair in pairs if _may_be_far(pair)]
+        self._places: list[Ints] = [np.array([number[id(one)] for one in pair.members]) for pair in self._wholes]
+        sides = [pair.nodes for pair in self._pairs] + [unique[id(target.facets)] for target in targets]
+        lengths = np.array([len(side) for side in sides], np.int64)
+        #: Nodes of all surfaces, those that have any on this rank, and where theirs begin.
+        self._nodes: Ints = np.concatenate([np.zeros(0, np.int64), *sides])
+        self._here: Ints = np.flatnonzero(lengths)
+        self._begin: Ints = (np.cumsum(lengths) - lengths)[self._here]
+        self._n_surfaces = len(sides)
+        # facets of higher degree may leave the box around their nodes
+        self._out = np.array([0.5 * (target.shape.lebesgue - 1) for target in targets])
+        longest = np.zeros(len(self._pairs))
+        size = {key: np.linalg.norm(np.ptp(config.X[dofs], axis=1), axis=1).max(initial=0.0) for key, dofs in surfaces.items()}
+        longest[: len(targets)] = [size[id(target.facets)] for target in targets]
+        if some:
+            config.comm.Allreduce(MPI.IN_PLACE, longest, op=MPI.MAX)
+        #: What is near, and with offsets ``(n_pairs,)``; boxes where the bodies were when last asked.
+        self._reach = self._near = FACETS_AWAY * longest
+        self._boxes: Boxes
+
+    def begin_step(self, falls: bool) -> None:
+        """Decide which contacts are far apart, where the bodies are now (collective).
+
+        Args:
+            falls: whether bodies fall in statics, for which gaps to rigid surfaces tell how far they may go at once.
+        """
+        if not self._pairs:
+            return
+        offsets = [pair.discretisation.offset for pair in self._pairs]
+        more = np.zeros((2, len(self._pairs)))
+        more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
+        # what touches, or has slid past an end, is looked at
+        for place, p in zip(self._places, self._wholes):
+            used = p.trial.active | p.trial.passed | p.barred
+            more[1, place[p.label[used]]] = 1.0
+        self._boxes, (offset, used) = self._look(self._config.x, more)
+        self._near = self._reach + offset
+        far = (used == 0.0) & (self._boxes.apart > self._near)
+        far[len(far) - len(self._rigid) :] &= not falls
+        for pair in self._set(far):
+            pair.project()
+
+    def place(self) -> None:
+        """Look at those that are near where the bodies are now, from the next placement on (collective)."""
+        if self._any_far:
+            self._boxes, _ = self._look(self._config.x)
+            self._look_at(self._boxes.apart <= self._near)
+
+    def look_within(self, way: float) -> None:
+        """Look at those that may come near if nodes move by no more than ``way`` along any axis, a length (collective)."""
+        if self._any_far:
+            for pair in self._look_at(self._boxes.apart <= self._near + 2.0 * np.sqrt(self._config.gdim) * way):
+                pair.project()
+
+    def look_along(self, ways: Array) -> bool:
+        """Look at those that may come near on straight ways of the local nodes ``(n_local, gdim)``: whether any may (collective)."""
+        if not self._any_far:
+            return False
+        then, _ = self._look(self._config.x + ways)
+        return bool(self._look_at(self._boxes.apart_until(then) <= self._near))
+
+    @property
+    def _any_far(self) -> bool:
+        return bool(self._far.any())
+
+    def _look(self, x: Array, more: Array | None = None) -> tuple[Boxes, Array]:
+        """Boxes with the local nodes at ``x (n_local, gdim)``, and the largest over all ranks of ``more (k, n_pairs)`` (collective)."""
+        n, g = len(self._pairs), self._config.gdim
+        # negative lower and upper corners
+        corners = np.full((self._n_surfaces, 2 * g), -np.inf)
+        if len(self._here):
+            places = x[self._nodes]
+            corners[self._here, :g] = -np.minimum.reduceat(places, self._begin)
+            corners[self._here, g:] = np.maximum.reduceat(places, self._begin)
+        told = np.concatenate([corners.ravel(), np.zeros(0) if more is None else more.ravel()])
+        self._config.comm.Allreduce(MPI.IN_PLACE, told, op=MPI.MAX)
+        corners, most = told[: corners.size].reshape(-1, 2 * g), told[corners.size :].reshape(-1, n)
+        low, high = -corners[:, :g], corners[:, g:]
+        m = self._n_surfaces - n
+        out = self._out[:, None] * (high[n:] - low[n:])
+        between = np.concatenate([low[n:] - out - high[:m], low[:m] - high[n:] - out], axis=1)
+        middle, radius = 0.5 * (low[m:n] + high[m:n]), 0.5 * np.linalg.norm(high[m:n] - low[m:n], axis=1)
+        distance = np.array([target.distance_of(at[None])[0] for target, at in zip(self._rigid, middle)])
+        return Boxes(between, middle, radius, distance), most
+
+    @property
+    def _far(self) -> Bools:
+        """Which contacts are not looked at ``(n_pairs,)``."""
+        far = np.zeros(len(self._pairs), dtype=bool)
+        for place, pair in zip(self._places, self._wholes):
+            far[place] = pair.far_of
+        return far
+
+    def _set(self, far: Bools) -> list[Interface]:
+        """Look at contacts or not ``(n_pairs,)``; those are returned of which that is new, as they are treated."""
+        found = [(place, p) for place, p in zip(self._places, self._wholes) if (far[place] != p.far_of).any()]
+        for place, pair in found:
+            pair.far_of = far[place]
+        return [pair for _, pair in found]
+
+    def _look_at(self, near: Bools) -> list[Interface]:
+        """Look at those of the contacts ``near (n_pairs,)`` that have not been looked at, which are returned as they are treated."""
+        return self._set(self._far & ~near)
+
+
+def _may_be_far(pair: Interface) -> bool:
+    measured = isinstance(pair.target, MeshTarget) or getattr(pair.target, "measures", False)
+    nodal = getattr(pair.discretisation, "can_be_far", False) and pair.sliding == "finite"
+    return nodal and measured and pair.tie is None and not pair.heats

@@ -1,0 +1,88 @@
+"""What residuals of other fields are small beside, and what of them is rounding: told from the terms of their own equations.
+
+A force is not a heat, and an equation as that of incompressibility has no reactions: beside the displacement, fields are measured by the
+terms ``K_ij w_j`` of their rows of K. What a row leaves of a constant counts once, as a sum, and what values differ from their mean in
+the row term by term, so that neither a rigid shift nor a temperature far from zero makes an equation seem solved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.geometry.fields import Unknowns
+from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.solve.bodies.tangent import Tangent
+
+
+class FieldScales:
+    """Sizes of the terms in the equations of a mixed problem (collective).
+
+    Args:
+        unknowns: rows of K.
+        tangent: K, not yet assembled.
+    """
+
+    def __init__(self, unknowns: Unknowns, tangent: Tangent):
+        self._unknowns, self._tangent = unknowns, tangent
+        g = unknowns.block
+        indptr, columns, _ = tangent.K.getValuesCSR()
+        nodes, place = np.unique(columns // g, return_inverse=True)
+        self._halo = Halo(unknowns, nodes.astype(np.int64))
+        #: Component of the columns looked at that each entry is in, and its row here.
+        column, row = place * g + columns % g, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+        field, kind = (self._halo.take(a.reshape(-1, g).__getitem__).ravel() for a in (unknowns.field, unknowns.kind))
+        #: Entries in equations of other fields, or of them in those of the displacement.
+        self._which: Ints = np.flatnonzero(((unknowns.field[row] > 0) | (field[column] > 0)) & (field[column] >= 0))
+        self._row, self._column = row[self._which], column[self._which]
+        self._by_displacement = field[self._column] == 0
+        kinds = int(unknowns.kind.max(initial=0)) + 1
+        #: Entries of one row in columns of one component, which are averaged.
+        self._group: Ints = self._row * kinds + kind[self._column]
+        self._kinds = kinds
+        self._values, self._number = np.zeros(0), -1
+
+    def _known(self) -> tuple[Array, Array]:
+        """Values of the entries, and of the unknowns in their columns, ``(k,)`` each (collective)."""
+        if self._number != self._tangent.number:
+            self._values, self._number = self._tangent.K.getValuesCSR()[2][self._which], self._tangent.number
+        config = self._unknowns.config
+        rows = config.rows(config.whole.x.array[: len(self._unknowns.place)])
+        return self._values, self._halo.take(rows.__getitem__).ravel()[self._column]
+
+    def terms(self) -> Array:
+        """Norm of the terms in the equations of each field, none for the displacement ``(n_fields,)`` (collective)."""
+        K, w = self._known()
+        weight, size = np.abs(K), len(self._unknowns.field) * self._kinds
+        total, sums, weighted = (np.bincount(self._group, a, size) for a in (weight, K, weight * w))
+        mean = weighted / np.where(total > 0.0, total, 1.0)
+        apart = np.bincount(self._row, weight * np.abs(w - mean[self._group]), size // self._kinds)
+        return self._of_others(np.asarray(apart + np.abs(sums * mean).reshape(-1, self._kinds).sum(axis=1)))
+
+    def _of_others(self, each: Array) -> Array:
+        norms = self._unknowns.norms_of(each)
+        norms[0] = 0.0
+        return norms
+
+    def _largest(self) -> Array:
+        """Sum of the terms' sizes in every equation, of those with other fields in the displacement's ``(n_rows * gdim,)``."""
+        K, w = self._known()
+        return np.asarray(np.bincount(self._row, np.abs(K * w), len(self._unknowns.field)), dtype=float)
+
+    def largest(self) -> Array:
+        """Norm of the sums of the terms' sizes in the equations of each field ``(n_fields,)`` (collective)."""
+        return self._unknowns.norms_of(self._largest())
+
+    def strain_rounding(self, size: float) -> Array:
+        """Norm of what rounding of ``1 + grad(u)`` can make in the equations of each field, none for the displacement ``(n_fields,)``.
+
+        An equation as ``det(1 + grad(u)) = 1`` is left with it however small u is. Collective; ``size`` is the model's, a length.
+        """
+        K, _ = self._known()
+        of_displacement = np.where(self._by_displacement, np.abs(K), 0.0)
+        each = np.bincount(self._row, np.finfo(float).eps * size * of_displacement, len(self._unknowns.field))
+        return self._of_others(np.asarray(each, dtype=float))
+
+    def above(self, F: Array, part: float) -> Array:
+        """Norm of the residual ``F (n_rows * gdim,)`` where it is more than a part of the terms, none for the displacement (collective)."""
+        return self._of_others(np.where(np.abs(F) > part * self._largest(), F, 0.0))

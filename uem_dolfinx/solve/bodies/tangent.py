@@ -1,0 +1,277 @@
+"""Derivatives at the present displacement: the tangent K of the bodies, the curvature of the contact, and cells turned inside out.
+
+A part of the seventh step on the data's way; K is assembled only when something it depends on has changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import compress
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.materials.elastic import HistoryMaterial
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.at_points import AtPoints
+    from uem_dolfinx.conditions.user_rows import UserRows
+
+
+class Tangent:
+    """K = dF/du, with the mass's part of it in dynamics, assembled when it has changed.
+
+    Args:
+        F: UFL residual.
+        config: configuration of the displacement.
+        materials: whose stresses in F are no expressions of u; they add their stiffness.
+        dynamics: whose inertia forces depend on u, or None.
+        points: loads and springs at nodes, or None.
+
+    Raises:
+        SpaceError: if F does not depend on u.
+    """
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        config: Configuration,
+        materials: Sequence[HistoryMaterial] = (),
+        dynamics: Dynamics | None = None,
+        points: AtPoints | None = None,
+    ):
+        u = config.whole
+        J = ufl.derivative(F, u)
+        for material in materials:
+            J += revolved(material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0]))
+        J, self._inputs = forms.with_derivatives(J)
+        if J.empty():
+            raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
+        #: Whether K is the same for every u.
+        self.linear: bool = not any(f is u for f in self._inputs)
+        self._dynamics, self._factor, self._points = dynamics, 0.0, points
+        self._values: list[Array] | None = None
+        with compiling("the tangent"):
+            self._form = forms.form(J)
+        self._unknowns = config.unknowns
+        self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
+        #: Components without Dirichlet condition ``(n_rows, gdim)``.
+        self._free: Bools = np.ones((0, 0), dtype=bool)
+        #: Components that nothing of K resists, without Dirichlet condition ``(n_rows * gdim,)``; None for none on any rank.
+        self.bare: Bools | None = None
+        #: Whether K has zeros on its diagonal, which is completed where components are held.
+        self._lacks = config.unknowns.mixed
+        #: Grows with every assembly.
+        self.number = 0
+
+    def hold(self, free: Bools) -> None:
+        """Take which components have no Dirichlet condition ``(n_rows, gdim)``; K has places for all of them."""
+        self._free = free
+        if self._lacks:
+            # its diagonal was completed where others were held
+            self._values = None
+
+    def update(self) -> None:
+        """Assemble K unless nothing it depends on has changed (collective)."""
+        values = [np.array(forms.values_of(c)) for c in self._inputs]
+        factor = self._dynamics.factor if self._dynamics is not None else 0.0
+        same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
+        same &= factor == self._factor
+        comm = self.K.comm.tompi4py()
+        if reduced(comm, int(same)) == comm.size:
+            return
+        with timed("assemble tangent"):
+            forms.assemble_matrix(self.K, self._form)
+            if self._points is not None:
+                self._points.add_stiffness(self.K)
+            if self._dynamics is not None and factor:
+                self.K.axpy(factor, self._dynamics.matrix, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+            self._complete(comm)
+        self._values, self._factor = values, factor
+        self.number += 1
+
+    def _complete(self, comm: MPI.Comm) -> None:
+        """Complete the diagonal of K, and see where nothing but a coupling or a contact can resist (collective)."""
+        zero, mixed = self.K.getDiagonal().array_r == 0.0, self._unknowns.mixed
+        self._lacks = bool(reduced(comm, int(zero.any()), op=MPI.MAX)) or mixed
+        self.bare = None
+        if not self._lacks:
+            return
+        self._unknowns.complete(self.K, self._free)
+        # other fields may have no diagonal
+        free = zero & self._free.ravel()
+        self.bare = free if not mixed and reduced(comm, int(free.any()), op=MPI.MAX) else None
+
+
+def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PETSc.Mat:
+    """Matrix of ``-sum lambda grad^2 g``, to be added to K (collective).
+
+    Args:
+        parts: of every pair, global nodes ``(k, m)``, negative where there is none, and the blocks ``(k, m gdim, m gdim)``.
+        du: a vector with the displacement's layout.
+    """
+    g = du.getBlockSize()
+    # how many blocks meet at each node bounds the length of its rows
+    counts = du.duplicate()
+    counts.set(0.0)
+    for nodes, _ in parts:
+        width = nodes.shape[1]
+        flat = nodes[nodes >= 0].astype(PETSc.IntType)
+        index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
+        counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
+    counts.assemble()
+    n = counts.getLocalSize()
+    rows = np.minimum(counts.array_r, counts.getSize())
+    G = PETSc.Mat().createAIJ(
+        (du.getSizes(), du.getSizes()),
+        bsize=g,
+        nnz=(np.minimum(rows, n).astype(PETSc.IntType), np.minimum(rows, counts.getSize() - n).astype(PETSc.IntType)),
+        comm=du.comm,
+    )
+    G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+    # a rank without nodes would not be told, and then assemble otherwise than the others
+    G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
+    for nodes, blocks in parts:
+        if len(nodes):
+            which = nodes.astype(PETSc.IntType)
+            G.setValuesBlockedRCV(which, which, blocks, addv=PETSc.InsertMode.ADD)
+    G.assemble()
+    return G
+
+
+def convex_part(blocks: Array) -> Array:
+    """Blocks ``(k, n, n)`` without the negative eigenvalues of those that are symmetric."""
+    out = blocks.copy()
+    which = np.flatnonzero((blocks == blocks.transpose(0, 2, 1)).all(axis=(1, 2)))
+    value, vector = np.linalg.eigh(blocks[which])
+    out[which] = (vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1)
+    return out
+
+
+def curvature_of(
+    pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool, linear: UserRows | None = None
+) -> PETSc.Mat | None:
+    """``-sum lambda grad^2 g`` of all pairs, and likewise of rigid couplings, or None if there is none (collective).
+
+    Args:
+        pairs: of all contacts.
+        du: a vector with the displacement's layout.
+        apart: whether P differs from Q; else the symmetric part counts.
+        convex: whether what could make the tangent indefinite is left out.
+        linear: equations of users; None for none.
+    """
+    moving = [pair for pair in pairs if pair.sliding == "finite"]
+    if not moving and linear is None:
+        return None
+    parts = [part for pair in moving for part in pair.curvature()]
+    parts += [] if linear is None else linear.curvature()
+    for i, (nodes, blocks) in enumerate(parts):
+        # one after the other takes the place of what it was made of
+        blocks = convex_part(blocks) if convex else blocks
+        parts[i] = nodes, blocks if apart else 0.5 * (blocks + blocks.transpose(0, 2, 1))
+    # a plane has none
+    if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
+        return None
+    return contact_curvature(parts, du)
+
+
+def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
+    """Forces of friction that do not grow with those along the normal, of pairs of which any rank has some (collective)."""
+    if not any(pair.frictional for pair in pairs):
+        return []
+    told = reduced(pairs[0].config.comm, np.array([pair.has_known_forces for pair in pairs]), op=MPI.LOR)
+    return [pair.known_forces() for pair in compress(pairs, told)]
+
+
+def slip_terms(
+    pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None
+) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
+    """What the directions of slip, heat through contacts, and masses at points add to the tangent, and slip to the residual (collective).
+
+    Args:
+        pairs: of all contacts.
+        du: a vector with the layout of all unknowns.
+        linear: equations of users; None for none.
+
+    Returns:
+        Either of them None for nothing.
+    """
+    g, comm = du.getBlockSize(), du.comm.tompi4py()
+    parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
+    heat = [part for pair in pairs for one in pair.heats for part in one.tangent()]
+    slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
+    passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
+    masses = [] if linear is None else linear.added_mass()
+    if not (slips or passes or masses):
+        return None, None
+    added = contact_curvature([*((nodes, blocks) for nodes, blocks, _ in parts), *heat, *masses], du)
+    if not slips:
+        return added, None
+    held = du.duplicate()
+    held.set(0.0)
+    for nodes, _, forces in parts:
+        there = nodes >= 0
+        index = (nodes[there][:, None] * g + np.arange(g)).ravel().astype(PETSc.IntType)
+        held.setValues(index, forces.reshape(*nodes.shape, g)[there].ravel(), addv=PETSc.InsertMode.ADD)
+    held.assemble()
+    return added, held
+
+
+def added_mass(linear: UserRows | None, like: PETSc.Vec) -> PETSc.Mat | None:
+    """What masses at points of rigid couplings add to M, for vectors like this one; None without any (collective)."""
+    parts = [] if linear is None else linear.added_mass(1.0)
+    return contact_curvature(parts, like) if parts else None
+
+
+def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:
+    """The sum of two matrices, either of which may be None."""
+    if A is None or B is None:
+        return B if A is None else A
+    both = A.copy()
+    both.axpy(1.0, B, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    return both
+
+
+class Inversions:
+    """Looks for cells that the displacement turns inside out.
+
+    Args:
+        config: configuration of the displacement.
+    """
+
+    def __init__(self, config: Configuration):
+        self.config = config
+        G = displacement_gradient(config.u)
+        self._J = ufl.det(ufl.Identity(G.ufl_shape[0]) + G)
+        one = fem.Constant(config.mesh, 1.0)
+        with compiling("the search for cells turned inside out"):
+            self._volume = forms.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
+
+    def find(self) -> str | None:
+        """Where the worst of them is, if there are any (collective)."""
+        config = self.config
+        if forms.assemble_scalar(self._volume, config.comm) == 0.0:
+            return None
+        determinant = fem.Function(compat.function_space(config.mesh, ("DG", 0)))
+        compat.interpolate_expression(determinant, self._J)
+        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
+        dofs = compat.cell_dofs(config.V)
+        here = (np.inf, "")
+        if len(values):
+            cell = int(values.argmin())
+            here = (float(values[cell]), str(np.round(config.X[dofs[cell]].mean(axis=0), 6)))
+        return min(config.comm.allgather(here))[1]

@@ -1,0 +1,96 @@
+"""What is touched first, told by how bodies would move if they followed their Dirichlet conditions rigidly, and what may be next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam import active_set
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import followed_nodes
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.rigid.rigid_motions import OPEN, RigidMotions
+
+
+def touch_ahead(
+    bodies: Bodies,
+    pairs: Sequence[Interface],
+    rigid: RigidMotions | None,
+    place: Callable[[], None],
+    look_within: Callable[[float], None],
+) -> None:
+    """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
+
+    It saves the solve that would find them; those that are wrong are released before anything moves. Contactors with friction are left
+    to that solve, which tells the way that they slip.
+
+    Args:
+        bodies: that their conditions hold.
+        pairs: of all contacts.
+        rigid: motions of the bodies; None without contacts.
+        place: projects all contactors.
+        look_within: looks at contacts that motions by a given length may bring near; see ``FarApart``.
+    """
+    config, comm = bodies.config, bodies.comm
+    known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
+    if known or rigid is None:
+        return
+    place()
+    free, prescribed = bodies.free[: config.n_owned], bodies.prescribed[: config.n_owned]
+    du = np.where(free, rigid.field(rigid.following(prescribed)), prescribed)
+    way = float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
+    look_within(way)
+    near = OPEN * way
+    gaps = [pair.predicted(du) for pair in pairs]
+    violated = []
+    for pair, gap in zip(pairs, gaps):
+        none = np.zeros(len(pair.nodes))
+        violated.append(pair.violated(gap, pair.traction._replace(lam=none), none, none, near, False, du))
+    if reduced(comm, any(w.enter.any() for w in violated), op=MPI.LOR):
+        for pair, first in zip(pairs, deepest_of(pairs, gaps, violated)):
+            pair.exchange(first, False)
+
+
+def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequence[Violations]) -> list[Violations]:
+    """Of contactors that would all enter at once, those deep enough to touch at first, and all that are released (collective).
+
+    Args:
+        pairs: of all contacts.
+        gaps: that decide on contact, of every pair ``(n,)``.
+        violated: contactors that are to change sides, of every pair; some contactor enters.
+    """
+    config = pairs[0].config
+    g, entering = config.gdim, [w.enter for w in violated]
+    points = np.concatenate([pair.points[enter] for pair, enter in zip(pairs, entering)])
+    overlap = -np.concatenate([gap[enter] for gap, enter in zip(gaps, entering)])
+    reach = np.array([*points.max(axis=0, initial=-np.inf), *(-points).max(axis=0, initial=-np.inf), overlap.max(initial=0.0)])
+    config.comm.Allreduce(MPI.IN_PLACE, reach, op=MPI.MAX)
+    span = float(np.linalg.norm(reach[:g] + reach[g : 2 * g])) / config.size
+    depth = active_set.deep_enough(span, g) * float(reach[-1])
+    return [w.on_first_touch(gap, depth) for w, gap in zip(violated, gaps)]
+
+
+def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
+    """What tells the owned nodes of all target facets that have one of some nodes, each ``(n_owned,)``; None where no feet move.
+
+    Args:
+        config: configuration of the displacement.
+        pairs: of all contacts.
+    """
+    moving = [pair.target for pair in pairs if pair.sliding == "finite" and pair.target.n_nodes and pair.tie is None]
+    facets = list({id(target.dofs): target.dofs for target in moving}.values())
+    every = np.arange(config.n_local)
+
+    def beside(nodes: Bools) -> Bools:
+        on = config.from_owners(every[: config.n_owned], nodes[:, None].astype(float), every)[:, 0] > 0.0
+        found = np.concatenate([dofs[on[dofs].any(axis=1)].ravel() for dofs in facets])
+        return followed_nodes(config, found)[: config.n_owned]
+
+    return beside if facets else None

@@ -1,0 +1,416 @@
+"""Bodies that only contact holds: how they come to rest, and what keeps the united system regular until they do.
+
+A body without enough Dirichlet conditions can move as a rigid body until contact holds it. Each motion that conditions and active
+contacts leave open is either loaded, and then the body falls along it until it touches something, or neutral, and then it is held in a
+statically determinate way, where the reaction is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TOUCHING
+from uem_dolfinx.errors import FloatingBodyError
+from uem_dolfinx.form_checks import takes_values
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.rigid.rigid_motions import LOADED, OPEN, RigidMotions
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.solve.bodies.far_apart import FarApart
+
+#: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
+#: [convention; the model's size; test_friction.py::test_what_slides_away]
+FAR = 1e3
+#: Bodies turn by so much in a step, in radians, and go as far as their radius times that, or to where they touch first.
+#: [heuristic; radians; test_heaps.py::test_heap_comes_to_rest_in_few_steps]
+TURN = 0.3
+#: Bodies without loads are as light as this part of the most loaded one: what touches them pushes them aside.
+#: [bound; the largest load; -]
+LIGHT = 1e-3
+#: A body that contact has pushed, and holds no more, has gone no farther than so many times the way of all else, deformations included.
+#: [heuristic; largest displacement in the step; test_unheld.py::test_a_body_that_is_thrown_out]
+THROWN = 10.0
+#: A body that falls comes to rest in so many steps at most.
+#: [bound; steps; -]
+MOST_RIGID_STEPS = 200
+
+
+class _Held(NamedTuple):
+    """What holds bodies.
+
+    Attributes:
+        rows: equations of contactors that follow their target, and of users.
+        rates: how fast each motion opens their gaps, a sparse matrix ``(m, n_motions)``.
+        which: those that cannot part again ``(m,)``: with friction, of ties and of users.
+        basis: motions that these leave open ``(n_motions, k)``.
+    """
+
+    rows: UnitingEquations
+    rates: Any
+    which: Bools
+    basis: Any
+
+
+class FloatingBodies:
+    """What a step does about bodies that only contact holds.
+
+    Args:
+        bodies: without contact.
+        pairs: of all contacts.
+        linear: equations of users, None for none.
+        far_apart: contacts that are not looked at until bodies come near; None if all are.
+
+    Attributes:
+        rigid: rigid motions of the bodies; None of a scalar field.
+        motions: those of the present step, None if conditions, springs and inertia hold all bodies.
+    """
+
+    def __init__(
+        self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None = None, far_apart: FarApart | None = None
+    ):
+        self._bodies, self._pairs, self._linear, self._far_apart = bodies, pairs, linear, far_apart
+        config, dynamics = bodies.config, bodies.dynamics
+        self.rigid: RigidMotions | None = None
+        self._at_rest: RigidMotions | None = None
+        self._in_motion: RigidMotions | None = None
+        if config.moves:
+            free, finite = bodies.free[: config.n_owned], not bodies.tangent.linear
+            self.rigid = RigidMotions(config, free, finite)
+            self._at_rest = self._floating(self.rigid)
+            if dynamics is not None:
+                # in a step in time, inertia holds what has mass
+                moving = RigidMotions(config, free & ~dynamics.inert, finite)
+                self._in_motion = self._floating(moving)
+        self.motions = self._at_rest
+        #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
+        self._open: Array = np.zeros((0, 0))
+        #: Less the displacement that the step began with, and less what bodies have fallen since ``(n_local, gdim)``.
+        self._went: Array = np.zeros((0, 0))
+        #: Sum of the forces that the step began with; None before they were known.
+        self._loads: float | None = None
+        #: Likewise with those that friction alone resists, where all contactors slip.
+        self._sliding: Array = np.zeros((0, 0))
+
+    def take(self, pairs: Sequence[Interface], far_apart: FarApart) -> None:
+        """Take the same contacts as they are treated from now on, and which of them are looked at."""
+        self._pairs, self._far_apart = pairs, far_apart
+
+    @cached_property
+    def _has_springs(self) -> bool:
+        """Whether bodies may be held beside conditions: by springs at nodes, or by a form of displacements themselves."""
+        return self._bodies.points is not None or takes_values(self._bodies.F, self._bodies.u)
+
+    def _floating(self, motions: RigidMotions) -> RigidMotions | None:
+        """The motions, if neither conditions nor springs in the form hold all bodies; else None (collective)."""
+        bodies = self._bodies
+        if not motions.any_open():
+            return None
+        if (self._pairs or self._linear is not None) and not self._has_springs:
+            return motions
+        bodies.initial_stiffness()
+        motions.ask_stiffness(bodies.tangent.K)
+        return motions if motions.any_open() else None
+
+    def begin_step(self, place: Callable[[], None]) -> None:
+        """Let bodies fall until they touch; ``place`` projects all contactors (collective).
+
+        Raises:
+            FloatingBodyError: naming a body, and the motion that nothing stops.
+        """
+        if self._bodies.dynamics is not None:
+            self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
+        if self._far_apart is not None:
+            self._far_apart.begin_step(self.motions is not None)
+        if self.motions is not None:
+            self._went = -self._bodies.config.displacement
+            self.motions.forget_supports()
+            self._loads = None
+            self._fall(place, freely=True)
+
+    def begin_motion(self) -> None:
+        """Take the motions of a step in time for the first acceleration."""
+        self.motions = self._in_motion
+
+    def end_step(self) -> None:
+        """Refuse a state in which supports carry more than rounding; in a step in time, say so.
+
+        Raises:
+            FloatingBodyError: in statics.
+        """
+        if self.motions is None:
+            return
+        if self._bodies.dynamics is None:
+            self._refuse_thrown()
+        if self.motions.share <= LOADED:
+            return
+        told = (
+            f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held at its position: "
+            "its contact does not determine its equilibrium"
+        )
+        if self._bodies.dynamics is None:
+            raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest with a decaying drag")
+        logger.warning(told)
+
+    def _refuse_thrown(self) -> None:
+        """Refuse a step in which contacts have thrown a body to where they hold it no more (collective).
+
+        Raises:
+            ThrownBodyError: naming the body.
+        """
+        motions, config = self.motions, self._bodies.config
+        assert motions is not None
+        if not self._open.shape[1]:
+            return
+        # what falls has not been thrown
+        way = (config.displacement + self._went)[: config.n_owned]
+        thrown = motions.part(self._open, way)
+        far, else_ = (np.linalg.norm(part, axis=1).max(initial=0.0) for part in (thrown, way - thrown))
+        far, else_ = reduced(self._bodies.comm, np.array([far, else_]), op=MPI.MAX)
+        if far > THROWN * else_ + TOUCHING * config.size:
+            raise motions.thrown(thrown, THROWN * else_)
+
+    def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
+        """Free components ``(n_rows, gdim)`` without those that hold neutral motions (collective).
+
+        Args:
+            free: components without Dirichlet condition ``(n_rows, gdim)``.
+            equations: rows of the relative motions that contacts do not let go on without end.
+            resisting: rows of all relative motions that contacts resist, the same object without friction.
+        """
+        if self.motions is None:
+            return free
+        self._open = self._sliding = self.motions.open_motions(self._rates(equations))
+        if resisting is not equations and self.neutral:
+            # where friction resists no less is resisted
+            self._open = self.motions.open_motions(self._rates(resisting))
+        rigid, parted = None if self._linear is None else self._linear.rigid, None
+        if rigid is not None:
+            # what couplings leave of their nodes holds these
+            parted = rigid.left(np.ones((self._bodies.config.n_owned, free.shape[1]), dtype=bool))
+            equations = equations.select(np.arange(len(equations)) < len(equations) - rigid.n_rows)
+        left, supports = free.copy(), self.motions.supports(self._sliding, equations, parted)
+        left[: len(supports)] &= ~supports
+        return left
+
+    def slide(self, driving: Array, forces: Array) -> Array | None:
+        """Increment, far beyond all others, of bodies that slide under what the supports carry; None if none does (collective).
+
+        Args:
+            driving: forces that are not in equilibrium, at the owned nodes ``(n_owned, gdim)``.
+            forces: all forces of the bodies, beside which they may be rounding ``(n_owned, gdim)``.
+        """
+        if self.motions is None or self._sliding.shape[1] == self._open.shape[1]:
+            return None
+        motion = self.motions.load(self._sliding, driving, forces)
+        return FAR * self._bodies.config.size * self.motions.field(motion / size) if (size := np.linalg.norm(motion)) else None
+
+    @property
+    def neutral(self) -> bool:
+        """Whether conditions and contacts leave motions open, along which bodies stay where they are."""
+        return self.motions is not None and self._sliding.shape[1] > 0
+
+    @property
+    def adrift(self) -> bool:
+        """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
+        if self.motions is None:
+            return False
+        force = self.motions.load(self._open, self._forces())
+        return bool(force.any())
+
+    def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
+        """Let bodies that have lost their hold fall (collective).
+
+        Args:
+            place: projects all contactors (collective).
+            changed: whether the active set has, or is about to.
+            in_equilibrium: whether the bodies are in equilibrium.
+
+        Returns:
+            Whether anything else has changed now.
+        """
+        if self.motions is None:
+            return False
+        if not (changed or in_equilibrium):
+            return False
+        if not self._held().basis.shape[1]:
+            self.motions.share = 0.0
+            return False
+        # a body that has lost its hold on the way falls only when the others have come to rest
+        return self._fall(place, freely=not changed)
+
+    def without_open_motions(self, du: Array) -> Array:
+        """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
+        if self.motions is None:
+            return du
+        return du - self.motions.part(self._sliding, du.reshape(-1, self._bodies.config.gdim)).ravel()
+
+    def _forces(self) -> Array:
+        """Forces of the bodies, less the loads of contacts, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        F = self._bodies.forces
+        for nodes, loads in filter(None, (pair.applied_forces() for pair in self._pairs)):
+            F = F - self._bodies.config.add_at_owners(nodes, loads)
+        return F
+
+    def _rates(self, equations: UnitingEquations) -> Any:
+        """Rates of the equations that hold, see ``RigidMotions`` (collective)."""
+        assert self.motions is not None
+        return self.motions.rates(equations.select(equations.active))
+
+    def _fall(self, place: Callable[[], None], freely: bool) -> bool:
+        """Move bodies rigidly along their loads until contact holds them (collective).
+
+        Args:
+            place: projects all contactors (collective).
+            freely: otherwise they only take hold of what they touch already.
+
+        Returns:
+            Whether any body has moved or touched something.
+
+        Raises:
+            FloatingBodyError: naming a body, and the motion that nothing stops.
+        """
+        motions = self.motions
+        assert motions is not None
+        changed, before, damping = False, np.zeros(motions.count * motions.n_modes), np.ones(motions.count)
+        for _ in range(MOST_RIGID_STEPS):
+            place()
+            self._bodies.assemble()
+            for pair in self._pairs:
+                pair.release_apart()
+            v, took = self._step(damping, freely)
+            changed |= took
+            if v is None:
+                return changed
+            ways = motions.ways(v)
+            if self._far_apart is not None and self._far_apart.look_along(ways):
+                continue
+            motions.config.shift(slice(None), ways)
+            self._went -= ways
+            damping, before, changed = self._pace(damping, before, v), v, True
+        raise motions.error(before)
+
+    def _pace(self, damping: Array, before: Array, v: Array) -> Array:
+        """Factors of every body's next step ``(count,)``, after one in which it has gone by v, and before that by ``before``.
+
+        A body that turns back goes half as far; one that goes on twice as far, as from where it is nearly balanced, if it stays within
+        what it may turn.
+        """
+        motions = self.motions
+        assert motions is not None
+        last, now = before.reshape(motions.count, -1), v.reshape(motions.count, -1)
+        along, small = (last * now).sum(axis=1), 2.0 * np.abs(now).max(axis=1) <= TURN * motions.radius
+        faster = np.where((along > 0) & small, 2.0 * damping, np.maximum(damping, np.minimum(1.0, 2.0 * damping)))
+        return np.where(along < 0, 0.5 * damping, faster)
+
+    def _looked_at(self) -> list[Interface]:
+        """Pairs that are not far apart."""
+        return [pair for pair in self._pairs if not pair.far]
+
+    def _held(self) -> _Held:
+        """What contacts and equations of users hold where the bodies are now (collective)."""
+        motions, g = self.motions, self._bodies.config.gdim
+        assert motions is not None
+        pairs = self._looked_at()
+        equations = [pair.equations() for pair in pairs]
+        more = [] if self._linear is None else [self._linear.at_present()]
+        rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
+        # friction holds what sticks in all directions; contactors without it may part again
+        firm = [(e.tied | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
+        which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
+        rates = motions.rates(rows)
+        return _Held(rows, rates, which, motions.open_motions(rates[which]))
+
+    def _step(self, damping: Array, freely: bool) -> tuple[Array | None, bool]:
+        """Contactors that touch and carry become active; an increment of all motions under the loads (collective).
+
+        Args:
+            damping: of every body's step, up to 1 ``(count,)``.
+            freely: see ``_fall``.
+
+        Returns:
+            The increment, None where contact holds the bodies, and whether any contactor has become active.
+
+        Raises:
+            FloatingBodyError: if the bodies move and no gap closes.
+        """
+        from scipy.sparse import vstack
+
+        from uem_dolfinx.solve.rigid.rigid_steps import least_motion, weighted
+
+        motions, config, comm = self.motions, self._bodies.config, self._bodies.comm
+        assert motions is not None
+        held, motions.share, n = self._held(), 0.0, motions.n_modes
+        basis = held.basis
+        if not basis.shape[1]:
+            return None, False
+        residual = self._forces()
+        loose = motions.load(motions.open_motions(held.rates), residual).any()
+        motions.share = 0.0
+        if not (loose or freely):
+            return None, False
+        force, scale = motions.forces(residual)
+        f = basis @ (basis.T @ force)
+        size = np.linalg.norm(f.reshape(-1, n), axis=1)
+        self._loads = scale if self._loads is None else self._loads
+        # where all bodies float, what equilibrium leaves is rounding, and small beside the loads that the step began with
+        if size.max() <= max(LOADED * max(scale, self._loads), self._bodies.rounding_of_displacement()):
+            return None, False
+        pairs = self._looked_at()
+        ahead = [pair.approach for pair in pairs]
+        front = UnitingEquations.join(ahead, config.gdim)
+        R = vstack([motions.rates(front), held.rates[~held.which]]).tocsr()
+        gap = np.concatenate([front.gap, held.rows.gap[~held.which]])
+        # as if each body were as heavy as its load, those without any hardly at all
+        weight, turn = np.maximum(size, LIGHT * size.max()), TURN * motions.radius
+        ways = self._ways(R, gap, f / np.repeat(weight, n))
+        shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
+        M = ((weight / damping)[:, None] / np.where(np.arange(n) < config.gdim, shift[:, None], turn[:, None])).ravel()
+        B = weighted(basis, M)
+        v, push = least_motion(comm, f, B, R, gap, np.arange(len(gap)) >= len(front))
+        took = False
+        if loose:
+            free = B @ (B.T @ f)
+            carries = (push > 0) | ((R @ free < -OPEN * np.linalg.norm(free)) & (R @ v <= OPEN * np.linalg.norm(free)))
+            parts = np.split(carries[: sum(len(e) for e in ahead)], np.cumsum([len(e) for e in ahead])[:-1])
+            active = [pair.activate_closing(c) for pair, c in zip(pairs, parts)]
+            took = any(active)
+            if freely and any(a and pair.frictional for a, pair in zip(active, pairs)):
+                return np.zeros_like(v), True
+        if not freely:
+            return None, took
+        left = basis @ (basis.T @ (M * v))
+        motions.share = float(np.abs(left).max() / scale)
+        if np.abs(v).max() <= TOUCHING * config.size:
+            return None, took
+        # a step that no gap closes, nor takes a body out of an overlap, goes on for ever
+        rate, some = R @ v, OPEN * np.abs(v).max()
+        if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
+            if reduced(comm, any([pair.discretisation.look_farther() for pair in self._pairs]), op=MPI.LOR):
+                return np.zeros_like(v), took
+            raise motions.error(v)
+        return v, took
+
+    def _ways(self, R: Any, gap: Array, v: Array) -> Array:
+        """How far bodies go in motions ``v (n_motions,)`` until the first of their gaps closes ``(count,)`` (collective)."""
+        motions = self.motions
+        assert motions is not None
+        ways, rate = np.full(motions.count, np.inf), R @ v
+        closing = np.flatnonzero(rate < -OPEN)
+        terms = R[closing].tocoo()
+        large = np.abs(terms.data) > OPEN
+        way = np.maximum(gap[closing], 0.0) / -rate[closing]
+        np.minimum.at(ways, terms.col[large] // motions.n_modes, way[terms.row[large]])
+        self._bodies.comm.Allreduce(MPI.IN_PLACE, ways, op=MPI.MIN)
+        return ways

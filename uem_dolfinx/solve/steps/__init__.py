@@ -1,0 +1,1 @@
+"""Load steps, time steps, stages and arc length."""

@@ -1,0 +1,232 @@
+"""Load steps of given arc length: the load factor is an unknown more, so that a path is followed past limit points under dead load.
+
+    Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    t . (u + du - u0) = s,    F_lam = dF/dlam
+
+with t the direction in which the last step went: Riks' method, the constraint a plane, solved with the one united matrix and two
+right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are those of the displacement: fields
+beside it follow, and have no part in t, whatever their units are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.law import as_law, follows_load
+from uem_dolfinx.errors import ConvergenceError, InputError
+from uem_dolfinx.log import say
+from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.checks import refuse_other_fields
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.rows import BodyState
+from uem_dolfinx.solve.united.system import BodySystem
+
+#: Difference of load factors over which the residual's derivative is taken; exact where the load is proportional to the factor.
+#: [convention; load factor; test_arc_length.py::test_loads_that_are_not_proportional]
+DIFFERENCE = 1e-4
+#: The arc has its length to this part of it.
+#: [convention; arc length; test_arc_length.py::test_length_of_the_arc]
+ON_THE_PLANE = 1e-8
+#: A path that has not come to the full load after so many times the nominal number of steps is given up.
+#: [bound; nominal number of steps; test_arc_length.py::test_path_without_end]
+MOST_STEPS = 100
+
+
+class ArcLength:
+    """A problem's contact by elimination, with the load factor as an unknown more; a ``newton.ContactMethod``.
+
+    Args:
+        problem: whose method and load are taken.
+
+    Attributes:
+        factor: the load factor now.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        assert isinstance(problem.system, BodySystem)
+        self._problem, self._system, self._bodies = problem, problem.system, problem.bodies
+        self.factor = 0.0
+        #: Number of the displacement's components here, which are the first of vectors.
+        self._n = problem.config.n_owned * problem.config.gdim
+        self._direction, self._length = np.zeros(self._n), 0.0
+        #: Displacement at the beginning of the step.
+        self._start = self._bodies.displacement()
+        #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
+        self._change, self._slope = 0.0, problem.config.unknowns.vector()
+        self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
+        self.accelerate, self.forget = self._system.accelerate, self._system.forget
+        self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
+        self.return_to_targets = self._system.return_to_targets
+
+    def begin(self, factor: float, direction: Array, length: float) -> None:
+        """Begin a step.
+
+        Args:
+            factor: committed load factor.
+            direction: of unit length over all ranks, at the displacement's owned components.
+            length: how far the displacement goes along it.
+        """
+        self._direction, self._length = direction, length
+        self._start = self._bodies.displacement()
+        self._change = 0.0
+        self._set(factor)
+
+    def _set(self, factor: float) -> None:
+        self.factor = factor
+        self._problem.set_load(factor)
+
+    def _along(self, way: PETSc.Vec) -> float:
+        """How far a way goes in the step's direction (collective)."""
+        return float(reduced(self._problem.comm, self._direction @ way.array_r[: self._n]))
+
+    @property
+    def _missing(self) -> float:
+        """How much further the displacement has to go (collective)."""
+        return self._length - self._along(self._bodies.displacement() - self._start)
+
+    def place(self) -> None:
+        """Project the contactors of displaced bodies, whose load factor has changed with the displacement."""
+        self._set(self.factor + self._change)
+        self._change = 0.0
+        self._system.place()
+
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
+        """Where the contactors belong; the state is closed if the arc has its length, too."""
+        state = self._system.assemble_constraints(in_equilibrium)
+        there = abs(self._missing) <= ON_THE_PLANE * self._length
+        return replace(state, closed=state.closed and there)
+
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """United matrix of a state, with the right-hand side without load increment, and the residual's derivative with the load factor."""
+        if iteration is not None:
+            self._differentiate()
+        problem = self._system.linearise(state, iteration)
+        # the load increment is as accurate as the unknowns, and near limit points little is left by solutions that are far off
+        return problem._replace(exact=not problem.iterative, iterative=False, passing=True, convex=False)
+
+    def _differentiate(self) -> None:
+        """Derivative of the residual with respect to the load factor (collective)."""
+        bodies, factor = self._bodies, self.factor
+        before = self._system.residual()
+        self._problem.set_load(factor + DIFFERENCE)
+        bodies.assemble()
+        self._slope = self._system.residual()
+        self._slope.axpy(-1.0, before)
+        self._slope.scale(1.0 / DIFFERENCE)
+        self._problem.set_load(factor)
+        bodies.assemble()
+
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Unknowns with the load increment that takes them to the plane."""
+        system, state = self._system, problem.state
+        load = state.test.transpose(self._slope)
+        load.scale(-1.0)
+        both = (problem._replace(rhs=rhs) for rhs in (problem.rhs, load))
+        free, by_load = (system.complete(one, system.solve(one, accuracy, None)) for one in both)
+        still = load.duplicate()
+        still.set(0.0)
+        along = self._along(by_load.du - system.move(state, still))
+        if along == 0.0:
+            raise ConvergenceError("the load does not move the bodies in the direction they went: take smaller steps")
+        self._change = (self._missing - self._along(free.du)) / along
+        dq, rhs = free.dq + self._change * by_load.dq, problem.rhs + self._change * load
+        return Increment(dq, system.move(state, dq), rhs, free.linear_iterations + by_load.linear_iterations, free.left)
+
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
+        """The state in which wrong contactors have changed sides, as they are predicted under the new load."""
+        assert isinstance(problem.state, BodyState)
+        held = self._change * self._slope
+        if problem.state.held is not None:
+            held.axpy(1.0, problem.state.held)
+        return self._system.exchange(problem._replace(state=replace(problem.state, held=held)), step)
+
+
+class AlongArc:
+    """Advances a problem by steps of given arc length; the first step of all tells the length, by its load.
+
+    Args:
+        problem: what is loaded.
+
+    Attributes:
+        tried: part of the arc of all nominal steps that the last step was meant to take.
+        most: number of steps, over the nominal one, after which the path is given up.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        if not isinstance(problem.system, BodySystem):
+            raise InputError("arc_length needs contact by elimination: leave out the problem's method")
+        for contact in problem.contacts:
+            if follows_load(as_law(contact.friction)):
+                raise InputError(
+                    f"arc_length leads loads, and friction of contact '{contact.name}' follows the load factor: expected friction that "
+                    "does not"
+                )
+        if not problem.config.moves:
+            refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
+        self._problem, self._arc = problem, ArcLength(problem)
+        self.tried, self.most = 0.0, MOST_STEPS
+
+    def advance(self, done: float) -> tuple[float, list[Iteration]]:
+        """Take a step from the committed load factor ``done`` and commit it (collective).
+
+        Returns:
+            The load factor and the history of the Newton loop.
+        """
+        problem, progress = self._problem, self._problem.progress
+        number = progress.control.number
+        before, self.tried = np.array(problem.committed), progress.control.length
+        if problem.verbose:
+            say(f"load step {number + 1}, along the arc from load factor {done:.6g}")
+        if number == 0:
+            factor, iterations = self.tried, self._by_load(self.tried)
+        else:
+            way = self._way(before - progress.start)
+            self._arc.begin(done, way / self._size(way), progress.reach * self.tried)
+            iterations = problem.attempt(along=self._arc)
+            factor = self._arc.factor
+            _check_values(problem)
+            if factor > 1.0:
+                # the end is a load, which this state is near
+                factor = 1.0
+                iterations = iterations[:-1] + self._by_load(factor)
+        problem.commit()
+        if number == 0:
+            progress.reach = self._size(self._way(problem.committed - before)) / self.tried
+            if progress.reach == 0.0:
+                raise InputError("arc_length needs a load that moves the bodies: expected a load that F depends on")
+        progress.start = before
+        return factor, iterations
+
+    def _by_load(self, factor: float) -> list[Iteration]:
+        """Equilibrium under a load that is given."""
+        self._problem.set_load(factor)
+        _check_values(self._problem)
+        return self._problem.attempt()
+
+    def _way(self, change: Array) -> Array:
+        """That of the displacement's owned components ``(n_owned * gdim,)`` in a change of all local unknowns ``(n,)``."""
+        config = self._problem.config
+        return np.asarray(config.of(change)[: config.n_owned]).ravel()
+
+    def _size(self, way: Array) -> float:
+        """Length of a way ``(n_owned * gdim,)`` (collective)."""
+        return float(np.sqrt(reduced(self._problem.comm, way @ way)))
+
+
+def _check_values(problem: UnitedProblem) -> None:
+    """Refuse Dirichlet values that change with the load factor (collective)."""
+    wanted = np.array(problem.committed)
+    compat.set_bc_values(wanted, problem.bodies.bcs)
+    wanted = problem.bodies.of_owners(wanted)
+    with agreed(problem.comm):
+        if not np.array_equal(wanted, problem.committed):
+            at = problem.config.place_of(int(np.flatnonzero(wanted != problem.committed)[0]))
+            raise InputError(
+                f"arc_length leads loads, and the Dirichlet values of {at} are not those of the committed state: expected values "
+                "that do not change with the load factor; bring them there by load_steps of its own, with arc_length=False"
+            )

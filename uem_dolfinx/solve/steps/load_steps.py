@@ -1,0 +1,175 @@
+"""Load steps: the load grows from 0 to 1 in steps that are cut where they fail; every one that converges is committed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
+from uem_dolfinx.log import progress as progress_bar
+from uem_dolfinx.log import say
+from uem_dolfinx.parallel import agreed
+from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.solve.memory import take_back
+from uem_dolfinx.solve.problem import UnitedProblem, check_steps
+from uem_dolfinx.solve.step_control import REMAINDER, StepControl
+from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.steps.limit_points import LimitPoint
+from uem_dolfinx.solve.steps.load_step import LoadStep
+from uem_dolfinx.solve.united.newton import Iteration
+
+if TYPE_CHECKING:
+    from uem_dolfinx.solve.steps.arc_length import AlongArc
+    from uem_dolfinx.solve.steps.step import Step
+
+
+def load_steps(
+    problem: UnitedProblem, steps: int | Sequence[Step] = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
+) -> Iterator[LoadStep]:
+    """Apply the load in steps, cut on failure, increased again after easy ones to the nominal length at most, with a progress bar.
+
+    Args:
+        problem: problem to solve; its ``load`` is evaluated at factors from 0 to 1 and its Dirichlet values are ramped.
+        steps: nominal number of equal steps; after a cut they end again at multiples of their length. Or a list of ``Step``, each with a
+            number of its own, between which conditions, loads, contacts and coefficients change: the load factor goes from 0 to 1 in each.
+        arc_length: prescribe the load of the first step only, and its length in displacement for all others: the load factor is an
+            unknown, which rises up to limit points and falls beyond them, until it is 1. Dirichlet values are not ramped.
+        checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
+            in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need. On restart, calls of ``load_steps``
+            that the checkpoint has already passed yield no steps.
+
+    Returns:
+        An iterator of converged steps.
+
+    Raises:
+        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more, nor a list of ``Step``, or one of these is not of this
+            problem; with ``arc_length`` if no load moves the bodies, or Dirichlet values do, or there are several ``Step``.
+        CheckpointError: see ``Checkpoint``.
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
+        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
+    """
+    check_steps(problem, checkpoint)
+    several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
+    with agreed(problem.comm):
+        arc_length = given.flag("arc_length", arc_length)
+        if several and arc_length:
+            raise InputError(
+                "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
+            )
+        n = 0 if several else given.count("steps", steps, "or give a list of Step")
+    given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length)
+    if isinstance(steps, Sequence):
+        from uem_dolfinx.solve.steps.stages import check_stages
+
+        check_stages(problem, steps)
+    begin_checkpoint(checkpoint, problem.state, problem.config.functions()[problem.config.name])
+    if isinstance(steps, Sequence):
+        made, total = _in_stages(problem, steps), sum(step.n for step in steps)
+    else:
+        way: ByLoad | AlongArc = ByLoad(problem)
+        if arc_length:
+            from uem_dolfinx.solve.steps.arc_length import AlongArc
+
+            way = AlongArc(problem)
+        made, total = _load_steps(problem, steps, way), steps
+    return between_steps(
+        problem.comm, problem.progress, progress_bar(made, "load steps", total=total), checkpoint, problem.declared
+    )
+
+
+def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadStep]:
+    """The load steps of several ``Step``, one after the other, or up to where a run before the checkpoint has left them."""
+    from uem_dolfinx.solve.steps.stages import Stage
+
+    progress = problem.progress
+    for step in steps:
+        left, through = progress.left_at(), False
+        stage = Stage(problem, step, 1.0 if left is None else left)
+        try:
+            for made in _load_steps(problem, step.n, ByLoad(problem)):
+                yield replace(made, step=step.name, before=progress.ramp - 1)
+            through = True
+        finally:
+            stage.leave()
+            if not through:
+                progress.left[progress.ramp] = progress.factor
+        if left is not None:
+            return
+
+
+def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> Iterator[LoadStep]:
+    """The steps of ``load_steps``."""
+    progress = problem.progress
+    if not progress.begin_ramp(problem.u.x.array, steps):
+        return
+    if progress.factor != 0.0:
+        problem.set_load(progress.factor)
+    #: the last load factor at which an equilibrium was found that is unstable
+    unstable: float | None = None
+    while progress.factor < 1.0:
+        done = progress.factor
+        if progress.control.number >= way.most * steps:
+            raise ConvergenceError(
+                f"the load factor is {done:.3g} after {progress.control.number} steps of the arc, and has not come to 1: the path does "
+                "not lead there; look at the states that were yielded, or take longer steps"
+            )
+        try:
+            factor, iterations = way.advance(done)
+        except UEMError as error:
+            if progress.control.shorten(way.tried, error):
+                continue
+            limit = LimitPoint(problem, arc=not isinstance(way, ByLoad))
+            take_back(problem, done)
+            limit.name(error, done, unstable)
+            raise
+        progress.factor = factor
+        if problem.solver.indefinite:
+            unstable = factor
+        number, cuts = progress.control.done(iterations)
+        yield LoadStep(number, factor, iterations, cuts)
+
+
+class ByLoad:
+    """Advances a problem by steps of given load.
+
+    Args:
+        problem: what is loaded.
+
+    Attributes:
+        tried: part of the load that the last step was meant to add.
+        most: number of steps, over the nominal one, after which the path is given up: this one ends.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        self._problem, self.tried, self.most = problem, 0.0, np.inf
+        self._ramped = not callable(problem.load) and (problem.stage is None or problem.stage.step.ramp)
+
+    def advance(self, done: float) -> tuple[float, list[Iteration]]:
+        """Take a step from the committed load factor ``done`` and commit it (collective).
+
+        Returns:
+            The load factor and the history of the Newton loop.
+        """
+        progress = self._problem.progress
+        factor = _next_factor(done, progress.control)
+        # it may be shorter than was meant
+        self.tried = factor - done
+        if self._problem.verbose:
+            say(f"load step {progress.control.number + 1}, to load factor {factor:.6g}")
+        self._problem.set_load(factor)
+        return factor, self._problem.solve(start=progress.start, fraction=factor if self._ramped else 1.0)
+
+
+def _next_factor(done: float, control: StepControl) -> float:
+    """Load factor at the end of the next step: after a cut, no further than the multiple of the nominal length that was to be reached."""
+    nominal = control.nominal
+    goal = min((np.floor(done / nominal + REMAINDER) + 1.0) * nominal, 1.0)
+    factor = min(done + control.length, goal)
+    if goal - factor < REMAINDER * nominal:
+        factor = goal
+    return 1.0 if 1.0 - factor < REMAINDER else float(factor)

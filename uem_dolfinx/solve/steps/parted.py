@@ -1,0 +1,37 @@
+"""Contacts that were treated together, one by one from now on, for what is asked of each alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from uem_dolfinx.contact.joining import part
+from uem_dolfinx.contact.pair.joined import JoinedInterface
+from uem_dolfinx.solve.bodies.far_apart import FarApart
+from uem_dolfinx.solve.united.exchanges import Exchanges
+from uem_dolfinx.solve.united.rows import OverConstraints
+
+
+def part_contacts(problem: Any) -> None:
+    """Treat all contacts of a problem one by one, between two steps (collective)."""
+    if all(len(pair.members) == 1 for pair in problem.interfaces):
+        return
+    system, before = problem.system, problem.interfaces
+    on = {id(pair) for pair in system.pairs}
+    known = {id(pair): (motion, id(pair) in on) for pair, motion in zip(before, problem.motions)}
+    memory = problem._before
+    kept = {id(pair): own for pair, own in zip(before, zip(memory.pairs, memory.motions))}
+    for whole, pairs in part(problem.contacts):
+        assert isinstance(whole, JoinedInterface)
+        for k, pair in enumerate(pairs):
+            known[id(pair)] = known[id(whole)]
+            kept[id(pair)] = whole.memory_of(k, kept[id(whole)][0]), None
+    after = problem.interfaces
+    problem.motions = [known[id(pair)][0] for pair in after]
+    remembered, motions = ([kept[id(pair)][i] for pair in after] for i in range(2))
+    problem._before = replace(memory, pairs=remembered, motions=motions)
+    problem.watch.begin()
+    system.pairs = pairs = [pair for pair in after if known[id(pair)][1]]
+    system.exchanges, system.far_apart = Exchanges(pairs), FarApart(system.config, pairs)
+    system.over_constraints = OverConstraints(system.config, pairs, system.linear)
+    system.floating.take(pairs, system.far_apart)

@@ -1,0 +1,255 @@
+"""Steps under way: what is switched between them, what that releases, and how loads and coefficients go from value to value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.laws.law import as_law
+from uem_dolfinx.contact.preload import Preload
+from uem_dolfinx.contact.switched import (
+    between,
+    blended_friction,
+    hold,
+    leave_friction,
+    leave_preload,
+    settle,
+    switch_off,
+    switch_on,
+    take_friction,
+    take_preload,
+)
+from uem_dolfinx.errors import CheckpointError, InputError
+from uem_dolfinx.parallel import agreed, ask_together, reduced
+from uem_dolfinx.solve.checks import check_conditions
+from uem_dolfinx.solve.kept import take_multipliers
+from uem_dolfinx.solve.loading import check_load, refuse_idle
+from uem_dolfinx.solve.memory import move_targets
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.reactions import owned_displacement, reactions
+from uem_dolfinx.solve.steps.parted import part_contacts
+from uem_dolfinx.solve.steps.step import Step
+from uem_dolfinx.solve.united.system import BodySystem
+
+
+def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
+    """Refuse steps that are not of this problem, before the first is taken (collective).
+
+    Raises:
+        InputError, InputTypeError, SpaceError: naming the step, and what it cannot do.
+    """
+    with agreed(problem.comm):
+        given.items("steps", steps, lambda one: isinstance(one, Step), "a Step")
+        if not steps:
+            raise InputError("steps = []: expected one Step at least")
+        if problem.dynamics is not None:
+            raise InputError(
+                "steps are for statics: leave dynamics out, or take time_steps and change loads in the loop over these"
+            )
+        if problem.load is not None:
+            raise InputError("the problem has a load, which its steps do not use: leave load out, and give the steps their loads")
+        if problem.history is not None:
+            raise InputError("the problem is being recorded, and Steps change what it is: record the load steps of one load")
+        for i, step in enumerate(steps):
+            _check(problem, step, f"step {i + 1}" + (f", '{step.name}'" if step.name else ""))
+    bcs = [bc for conditions in (problem.bodies.bcs, *(step.bcs or () for step in steps)) for bc in conditions]
+    for i, step in enumerate(steps):
+        words = f"the loads of step {i + 1}" + (f", '{step.name}'" if step.name else "")
+        refuse_idle(problem, step.loads, bcs, words, [replace(one, loads=None) for one in steps])
+    told = [[step.name, step.n, step.ramp, -1 if step.bcs is None else len(step.bcs)] for step in steps]
+    switched = [[f"{contact.name}: {on}" for contact, on in step.contacts.items()] for step in steps]
+    given.alike(problem.comm, "load_steps", steps=told, contacts=switched)
+
+
+def _check(problem: UnitedProblem, step: Step, words: str) -> None:
+    if step.bcs is not None:
+        check_conditions(problem.config, step.bcs)
+    for contact in [*step.contacts, *step.friction, *step.offset, *step.preload]:
+        if not any(contact is one for one in problem.declared):
+            names = ", ".join(repr(one.name) for one in problem.declared) or "none"
+            raise InputError(f"{words}: contact '{contact.name}' is not the problem's: expected one of its contacts, {names}")
+    for contact, value in step.friction.items():
+        before, law = as_law(contact.friction), as_law(value)
+        known = f"a value for the law {type(before).__name__}, with which contact '{contact.name}' was made"
+        given.kind(f"{words}: friction", value, type(law) is type(before), known)
+        if contact.pair.friction is None and (callable(law.field) or law.field > 0.0):
+            raise InputError(
+                f"{words}: contact '{contact.name}' was made without friction: make it with the friction that it is to have, and give "
+                "an earlier step friction 0"
+            )
+    for contact, on in step.contacts.items():
+        if isinstance(contact, Preload):
+            raise InputError(f"{words}: preload '{contact.name}' cannot be switched: give the step preload = {{preload: 0.0}}")
+        if on and getattr(contact, "tied", False) is True:
+            raise InputError(
+                f"{words}: contact '{contact.name}' is tied from the start, and cannot be switched on: make it with tied='after', and "
+                "give the step begin=contact.tie"
+            )
+    if step.contacts or step.bcs is not None:
+        if not isinstance(problem.system, BodySystem):
+            raise InputError(f"{words}: conditions and contacts change where contact is eliminated alone: leave method out")
+        if any(law.perfect for contact in problem.contacts for law in contact.heats):
+            raise InputError(f"{words}: conditions and contacts stay where temperatures are united: give a finite conductance")
+
+
+class Stage:
+    """A step that a problem has begun, or goes on with (making one is collective).
+
+    Args:
+        problem: taken through it.
+        step: as it was declared, and checked.
+        end: load factor at which it ended, if the problem's state is one of a later call.
+
+    Attributes:
+        step: likewise.
+
+    Raises:
+        CheckpointError: if the problem's state is one of another step.
+        InputError: if conditions change at nodes that mortar ties.
+    """
+
+    def __init__(self, problem: UnitedProblem, step: Step, end: float = 1.0):
+        self._problem, self.step = problem, step
+        progress, self._at = problem.progress, 0.0
+        #: Whether nothing of it has been done yet, rather than a part of it, or all, before a checkpoint.
+        fresh = progress.ahead > 0
+        if progress.ahead == 0 and progress.step != step.name:
+            raise CheckpointError(
+                f"the state is one of the step '{progress.step}', which is '{step.name}' now: expected the same steps as before; go "
+                "on with these, or remove the checkpoint"
+            )
+        if fresh and step.begin is not None:
+            ask_together(problem.comm, f"begin of the step '{step.name}'", step.begin)
+        self._switch(fresh)
+        starts = self._take_loads(fresh)
+        known = not fresh
+        for contact, value in step.friction.items():
+            take_friction(contact, blended_friction(contact, value, self._share), known)
+        #: Offsets where the step began.
+        self._offsets = {contact: contact.offset for contact in step.offset}
+        problem.stage = self
+        if fresh:
+            progress.step, progress.loads = step.name, starts
+        else:
+            at = progress.factor if progress.ahead == 0 else end
+            problem.set_load(at, known=True)
+            # earlier steps have been gone through before
+            progress.take_shares(replace(progress.began, led=progress.taken.now().led), progress.taken)
+            progress.take_shares(progress.began, progress.taken.with_led(self.led(at)))
+            move_targets(problem, problem.motions)
+            for pair in problem.interfaces:
+                settle(pair)
+
+    def _share(self, at: float) -> float:
+        """Part of the way from where the step began that is done at a load factor."""
+        return at if self.step.ramp else 1.0
+
+    # -- what is switched ------------------------------------------------------------------------------------------------
+
+    def _switch(self, fresh: bool) -> None:
+        """Take the step's conditions and contacts, and the forces of what it releases (collective)."""
+        problem, step = self._problem, self.step
+        if step.contacts:
+            # some of those that are alike go on without the others
+            part_contacts(problem)
+        bodies, held = problem.bodies, problem.bodies.held
+        parts = [(part, on) for one, on in step.contacts.items() for part in ([one] if isinstance(one, Contact) else one.parts)]
+        left, come = ([part for part, on in parts if on is not part.on and on is which] for which in (False, True))
+        acting = reactions(problem) if fresh and problem.progress.steps else None
+        if step.bcs is not None:
+            bodies.hold(step.bcs)
+        changed = held != bodies.held
+        other = bool(reduced(problem.comm, bool(changed.any()), op=MPI.LOR))
+        if fresh:
+            problem.progress.carried = self._carried(acting, held & changed, left)
+        for pair in problem.interfaces if other else ():
+            hold(pair, bodies.free[: problem.config.n_owned], None if not fresh else problem.config.of(changed).any(axis=1))
+        for part, on in parts:
+            part.switch(on)
+        for part in left if fresh else ():
+            switch_off(part.pair)
+        for part in come if fresh else ():
+            settle(part.pair)
+            switch_on(part.pair)
+        if other or left or come or problem.linear is not None:
+            assert isinstance(problem.system, BodySystem)
+            problem.unite(step.loads, 0.0)
+            if problem.linear is not None and problem.progress.ahead == 0:
+                take_multipliers(problem)
+            left_on = {id(contact.pair.whole) for contact in problem.contacts if contact.on}
+            problem.system.take([pair for pair in problem.interfaces if id(pair) in left_on], problem.linear)
+
+    # -- what is released ------------------------------------------------------------------------------------------------
+
+    def _carried(self, acting: Array | None, released: Bools, left: Sequence[Contact]) -> Array | None:
+        """Forces of what is released at all unknowns, ghosts included ``(n,)``, and what an interrupted step has left; None for none.
+
+        Args:
+            acting: forces of the conditions ``(n,)``; None if there was no step yet, so that nothing carries anything.
+            released: unknowns that are no longer held ``(n,)``.
+            left: contacts that are switched off.
+        """
+        problem, config = self._problem, self._problem.config
+        total = np.zeros(len(released)) if problem.bodies.dead is None else np.array(problem.bodies.dead)
+        if acting is not None:
+            total += np.where(released, acting, 0.0)
+            at = owned_displacement(problem)
+            for contact in left:
+                total[at] += config.add_at_owners(*contact.pair.nodal_forces(contact.pair.committed))
+        return total if reduced(problem.comm, bool(total.any()), op=MPI.LOR) else None
+
+    # -- what is ramped --------------------------------------------------------------------------------------------------
+
+    def _take_loads(self, fresh: bool) -> list[Any]:
+        """Let loads and preloads be the step's; returns where they begin (collective)."""
+        problem, loads, bolts = self._problem, self.step.loads, self.step.preload
+        constants = dict(loads) if isinstance(loads, dict) else {}
+        starts = problem.progress.loads
+        if fresh or problem.progress.ahead < 0:
+            starts = [np.asarray(c.value).tolist() for c in constants]
+            starts += [bolt.carried for bolt in bolts]
+
+        def ramp(start: Any, end: Any) -> Callable[[float], Any]:
+            if callable(end):
+                return end
+            return lambda s: (1.0 - self._share(s)) * np.asarray(start) + self._share(s) * np.asarray(end)
+
+        ramps = [ramp(start, end) for start, end in zip(starts, [*constants.values(), *bolts.values()])]
+        problem.load = dict(zip(constants, ramps)) if constants else check_load(loads)
+        for (bolt, force), follows in zip(bolts.items(), ramps[len(constants) :]):
+            take_preload(bolt, None if force is None else follows, not fresh)
+        return starts
+
+    def led(self, at: float) -> Iterator[tuple[Any, float]]:
+        """Constants, and contacts for their offsets, that it leads to given values, and the share that a load factor has of these."""
+        share, loads, began = self._share(at), self.step.loads, self._problem.progress.began
+        for constant, end in loads.items() if isinstance(loads, Mapping) else ():
+            yield constant, 1.0 if callable(end) else share + (1.0 - share) * began.began(constant)
+        for contact in self.step.offset:
+            yield contact, share + (1.0 - share) * began.began(contact)
+
+    def take_load(self, at: float) -> None:
+        """Release what was carried, and take offsets, as far as a load factor tells (collective)."""
+        problem, self._at = self._problem, at
+        carried, left = problem.progress.carried, 1.0 - self._share(at)
+        problem.bodies.dead = carried * left if carried is not None and left else None
+        for contact, start in self._offsets.items():
+            end = self.step.offset[contact]
+            contact.offset = end if left == 0.0 else between(start, end, self._share(at))
+
+    def leave(self) -> None:
+        """Let everything stay as it is at the load factor that has been reached."""
+        problem = self._problem
+        problem.load = problem.stage = None
+        for contact, value in self.step.friction.items():
+            leave_friction(contact, value, self._at)
+        for bolt in self.step.preload:
+            leave_preload(bolt, self._at)

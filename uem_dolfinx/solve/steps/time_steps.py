@@ -1,0 +1,296 @@
+"""Time steps: shortened where they fail, where contacts would give the bodies energy, and at instants of contact [UEM, 5].
+
+Every step that converges is committed, so that a run that fails keeps its last good state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import compress
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import given
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
+from uem_dolfinx.log import logger, progress, say
+from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.restart.checkpoint import Checkpoint
+from uem_dolfinx.solve.problem import UnitedProblem, check_steps
+from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
+from uem_dolfinx.solve.stepping import ConvergedStep, begin_checkpoint, between_steps
+from uem_dolfinx.solve.united.newton import Iteration
+from uem_dolfinx.solve.united.system import CLOSED
+
+#: Rounding of a time, a few units in its last place.
+#: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
+TIME_ROUNDING = 4 * np.finfo(float).eps
+#: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
+#: in the surfaces that they press.
+#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
+MOST_GIVEN = 2e-3
+#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
+#: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
+SHORTEST_GIVEN = 1.0 / 128
+
+
+@dataclass(frozen=True, repr=False)
+class TimeStep(ConvergedStep):
+    """A converged time step.
+
+    Attributes:
+        number: counted from 1.
+        time: reached.
+        dt: length of the step.
+        iterations: history of the Newton loop.
+        cuts: how often the step had to be shortened.
+        touched: names of the contacts that had no active contactor before the step and have one now.
+        left: names of those that had one and have none now.
+    """
+
+    number: int
+    time: float
+    dt: float
+    iterations: list[Iteration]
+    cuts: int
+    touched: tuple[str, ...]
+    left: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Which step it is, its time, and which contacts have touched or come apart in it."""
+        events = [f"{word} {', '.join(names)}" for word, names in (("touched:", self.touched), ("left:", self.left)) if names]
+        return ", ".join([f"time step {self.number}, time {self.time:.6g}", *events])
+
+    @property
+    def start(self) -> float:
+        """Time at which the step began; with ``event_tolerance`` the instant of the touches and departures in it."""
+        return self.time - self.dt
+
+
+def time_steps(
+    problem: UnitedProblem,
+    dt: float,
+    end: float,
+    *,
+    event_tolerance: float | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Iterator[TimeStep]:
+    """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
+
+    A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would add
+    energy to the bodies within it, and increased again after easy steps.
+
+    Args:
+        problem: with ``dynamics``; its ``load`` is called with the time.
+        dt: nominal length of the steps.
+        end: time to reach.
+        event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``. The step is divided there, so
+            that a step begins at the instant, unless rounding exceeds the forces of such short steps. None: steps are not divided.
+        checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
+            in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need.
+
+    Returns:
+        An iterator of converged steps.
+
+    Raises:
+        InputError, InputTypeError: if ``dt`` is not positive, or smaller than the rounding error of the time, ``end`` before the
+            start or not finite, or ``event_tolerance`` not between 0 and 1.
+        SpaceError: if the problem has no dynamics.
+        CheckpointError: see ``Checkpoint``.
+        TunnellingError: if a contactor passes through a target even in the shortest step.
+        EnergyGivenError: if impact adds energy to the bodies even in the shortest step.
+        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
+        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
+    """
+    check_steps(problem, checkpoint)
+    dynamics = problem.dynamics
+    if dynamics is None:
+        raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
+    with agreed(problem.comm):
+        dt, end = given.number("dt", dt, given.POSITIVE), given.number("end", end, _not_before(dynamics.start))
+        if event_tolerance is not None:
+            event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
+    given.alike(problem.comm, "time_steps", dt=dt, end=end, event_tolerance=event_tolerance)
+    with np.errstate(all="ignore"):
+        squares = np.array([dt, SHORTEST_LENGTH * dt]) ** 2
+        countable = np.isfinite(squares).all() and np.isfinite(1.0 / squares).all()
+    if not countable:
+        raise InputError(f"dt = {dt}: its square, or that of a step that is cut, is no number; take other units of time")
+    if _rounding(dynamics, dt, end) > SHORTEST_LENGTH * dt:
+        raise InputError(
+            f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
+            "take longer steps"
+        )
+    begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
+    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
+    shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
+    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
+
+
+def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
+    """The steps of ``time_steps``."""
+    control = problem.step_control
+    control.begin(dt)
+    problem.set_load(dynamics.time)
+    first = not dynamics.accelerated
+    problem.system.accelerate()
+    if first and problem.history is not None:
+        problem.history.note_start()
+    before, rounding = _touching(problem), _rounding(dynamics, dt, end)
+    while (remainder := end - dynamics.time) > rounding:
+        # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
+        passed = (dynamics.time - dynamics.start) / dt
+        rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
+        length = min(control.longest, dt if abs(rest - dt) <= rounding else rest)
+        try:
+            forces = _contact_forces(problem)
+            length, iterations = _step(problem, length, before, tolerance)
+            _refuse_given_energy(problem, dynamics, length, forces)
+        except UEMError as error:
+            dynamics.restore()
+            problem.set_load(dynamics.time)
+            problem.restore()
+            if control.shorten(length, error):
+                continue
+            raise
+        problem.commit()
+        nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
+        if abs(dynamics.time - nearest) <= rounding:
+            dynamics.time = float(nearest)
+        number, cuts = control.done(iterations)
+        after = _touching(problem)
+        changes = [(c.name, was, now) for c, was, now in zip(problem.contacts, before, after)]
+        touched = tuple(name for name, was, now in changes if now and not was)
+        left = tuple(name for name, was, now in changes if was and not now)
+        yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
+        # the caller may have taken the step again
+        before = _touching(problem)
+
+
+def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
+    """Attempt a step, or the part of it before the first touch or departure: its length and history (collective)."""
+    iterations = _attempt(problem, length)
+    if tolerance is None or length <= tolerance or _touching(problem) == before:
+        return length, iterations
+    # the first trial asks whether the step begins at the instant
+    low, high, trial, reached = 0.0, length, tolerance, 0.0
+    while high - low > tolerance:
+        problem.restore()
+        try:
+            _attempt(problem, trial)
+            same = _touching(problem) == before
+            reached = trial if same else reached
+        except MENDABLE:
+            same = False
+        except PrecisionError:
+            # a step so short that rounding hides its forces: the instant is looked for later
+            same = True
+        low, high = (trial, high) if same else (low, trial)
+        trial = 0.5 * (low + high)
+    problem.restore()
+    length = reached or length
+    return length, _attempt(problem, length)
+
+
+def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
+    """Find the state at the end of a step of this length (collective)."""
+    assert problem.dynamics is not None
+    if problem.verbose:
+        say(f"time step {problem.step_control.number + 1}, to time {problem.dynamics.time + length:.6g}")
+    problem.set_load(problem.dynamics.time + length)
+    problem.dynamics.begin(length)
+    return problem.attempt()
+
+
+def _contact_forces(problem: UnitedProblem) -> list[Array]:
+    """Contact forces on both bodies of each contact that does no work by itself, at this rank's nodes (collective)."""
+    touching = compress(problem.contacts, _touching(problem))
+    own = slice(problem.config.gdim * problem.config.n_owned)
+    return [np.array(c.force.x.array[own]) for c in touching if not c.pair.works]
+
+
+def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
+    """Refuse a step within which contacts have given the bodies energy, by more than their share; warn of it with mass (collective).
+
+    The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along, the
+    less the shorter the step. One that has sunk beside the target's end and is taken back gives a blow in however short a step; from the
+    next attempt on it is left out. Contactors with mass are given energy in steps of any length.
+
+    Args:
+        problem: at the end of the step.
+        dynamics: of the problem.
+        length: of the step.
+        before: contact forces at its beginning.
+
+    Raises:
+        EnergyGivenError: if they have, and a shorter step or another attempt may be better.
+    """
+    control = problem.step_control
+    if not (forces := before + _contact_forces(problem)):
+        return
+    config = problem.config
+    way = config.of(problem.u.x.array - problem.committed)[: config.n_owned].ravel()
+    given = reduced(problem.comm, 0.5 * float(sum(f @ way for f in forces)))
+    if given <= MOST_GIVEN * control.largest_energy:
+        return
+    control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
+    at_work = control.largest_energy + _held_by(problem, forces)
+    if given <= MOST_GIVEN * at_work:
+        return
+    words = f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
+    if dynamics.contactors != "massless":
+        logger.warning("%s, from time %.6g: their contactors have mass; take contactors='massless'", words, dynamics.time)
+        return
+    barred = [pair.bar_returned() for pair in problem.pairs]
+    for pair, count in zip(problem.pairs, barred):
+        if count:
+            logger.warning(
+                "%s: %d contactors that had slid past the end of the target and sunk come back inside it at time %.6g; to put them "
+                "back onto it would be a blow, so they are left out until they are in front of it again",
+                pair.name,
+                count,
+                dynamics.time,
+            )
+    if length > SHORTEST_GIVEN * control.nominal or any(barred):
+        raise EnergyGivenError(words)
+    logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
+
+
+def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
+    """Energy that contact forces ``(n_owned * gdim,)`` hold in the cells they press, the mean of a step's start and end (collective).
+
+    Of bodies at rest it is what the work of these forces is compared with: their kinetic energy is the rounding of nothing.
+    """
+    K = problem.bodies.stiffness
+    if K is None:
+        return 0.0
+    compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()
+    held = sum(0.25 * float(f @ (compliance * f)) for f in forces)
+    # of gaps that count as closed, which rounding leaves
+    open_still = CLOSED * problem.config.size
+    pressed = np.logical_or.reduce([f != 0.0 for f in forces])
+    held += 0.5 * float(K.ravel()[pressed].sum()) * open_still**2
+    return float(reduced(problem.comm, held))
+
+
+def _touching(problem: UnitedProblem) -> list[bool]:
+    """Which contacts have active contactors (collective)."""
+    if not problem.contacts:
+        return []
+    active = np.array([bool(contact.pair.united.any()) for contact in problem.contacts])
+    return list(map(bool, reduced(problem.comm, active, op=MPI.LOR)))
+
+
+def _not_before(start: float) -> given.Range:
+    """Times that steps can end at."""
+    return given.Range(f"a time that is not before the start, {start:.6g}", lambda t: start <= t < np.inf)
+
+
+def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
+    """Difference of times that means nothing."""
+    return max(REMAINDER * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))

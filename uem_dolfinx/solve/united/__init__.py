@@ -1,0 +1,1 @@
+"""The united system and its Newton loop."""

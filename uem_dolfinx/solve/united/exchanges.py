@@ -1,0 +1,328 @@
+"""Which of the wrong contactors change sides, exchange by exchange and iteration by iteration.
+
+A state that comes again is noticed when it does. Another rule takes over then; where none is left, an error names the contactors that
+change sides for ever.
+
+Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
+are: the united matrix is singular, and what it predicts is far beyond the bodies. From the state before, limits of friction are then held
+at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric; without the curvature of contact the problem
+is convex. The forces that follow make the next limits, until these settle, and Coulomb's law goes on from there. So they are once in every
+linearised problem where contactors would go one by one.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.friction.pivot import Pivot
+from uem_dolfinx.contact.friction.stick_slip import FrictionViolations
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import ConvergenceError, FrictionError
+from uem_dolfinx.parallel import gathered, reduced
+from uem_dolfinx.solve.rigid.first_touch import deepest_of
+from uem_dolfinx.solve.rigid.floating import FAR
+
+#: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
+#: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
+ALONG = np.sqrt([2.0, 3.0, 5.0])
+#: The active set of a linearised problem settles within so many exchanges of many contactors or of the worst, or the step is cut.
+#: [bound; exchanges; -]
+MOST_EXCHANGES = 100
+#: Exchanges of the first contactor alone find the active set of every convex problem without friction; they may take so many of them.
+#: [bound; exchanges for each contactor; -]
+MOST_OF_EACH = 20
+#: A state that comes again with more than this part of the residual that it had has led nowhere.
+#: [convention; norm of the residual; test_exchanges.py::test_states_that_come_again]
+NO_LESS = 0.9
+#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left.
+#: [convention; norm of the residual; test_exchanges.py::test_convex_until_it_gets_better]
+WHOLE_AGAIN = 0.1
+#: States of a step may come again so often.
+#: [convention; rounds; test_exchanges.py::test_states_that_come_again]
+MOST_ROUNDS = 6
+#: A state that has come again so often although no contactor changes gets a convex tangent the next time.
+#: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]
+OFTEN = 3
+#: Limits of friction that change by less than this part of the largest are near enough to begin with Coulomb's law.
+#: [convention; the largest limit; test_exchanges.py::test_limits_are_held_until_they_settle]
+LIMITS_NEAR = 0.1
+#: So many of the contactors that change sides for ever are named.
+#: [convention; contactors; test_exchanges.py::test_who_goes_in_a_circle_is_named]
+NAMED = 3
+
+
+@dataclass(frozen=True)
+class _Visit:
+    """A state that the bodies have been in on the way to equilibrium.
+
+    Attributes:
+        state: what tells it from others.
+        norm: of the residual.
+        patterns: of every pair.
+        changed: contactors of every pair that have been exchanged since the one before.
+    """
+
+    state: object
+    norm: float
+    patterns: list[Ints]
+    changed: list[Bools]
+
+
+class Exchanges:
+    """Chooses among the wrong contactors of all pairs; all methods are collective.
+
+    Args:
+        pairs: of all contacts.
+
+    Attributes:
+        straight: whether the linearised problem has to do without the curvature of contact.
+        convex: whether the curvature of contact has to do without what could make the tangent indefinite: Newton's method does not
+            leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
+        frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
+        held: whether limits of friction are held.
+        again: whether the linearised problem is to be solved with other limits of friction, even without changes of sides.
+    """
+
+    def __init__(self, pairs: Sequence[Interface]):
+        self._pairs = pairs
+        self._frictional = any(pair.frictional for pair in pairs)
+        self.begin_step()
+
+    def begin_step(self) -> None:
+        """Forget the states of other steps."""
+        self._visits: list[_Visit] = []
+        self._rounds = 0
+        #: Norm of the residual since when the curvature is convex; zero for the next.
+        self.convex, self._from = False, 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin another linearised problem."""
+        self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
+        self._number, self._alone, self._rule = 0, 0, Rule.ALL
+        #: Whether limits have been held, and the last states without a mechanism.
+        self.held = self._were_held = False
+        self._known: list[tuple[PairState, Pivot] | None] | None = None
+        for pair in self._pairs:
+            if pair.friction is not None:
+                pair.friction.hold_limits(None)
+        #: Contactors exchanged in this problem, and of these by the present rule.
+        self._changed, self._lately = self._none(), self._none()
+
+    @property
+    def ahead(self) -> bool:
+        """See ``Pivoting``."""
+        return self._pivoting.ahead
+
+    def start_again(self) -> None:
+        """See ``Pivoting``."""
+        self._pivoting.start_again()
+
+    def choose(
+        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0
+    ) -> list[Violations] | None:
+        """Which of the wrong contactors are exchanged now; None if the linearised problem is solved.
+
+        Args:
+            violated: of every pair.
+            gaps: that decide on contact, of every pair ``(n,)``.
+            curved: whether the linearised problem has a curvature of contact.
+            way: how far a node goes at most, a length.
+
+        Raises:
+            ConvergenceError, FrictionError: if no rule is left; it names the contactors that are wrong by turns.
+        """
+        comm = self._pairs[0].config.comm
+        if self.frozen:
+            violated = [w.of_contact() for w in violated]
+        own = (
+            sum(w.count for w in violated),
+            sum(int(w.enter.sum()) for w in violated),
+            active_here(self._pairs),
+            sum(len(p.nodes) for p in self._pairs),
+        )
+        told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
+        (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
+        self.again = False
+        if not number:
+            if not self.held:
+                return None
+            self._let_limits_follow(violated)
+            return violated
+        free = self._frictional and not self.held
+        far = free and way > FAR * self._pairs[0].config.size and self._known is not None
+        if free and not far:
+            self._known = self._here(violated)
+        chosen, rule = violated, self._rule if far else self._pivoting.choose(int(number), state)
+        if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
+            if curved:
+                # without curvature the problem with held limits is a convex one
+                self.straight = self.convex = True
+            self._hold_limits()
+            return [w.among(np.zeros_like(w.enter)) for w in violated]
+        if rule >= Rule.FIRST and curved and not self.straight:
+            # with curvature the problem may have no solution, or several; without there is one
+            self._pivoting, self.straight, self.convex = Pivoting(), True, True
+        elif rule == Rule.WORST:
+            worst = reduced(comm, max(w.worst for w in violated), op=MPI.MAX)
+            chosen = [w.among_the_worst(worst) for w in violated]
+        elif rule == Rule.FIRST:
+            chosen = self._first(violated)
+        elif rule == Rule.NONE:
+            if not self._frictional or self.frozen:
+                raise self._circle(self._lately)
+            self._pivoting, self.frozen = Pivoting(), True
+            return self.choose(violated, gaps, curved)
+        elif entering > active:
+            chosen = deepest_of(self._pairs, gaps, violated)
+        if rule != self._rule:
+            self._rule, self._lately = rule, self._none()
+        self._changed, self._lately = ([c | w.which for c, w in zip(before, chosen)] for before in (self._changed, self._lately))
+        if rule == Rule.FIRST:
+            self._alone += 1
+            if self._alone > MOST_OF_EACH * every:
+                raise self._circle(self._lately)
+            return chosen
+        self._solve_again()
+        return chosen
+
+    def _solve_again(self) -> None:
+        self._number += 1
+        if self._number > MOST_EXCHANGES:
+            raise self._circle(self._lately)
+
+    def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
+        """States of the pairs with friction, with the forces along the normal that are predicted."""
+        here: list[tuple[PairState, Pivot] | None] = []
+        for pair, w in zip(self._pairs, violated):
+            if pair.friction is None or not isinstance(w, FrictionViolations):
+                here.append(None)
+            else:
+                here.append((replace(pair.trial, lam=w.seen.lam), pair.friction.pivot))
+        return here
+
+    def _hold_limits(self) -> None:
+        """Go back to the last state without a mechanism, and hold the limits that its forces make (collective)."""
+        for pair, known in zip(self._pairs, self._known or ()):
+            if pair.friction is not None and known is not None:
+                state, pair.friction.pivot = known
+                pair.trial = state
+                pair.friction.hold_limits(state.lam)
+        self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
+        self._solve_again()
+
+    def _let_limits_follow(self, violated: Sequence[Violations]) -> None:
+        """Take the limits that held ones have led to, or Coulomb's law where these are near (collective)."""
+        self._known, each = self._here(violated), np.zeros(2)
+        for pair, known in zip(self._pairs, self._known):
+            if pair.friction is not None and known is not None:
+                pair.trial = known[0]
+                each = np.maximum(each, pair.friction.hold_limits(pair.trial.lam))
+        self._pairs[0].config.comm.Allreduce(MPI.IN_PLACE, each, op=MPI.MAX)
+        if each[0] <= LIMITS_NEAR * each[1]:
+            for pair in self._pairs:
+                if pair.friction is not None:
+                    pair.friction.hold_limits(None)
+            self.held = False
+        self._pivoting, self.again = Pivoting(), True
+        self._solve_again()
+
+    def _none(self) -> list[Bools]:
+        return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
+
+    def _first(self, violated: Sequence[Violations]) -> list[Violations]:
+        """The first of the wrong contactors alone, with those at the same place of the same contact."""
+        config = self._pairs[0].config
+        along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
+        first = np.cumsum([0, *(len(pair.members) for pair in self._pairs)])
+        label, least = [k + pair.label for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
+        for which, w, a in zip(label, violated, along):
+            np.minimum.at(least, which, np.where(w.which, a, np.inf))
+        config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+        k = int(np.argmax(np.isfinite(least)))
+        at = least[k] + TOUCHING * config.size
+        return [w.among((a <= at) & (which == k)) for which, w, a in zip(label, violated, along)]
+
+    def visit(self, norm: float) -> bool:
+        """Note the state in which the bodies are, which is no equilibrium.
+
+        Args:
+            norm: of the residual.
+
+        Returns:
+            Whether it has come again, and contactors that go in and out of corners follow bends less closely from now on.
+
+        Raises:
+            ConvergenceError, FrictionError: if it has come again otherwise, naming the contactors that change.
+        """
+        if self.convex:
+            self._from = self._from or norm
+            self.convex = norm > WHOLE_AGAIN * self._from
+        if not self.convex:
+            self._from = 0.0
+        here = _Visit(self._state(), norm, [pair.pattern for pair in self._pairs], self._changed)
+        back = [k for k, v in enumerate(self._visits) if v.state == here.state and norm > NO_LESS * v.norm > 0.0]
+        self._visits.append(here)
+        if not back:
+            return False
+        since = self._visits[back[-1] + 1 :]
+        changed = [
+            np.any([v.changed[i] | (v.patterns[i] != here.patterns[i]).any(axis=1) for v in since], axis=0)
+            for i in range(len(self._pairs))
+        ]
+        comm = self._pairs[0].config.comm
+        if not reduced(comm, sum(int(c.sum()) for c in changed)):
+            if len(back) <= OFTEN:
+                return False
+            self.convex, self._from = True, max(norm, self._from)
+            return False
+        self._visits, self._rounds = [], self._rounds + 1
+        calmed = reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        # no rule found the active set of the last linearised problem, and it has led back to the same state
+        if self._rounds == MOST_ROUNDS or (self.frozen and not calmed):
+            raise self._circle(changed)
+        return calmed
+
+    def _state(self) -> tuple[int, ...]:
+        """What tells the present states of all contactors from others."""
+        return tuple(gathered(self._pairs[0].config.comm, self._pattern()))
+
+    def _pattern(self) -> int:
+        """What tells the present states of this rank's contactors from others."""
+        return zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
+
+    def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
+        """The error that names contactors ``(n,)`` of every pair."""
+        own = [
+            (tuple(pair.config.X[pair.nodes[i]]), pair.name_at(int(i)), pair.config.describe(int(pair.nodes[i])))
+            for pair, c in zip(self._pairs, changed)
+            for i in np.flatnonzero(c)
+        ]
+        found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
+        names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])
+        more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
+        why = "touch and let go, or stick and slip" if self._frictional else "touch and let go"
+        return (FrictionError if self._frictional else ConvergenceError)(
+            f"the active set goes in a circle: contactors {why} by turns: {names}{more}; take smaller load steps, or a target of finer "
+            f"facets there{', or less friction' if self._frictional else ''}"
+        )
+
+
+def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
+    """Number of wrong contactors over all pairs and ranks (collective)."""
+    return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0
+
+
+def active_here(pairs: Sequence[Interface]) -> int:
+    """Number of active contactors of this rank."""
+    return sum(int(pair.trial.active.sum()) for pair in pairs)

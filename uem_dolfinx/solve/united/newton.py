@@ -1,0 +1,442 @@
+"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, constraints, solve, until equilibrium and contact hold.
+
+The loop speaks to the bodies and to a ``ContactMethod``, so it serves statics and dynamics, and any way to impose contact, alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Ints
+from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
+from uem_dolfinx.log import logger, say
+from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
+from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, runs_away, worst
+from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
+
+#: A residual that keeps this part of its norm twice has met its rounding.
+#: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
+STALLED = 0.5
+#: Shortest step of the line search.
+#: [bound; halvings of a step; -]
+SHORTEST_SEARCH = 1.0 / 64
+#: Longest step where forces drive the bodies on.
+#: [bound; doublings of a step; -]
+LONGEST_SEARCH = 64.0
+#: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
+#: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
+ENOUGH_DECREASE = 0.9
+#: A solve that another iteration follows leaves this part of its right-hand side, times the relative residual [Eisenstat and Walker,
+#: SIAM Journal on Scientific Computing 17 (1996) 16-32]; one that asks which contactors are wrong leaves this part as it is.
+#: [heuristic; right-hand side; test_invariance.py::test_any_pose_and_numbering]
+FORCING = 1e-4
+#: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
+#: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
+ACCURACY_AT_THE_END = 0.1
+#: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
+#: [bound; norm of the forces; test_trust.py::test_converged_means_converged]
+LARGEST_ROUNDING = 1e-4
+
+#: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
+InEquilibrium = Callable[[Norm, Norm, Norm], bool]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of the history.
+
+    Attributes:
+        residual: norm of ``Q'r`` over the forces at work.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks with which the bodies moved on.
+        changed: whether contactors were activated or released, or entered or left a corner.
+        linear_iterations: of the solves that followed; 0 if the step had converged.
+        step_length: of the line search in the step that led here.
+        exchanges: further solves with the same tangent, each with another active set.
+    """
+
+    residual: float
+    gap: float
+    active: int
+    changed: bool
+    linear_iterations: int
+    step_length: float
+    exchanges: int = 0
+
+
+@dataclass(frozen=True)
+class IterationState:
+    """A state of the united system as the loop sees it.
+
+    Attributes:
+        trial: P and c, by which the bodies move.
+        test: Q, by which forces are handed on; the same object as P unless a coupling tells trial from test rows.
+        residual: ``Q'F``, the out-of-balance forces.
+        norm: its norm.
+        scale: norm of the forces at work.
+        rounding: norm below which a force is rounding of the displacement.
+        gap: largest gap of an active contactor, a length.
+        active: number of active contactors over all ranks.
+        changed: whether contactors have changed what they are united to because of where they are.
+        right: whether no contactor breaks the conditions of contact, as far as the present forces tell.
+        closed: whether gaps and Dirichlet conditions are met.
+        in_contact: whether there are contacts at all.
+    """
+
+    trial: Restriction
+    test: Restriction
+    residual: PETSc.Vec
+    norm: Norm
+    scale: Norm
+    rounding: Norm
+    gap: float
+    active: int
+    changed: bool
+    right: bool
+    closed: bool
+    in_contact: bool
+
+
+class LinearisedProblem(NamedTuple):
+    """``Q'KP dq = rhs`` in one active set, and how it is to be solved.
+
+    Attributes:
+        state: whose P and Q these are.
+        rhs: right-hand side ``Q'(r - K c)``.
+        exact: whether solves are to leave no more than rounding, since no iteration follows that makes up for it.
+        iterative: whether solves leave as much as they may, and can go on from the solution of another active set.
+        passing: whether another iteration follows in any case.
+        fits: whether a full step needs no line search.
+        convex: whether the tangent leaves out what could make it indefinite, so that steps are no longer than forces drive the bodies.
+    """
+
+    state: IterationState
+    rhs: PETSc.Vec
+    exact: bool
+    iterative: bool
+    passing: bool
+    fits: bool
+    convex: bool
+
+
+class Increment(NamedTuple):
+    """Solution of a linearised problem.
+
+    Attributes:
+        dq: unknowns.
+        du: ``P dq + c``.
+        rhs: right-hand side that they belong to; a method that leads the load adds to it.
+        linear_iterations: number of linear iterations.
+        left: part of the right-hand side that may be left.
+        longest: part of it that may be taken at most; 1 unless the method knows better.
+    """
+
+    dq: PETSc.Vec
+    du: PETSc.Vec
+    rhs: PETSc.Vec
+    linear_iterations: int
+    left: float
+    longest: float = 1.0
+
+
+class ContactMethod(Protocol):
+    """How contact is imposed on bodies; every method is collective.
+
+    ``system.BodySystem`` eliminates the contactors; another method implements the same.
+    """
+
+    def begin_step(self) -> None:
+        """Begin a step, before the loop."""
+
+    def place(self) -> None:
+        """Project the contactors where bodies and targets are now."""
+
+    def return_to_targets(self, bound: float) -> bool:
+        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets, unless that makes forces of a norm above ``bound``.
+
+        Returns:
+            Whether any has been moved, by more than rounding of positions; contactors are projected again then.
+        """
+
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
+        """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
+
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """The united matrix ``Q'KP`` and right-hand side of a state.
+
+        Args:
+            state: P and Q.
+            iteration: number of the iteration that begins with it; None for another active set in the same one, whose tangents stay.
+        """
+
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Solve a linearised problem, in the unknowns that contact asks for; ``complete`` tells the others.
+
+        Args:
+            problem: the last one.
+            accuracy: part of the right-hand side that may be left.
+            near: unknowns to begin with, those of another active set or accuracy, or None.
+        """
+
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
+        """The state in which contactors that ``step`` shows on the wrong side have changed sides; None if none is to change.
+
+        Bodies and residual are those that the iteration began with. A ConvergenceError bounds the number of states.
+        """
+
+    def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
+        """The increment in all unknowns, if the last solve was of some."""
+
+    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
+        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``."""
+
+    def end_step(self) -> None:
+        """End a step in which the loop has converged; may refuse it."""
+
+    def accelerate(self) -> None:
+        """Find the acceleration that the bodies start with, in dynamics."""
+
+    def forget(self) -> None:
+        """Let the next step assemble and factorise anew, as the first of a run does."""
+
+
+def solve_united(
+    bodies: Bodies,
+    method: ContactMethod,
+    *,
+    rtol: float,
+    max_iterations: int,
+    line_search: bool,
+    verbose: bool,
+    forces_before: Norm = 0.0,
+    check_signals: Callable[[], None] | None = None,
+) -> list[Iteration]:
+    """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
+
+    Args:
+        bodies: without contact.
+        method: how contact is imposed on them.
+        rtol: bound on the norm of ``Q'r`` relative to the forces at work.
+        max_iterations: bound on the number of iterations.
+        line_search: shorten steps that invert cells or increase the work of the residual.
+        verbose: print a line per iteration.
+        forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
+        check_signals: called on all ranks after every linear solve; what it raises ends the loop.
+
+    Returns:
+        The history; its last entry is the converged state.
+
+    Raises:
+        FloatingBodyError: if the residual stays and what is solved for grows, since nothing holds a body or a field.
+        ConvergenceError: after ``max_iterations``, where the residual runs away, or where an active set does not settle, with the history.
+        PrecisionError: if rounding hides whether the forces are in equilibrium.
+        NotFiniteError: if the residual is NaN or infinite at the start of the step.
+        InvertedElementError: if even the shortest step turns a cell inside out.
+    """
+    history: list[Iteration] = []
+    start: Norm = 0.0
+    norm: Norm = 0.0
+    left: Norm = 0.0
+    within: Norm = np.inf
+    stalled: int | Ints = 0
+    norms, length = bodies.unknowns.norms, 1.0
+
+    def rounding_of_all(rounding: Norm, times: int) -> Norm:
+        # a residual that has not fallen so often has met the rounding of laws that start from the deformation gradient
+        more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
+        return np.maximum(np.maximum(rounding, left), more)
+
+    def bounded(rounding: Norm, forces: Norm) -> Norm:
+        # what is not small beside forces is rounding of a displacement as large as the model, as at the start, or as conditions lead it
+        if not np.any(rounding > within):
+            return rounding
+        of_model = FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()
+        return np.minimum(rounding, np.maximum(np.maximum(within, LARGEST_ROUNDING * forces), of_model))
+
+    def in_equilibrium(norm: Norm, scale: Norm, rounding: Norm) -> bool:
+        forces = np.maximum(scale, start)
+        return bool(np.all(norm <= np.maximum(rtol * forces, bounded(rounding_of_all(rounding, 1), forces))))
+
+    method.place()
+    if not bodies.assemble():
+        raise NotFiniteError(
+            "the residual is not finite at the start of the step: "
+            "check loads, material parameters and the initial displacement for NaN and division by zero"
+        )
+    for k in range(max_iterations + 1):
+        with _told(history):
+            state = method.assemble_constraints(in_equilibrium)
+        if k == 0:
+            # a displacement that comes back to nothing keeps the rounding of what it was
+            start, left, within = state.norm, np.minimum(state.rounding, rtol * forces_before), state.rounding
+        forces = np.maximum(state.scale, start)
+        if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * first(forces)):
+            bodies.assemble()
+            with _told(history):
+                state = method.assemble_constraints(in_equilibrium)
+        steady = state.right and not state.changed
+        stalled = np.where(state.norm > STALLED * norm, stalled + 1, 0) if k > 0 and not state.changed else 0
+        norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
+        if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
+            # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
+            real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
+            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding, forces))
+            small = np.where((small < norm) & (norm <= rounding), excused, small)
+        converged = steady and state.closed and bool(np.all(norm <= small))
+        hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
+        flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding, forces)) < norm) & (norm <= rounding))
+        if converged or hidden or flown.any() or (lost := runs_away([i.residual for i in history])) or k == max_iterations:
+            history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
+            _report(history, verbose)
+            if converged:
+                return history
+            if hidden:
+                raise no_precision(*worst(norm, rounding, real))
+            if flown.any():
+                error = unheld(bodies, int(flown.argmax()), history[-1].residual)
+                # a shorter step may keep bodies in their contacts
+                raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
+            break
+        # the residual that a step begins with knows nothing of conditions and gaps
+        relative = ratio(norm, forces) if k > 0 else 1.0
+        with _told(history):
+            problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * first(forces), relative, check_signals)
+        driving = np.maximum(norms(problem.rhs), norms(step.rhs))
+        within = np.maximum(within, LARGEST_ROUNDING * driving) if k == 0 else within
+        residual = ratio(driving, np.maximum(forces, driving if k == 0 else 0.0))
+        changed = state.changed or exchanges > 0
+        history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
+        _report(history, verbose)
+        length = _advance(bodies, method, problem, step, line_search)
+    last, more = history[-1], "" if lost else ", or raise max_iterations"
+    raise ConvergenceError(
+        f"no convergence in {k} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
+        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps{more}",
+        history,
+    )
+
+
+@contextmanager
+def _told(history: list[Iteration]) -> Iterator[None]:
+    """Give the history to errors that do not know it."""
+    try:
+        yield
+    except ConvergenceError as error:
+        error.history = list(history)
+        raise
+
+
+def _solve_linearised(
+    method: ContactMethod,
+    state: IterationState,
+    iteration: int,
+    wanted: float,
+    relative: float,
+    check_signals: Callable[[], None] | None,
+) -> tuple[LinearisedProblem, Increment, int, int]:
+    """Solve the linearised problem together with the conditions of contact; nothing moves.
+
+    Args:
+        method: how contact is imposed.
+        state: to begin with.
+        iteration: number of this iteration.
+        wanted: norm of the residual that convergence asks for.
+        relative: residual over the forces at work.
+        check_signals: see ``solve_united``.
+
+    Returns:
+        The problem whose active set agrees with its solution, the solution, and the numbers of linear iterations and of exchanges.
+    """
+    solves, exchanges = 0, 0
+    problem, near = method.linearise(state, iteration), None
+    while True:
+        accuracy = _accuracy(problem, iteration, wanted, relative)
+        # contactors that are wrong by far are told long before the solution is accurate
+        loose = problem.iterative and problem.state.in_contact and accuracy < FORCING
+        for left in (FORCING, accuracy) if loose else (accuracy,):
+            step = method.solve(problem, left, near)
+            solves, near = solves + step.linear_iterations, step.dq
+            if check_signals is not None:
+                check_signals()
+            better = method.exchange(problem, step)
+            if better is not None:
+                break
+        if better is None:
+            return problem, method.complete(problem, step), solves, exchanges
+        problem, near, exchanges = method.linearise(better, None), better.trial.reduce(step.du), exchanges + 1
+
+
+def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relative: float) -> float:
+    """Part of the right-hand side that a solve may leave."""
+    if problem.exact:
+        return 0.0
+    state, driving = problem.state, problem.rhs.norm()
+    last = ACCURACY_AT_THE_END * wanted / driving if driving > 0 else 0.0
+    passing = problem.passing or state.changed or (iteration == 0 and state.in_contact)
+    return min(max(last, FORCING * min(relative, 1.0) if passing else 0.0), ACCURACY_AT_THE_END)
+
+
+def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, step: Increment, line_search: bool) -> float:
+    """Take the step, shortened where the displacement's forces ask for it, to where the next iteration begins: the length taken."""
+    start, state, dq = bodies.displacement(), problem.state, step.dq
+    work_of, norms = bodies.unknowns.work, bodies.unknowns.norms
+    work, norm, length = abs(work_of(dq, step.rhs)), first(norms(step.rhs)), step.longest
+    while True:
+        last = not line_search or length <= SHORTEST_SEARCH
+        if _moved(bodies, method, start, step, length):
+            if last or problem.fits:
+                return length
+            residual = method.reduced_residual(state)
+            least = first(state.rounding) * first(norms(dq))
+            less_work = abs(work_of(dq, residual)) <= max(ENOUGH_DECREASE * work, least)
+            downhill = problem.convex and work_of(dq, residual) < 0.0
+            if downhill and not less_work and length == 1.0:
+                return _downhill(bodies, method, state, start, step)
+            if less_work or downhill or first(norms(residual)) <= ENOUGH_DECREASE * norm:
+                return length
+        elif last:
+            where = bodies.inverted()
+            if where is None:
+                raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
+            raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+        length *= 0.5
+
+
+def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increment, length: float) -> bool:
+    """Displace the bodies, project the contactors and assemble the residual: whether it is finite, and no cell turned inside out."""
+    bodies.displace(start, step.du, length)
+    if bodies.inverted() is not None:
+        return False
+    method.place()
+    return bodies.assemble()
+
+
+def _downhill(bodies: Bodies, method: ContactMethod, state: IterationState, start: PETSc.Vec, step: Increment) -> float:
+    """Go on from a full step as long as forces still drive the bodies that way: the length taken, of 1, 2, 4 ... up to a bound."""
+    length, along = 1.0, partial(bodies.unknowns.work, step.dq)
+    while length < LONGEST_SEARCH:
+        if not _moved(bodies, method, start, step, 2.0 * length) or along(method.reduced_residual(state)) >= 0.0:
+            break
+        length *= 2.0
+    _moved(bodies, method, start, step, length)
+    return length
+
+
+def _report(history: list[Iteration], verbose: bool) -> None:
+    i = history[-1]
+    line = (
+        f"  {len(history) - 1:3d}  residual {i.residual:.3e}  gap {i.gap:.1e}  active {i.active:5d}{'*' if i.changed else ' '}  "
+        f"exchanges {i.exchanges:2d}  linear {i.linear_iterations:3d}  step {i.step_length:g}"
+    )
+    if verbose:
+        say(line)
+    else:
+        logger.debug(line)

@@ -1,0 +1,360 @@
+"""Uniting equations of all pairs brought together: where they can conflict, Q, and how conflicts are resolved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra.dependent import IndependentEquations
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.rings import DependentRingError
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Constraints, Traction
+from uem_dolfinx.errors import ConflictError, FrictionError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.surfaces import followed_nodes
+from uem_dolfinx.parallel import agree, reduced
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
+from uem_dolfinx.solve.united.newton import IterationState
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
+    from uem_dolfinx.contact.thermal.heat import Heat, HeatEquations
+
+
+class OverConstraints:
+    """How equations of several contacts can meet (collective).
+
+    Args:
+        config: configuration of the displacement.
+        pairs: of all contacts; they are told whether their surfaces are contactor and target of each other.
+        linear: equations of users; None for none.
+
+    Attributes:
+        shared: whether a node is a contactor of several pairs.
+        stacked: whether a node that is followed may itself be eliminated.
+        contestable: whether equations can conflict that follow each other in no ring.
+    """
+
+    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
+        self._unknowns = config.unknowns
+        # contacts that are treated together meet each other one by one
+        surfaces, which = _surfaces([one for pair in pairs for one in pair.members])
+        follows = [followed_nodes(config, dofs) for dofs in surfaces]
+        whole, pairs = pairs, [one for pair in pairs for one in pair.members]
+        table: Bools = np.zeros((len(follows), config.n_local), dtype=bool)
+        for k, own in enumerate(follows):
+            table[k] = own
+        meets: Bools = np.zeros((len(pairs), len(pairs)), dtype=bool)
+        for k, pair in enumerate(pairs):
+            meets[k] = np.asarray(table[:, pair.nodes].any(axis=1))[which]
+        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
+        shared = len(np.unique(contactors)) < len(contactors)
+        found = np.append(meets.ravel(), shared)
+        config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
+        meets = found[:-1].reshape(meets.shape)
+        self.shared = bool(found[-1])
+        # bodies that follow each other in one order never follow each other both ways
+        ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
+        one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
+        both_ways = meets & meets.T & ~one_order
+        # what is tied as a whole never touches: its surfaces meet others beside it alone
+        tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
+        refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
+        for pair, mutual, wrong in zip(pairs, both_ways.any(axis=1), refused):
+            pair.mutual = bool(mutual)
+            if wrong and not pair.discretisation.two_pass:
+                raise ConflictError(
+                    f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
+                    "one of the two contacts, or give both coupling='node_to_surface'"
+                )
+        self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
+        self.contestable = self.shared or any(pair.discretisation.prescribed for pair in whole)
+        if any(_united_fields(pair) for pair in pairs):
+            # temperatures of both sides stand in the same rows, and may be prescribed
+            self.stacked = self.contestable = True
+        self._n_linear = 0
+        self._rigid = None if linear is None else linear.rigid
+        if linear is not None:
+            self._meet(config, linear.equations, contactors, follows)
+
+    def _meet(self, config: Configuration, linear: UnitingEquations, contactors: Indices, follows: Sequence[Bools]) -> None:
+        """Take in how equations of users meet each other and those of contacts (collective)."""
+        self._n_linear = len(linear) - (0 if self._rigid is None else self._rigid.n_rows)
+        eliminated = np.zeros(config.n_local, dtype=bool)
+        eliminated[linear.node] = True
+        at_contactors = bool(eliminated[contactors].any())
+        followed = any(bool(f[linear.node].any()) for f in follows)
+        eliminated[contactors] = True
+        followed |= bool((config.ask_owners(linear.followed, eliminated[: config.n_owned, None].astype(float)) > 0).any())
+        at_contactors, followed = reduced(config.comm, np.array([at_contactors, followed])) > 0
+        self.stacked, self.contestable = self.stacked or bool(followed), self.contestable or bool(at_contactors)
+
+    def parted(self, equations: UnitingEquations) -> tuple[UnitingEquations, list[UnitingEquations]]:
+        """Equations as they can be told to be independent, and those of rigid couplings, which others speak of no more (collective)."""
+        if self._rigid is None:
+            return equations, []
+        last = np.arange(len(equations)) >= len(equations) - self._rigid.n_rows
+        return self._rigid.rewritten(equations.select(~last)), [equations.select(last)]
+
+    def restrict(
+        self, equations: UnitingEquations, free: Bools, prescribed: Array
+    ) -> tuple[Restriction, IndependentEquations | None]:
+        """P or Q of equations, and how conflicts among them were resolved (collective).
+
+        Args:
+            equations: of all pairs together, and after them those of users.
+            free: components that are not held ``(n_rows, gdim)``.
+            prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
+        """
+        given, rigid = self.parted(equations)
+        firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
+        left = free if self._rigid is None else self._rigid.left(free)
+        independent = IndependentEquations(self._unknowns, given, left, firm=firm) if self.contestable else None
+        own = given if independent is None else independent.equations
+        stacked = self.stacked or (independent is not None and independent.found)
+        try:
+            return Restriction(self._unknowns, joined(own, rigid, g), free, prescribed, stacked), independent
+        except DependentRingError as error:
+            ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
+        independent = IndependentEquations(self._unknowns, given, left, ring, firm)
+        return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Uniting equations of all pairs in one state, and what was made of them.
+
+    Attributes:
+        equations: of every pair; those of users come after them in P and Q.
+        trial: all that P is made of; None where it is ``frictionless``.
+        independent: how conflicts were resolved; None if there could be none.
+        test: Q.
+        frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
+        heat: equations of temperatures by number of their pair, each of one field, which come after those of ``equations``, before those
+            of users.
+        rigid: couplings whose equations come last; None without any.
+        given: what Q was made of before it was rewritten for these; None without any.
+    """
+
+    equations: list[Constraints]
+    trial: UnitingEquations | None
+    independent: IndependentEquations | None
+    test: Restriction
+    frictionless: Restriction
+    heat: dict[int, list[HeatEquations]]
+    rigid: RigidNodes | None = None
+    given: UnitingEquations | None = None
+
+
+@dataclass(frozen=True)
+class BodyState(IterationState):
+    """``IterationState`` with the rows that it was made of, and what the direction of slip adds to tangent and residual."""
+
+    rows: Rows
+    added: PETSc.Mat | None
+    held: PETSc.Vec | None
+
+    def with_pressures(self, pairs: Sequence[Interface], K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
+        """The state with how heat changes with pressures, as far as they are forces of single contactors (collective).
+
+        Args:
+            pairs: of all contacts.
+            K: tangent of the bodies, whose rows at the contactors tell how contact forces change.
+            G: curvature of the contact, or None.
+        """
+        state, test, parts, first = self, self.test, [], 0
+        if test.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+            return self
+        for pair, own in zip(pairs, self.rows.equations):
+            parts += [heat.by_forces(own, test.lift[first : first + len(own)]) for heat in pair.heats if callable(heat.law.h)]
+            first += len(own)
+        if not parts:
+            return self
+        by_forces = contact_curvature(parts, self.residual)
+        for matrix in (K, G):
+            if matrix is not None:
+                state = replace(state, added=together(state.added, by_forces.matMult(matrix)))
+        return state
+
+
+def make_rows(
+    over_constraints: OverConstraints,
+    pairs: Sequence[Interface],
+    hold: Callable[[UnitingEquations, UnitingEquations], Bools],
+    prescribed: Array,
+    linear: UserRows | None = None,
+) -> Rows:
+    """Equations of all pairs in their present states, and Q (collective).
+
+    Args:
+        over_constraints: of the pairs.
+        pairs: of all contacts.
+        hold: free components ``(n_rows, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
+        prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
+        linear: equations of users; None for none.
+
+    Raises:
+        FrictionError: if contactors wedge where several equations meet.
+    """
+    rigid = [pair for pair in pairs if not (pair.target.n_nodes or pair.kinematics.idle)]
+    for pair in rigid if over_constraints.shared else ():
+        pair.meet([other for other in rigid if other is not pair])
+    equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
+    united = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
+    heat = {i: [one.equations() for one in fields] for i, fields in united if fields}
+    users = [] if linear is None else [linear.at_present()]
+    more = [*(e.rows for fields in heat.values() for e in fields), *users]
+    frictionless = trial = UnitingEquations.join([*(e.frictionless for e in equations), *more], g)
+    if any(e.trial is not e.frictionless for e in equations):
+        trial = UnitingEquations.join([*(e.trial for e in equations), *more], g)
+    resisting = stopping = trial
+    if heat or any(e.resisting is not e.trial for e in equations):
+        resisting, stopping = (
+            UnitingEquations.join([*parts, *users], g)
+            for parts in ([e.resisting for e in equations], [e.stopping for e in equations])
+        )
+    # the derivatives of the gaps tell which motions of a body nothing holds
+    free = hold(stopping, resisting)
+    Q, independent = over_constraints.restrict(frictionless, free, prescribed)
+    given = frictionless
+    rotated = Q
+    if any(e.test is not e.frictionless for e in equations):
+        given = UnitingEquations.join([*(e.test for e in equations), *more], g)
+        test, last = over_constraints.parted(given)
+        if independent is not None and independent.found:
+            independent = _rotated(pairs, independent, test)
+            test = independent.equations
+        try:
+            rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
+        except DependentRingError as error:
+            _refuse_wedged(pairs, test, error.rows[: len(test)])
+            raise
+    couplings = None if linear is None else linear.rigid
+    return Rows(
+        equations,
+        None if trial is frictionless else trial,
+        independent,
+        rotated,
+        Q,
+        heat,
+        couplings,
+        None if couplings is None else given,
+    )
+
+
+def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
+    """Nodes of all targets, those of one surface once, and which of these each pair has ``(n_pairs,)``."""
+    keys = [id(getattr(pair.target, "facets", pair)) if len(pair.whole.members) > 1 else id(pair) for pair in pairs]
+    first = {key: pair.discretisation.followed for key, pair in reversed(list(zip(keys, pairs)))}
+    return list(first.values()), np.array([list(first).index(key) for key in keys], dtype=np.int64)
+
+
+def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int) -> UnitingEquations:
+    """Equations and others after them."""
+    return UnitingEquations.join([equations, *more], block) if more else equations
+
+
+def _united_fields(pair: Interface) -> list[Heat]:
+    """Heat of those fields that are the same on both sides where the pair's surfaces touch."""
+    return [heat for heat in pair.heats if heat.law.perfect]
+
+
+def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array | None) -> tuple[list[Traction], Array]:
+    """Contact forces of every pair, with the heat that goes through it, and multipliers of users' equations ``(m,)`` (collective).
+
+    Args:
+        pairs: of all contacts; they are told which of their equations are redundant.
+        rows: their equations.
+        y: forces that were passed on by Q.
+        du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
+    """
+    n_rigid = 0 if rows.rigid is None else rows.rigid.n_rows
+    lam, last = np.split(rows.test.multipliers(y), [len(rows.test.equations) - n_rigid])
+    redundant = np.zeros(len(lam), dtype=bool)
+    if rows.independent is not None:
+        lam, redundant = rows.independent.forces(lam), rows.independent.redundant
+    found, start = [], 0
+    for pair, own in zip(pairs, rows.equations):
+        part = slice(start, start + len(own))
+        pair.set_redundant(own, redundant[part])
+        found.append(pair.forces(own, lam[part], du))
+        start = part.stop
+    for i, fields in rows.heat.items():
+        powers = []
+        for heat, equations in zip(_united_fields(pairs[i]), fields):
+            part = slice(start, start + len(equations.which))
+            powers.append(heat.read(equations, lam[part], redundant[part]))
+            start = part.stop
+        found[i] = found[i]._replace(heat=np.column_stack(powers))
+    if rows.rigid is not None and rows.given is not None:
+        last = rows.rigid.beside(last, rows.given.select(np.arange(len(rows.given)) < len(lam)), lam)
+    return found, np.append(lam[start:], last)
+
+
+def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
+    """Equations that conflicted, rotated where contactors slip (collective).
+
+    Args:
+        pairs: of all contacts.
+        independent: how they were resolved without friction.
+        test: rotated equations of all pairs.
+
+    Raises:
+        FrictionError: naming the first contactor, of the first rank that has one, whose equations no longer tell its motion.
+    """
+    rotated = independent.rotated(test)
+    _refuse_wedged(pairs, test, rotated.undetermined)
+    return rotated
+
+
+def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: Bools) -> None:
+    """Raise a FrictionError of the first contactor with rotated equations that no longer tell its motion, on any rank (collective)."""
+    bad, error = np.flatnonzero(wedged), None
+    if len(bad):
+        node = int(test.node[bad[0]])
+        names = ", ".join(one.name for pair in pairs for one in pair.members if node in one.nodes)
+        error = FrictionError(
+            f"{names}: friction leaves more than one answer about the contactor at {pairs[0].config.describe(node)}, where several uniting "
+            "equations meet and it wedges: take less friction there, or drop one of the contacts"
+        )
+    agree(pairs[0].config.comm, error)
+
+
+def unbalanced(
+    pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction], more: Array | None = None
+) -> tuple[Array, Array]:
+    """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
+
+    ``forces`` are those of every pair, ``more (n_owned, gdim)`` those of equations of users, None without any.
+    """
+    config = pairs[0].config
+    every = F.array_r.reshape(-1, config.gdim)[: config.n_owned].copy()
+    left = every.copy() if more is None else every - more
+    for pair, found in zip(pairs, forces):
+        left -= pair.config.add_at_owners(*pair.nodal_forces(pair.with_forces(found)))
+    return left, every
+
+
+def not_held() -> FrictionError:
+    """For bodies that friction does not hold."""
+    return FrictionError(
+        "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
+        "Dirichlet condition, give it inertia, or take less load"
+    )
+
+
+def several_answers() -> FrictionError:
+    """The refusal of an equilibrium between which and that without friction the united matrix was singular."""
+    return FrictionError(
+        "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP has another sign than "
+        "without friction; take less friction, or stiffer bodies"
+    )

@@ -1,0 +1,459 @@
+"""The united system: bodies, contact pairs, P and Q brought together for the Newton loop.
+
+It implements ``newton.ContactMethod`` by elimination, and leaves load steps and commits to the problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Traction
+from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import gathered, reduced
+from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
+from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, known_forces, slip_terms, together
+from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead
+from uem_dolfinx.solve.rigid.floating import FloatingBodies
+from uem_dolfinx.solve.rigid.unheld import refuse_bare
+from uem_dolfinx.solve.united.exchanges import Exchanges, count
+from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.rows import (
+    BodyState,
+    OverConstraints,
+    Rows,
+    make_rows,
+    not_held,
+    read_forces,
+    several_answers,
+    unbalanced,
+)
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.user_rows import UserRows
+
+#: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
+#: [convention; the increment; test_system.py::test_what_a_solve_predicts]
+PREDICTED = 1e-8
+#: Part of the model's size that an active contactor's gap may be left with.
+#: [convention; the model's size; test_system.py::test_gaps_that_count_as_closed]
+CLOSED = 1e-13
+
+
+class BodySystem:
+    """Bodies whose active contactors are eliminated.
+
+    Args:
+        bodies: without contact.
+        pairs: of all contacts, just made.
+        solver: of the united system.
+        newton: ``"full"`` or ``"modified"``.
+        consistent_tangent: whether the curvature of the contact is added to K.
+        linear: equations of users; None for none.
+    """
+
+    def __init__(
+        self,
+        bodies: Bodies,
+        pairs: Sequence[Interface],
+        solver: UnitedSolver,
+        *,
+        newton: str = "full",
+        consistent_tangent: bool = True,
+        linear: UserRows | None = None,
+    ):
+        self.bodies, self.solver = bodies, solver
+        self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
+        self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
+        self.newton, self.consistent_tangent = newton, consistent_tangent
+        solver.lasting = bodies.tangent.linear or newton == "modified"
+        #: Curvature of the contact in the last united matrix; None where it had none.
+        self.curvature: PETSc.Mat | None = None
+        self._petrov_galerkin = False  # whether P differs from Q
+        #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
+        self._not_unique: tuple[BodyState, bool] | None = None
+        #: Whether the bodies have moved in this step.
+        self._led = False
+        #: Whether the last exchange has let go of a body that loads drive.
+        self._adrift = False
+        #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
+        self._swept = False
+        self._multipliers: Array = np.zeros(0)  # of the equations of users, as read last ``(m,)``
+        #: Equations where the contactors were placed last, with the directions of slip there; None before they were asked for.
+        self._here: Rows | None = None
+        self.take(pairs, linear)
+        self.place()
+        for pair in self.pairs:
+            check_initial(pair)
+            pair.activate_touching()
+
+    def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
+        """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
+        from uem_dolfinx.solve.bodies.far_apart import FarApart
+
+        self.pairs, self.linear, self._here = list(pairs), linear, None
+        self._heats = [heat for pair in self.pairs for heat in pair.heats]
+        self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
+        self.over_constraints = OverConstraints(self.config, self.pairs, linear)
+        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
+        self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
+
+    # -- where the contactors stand --------------------------------------------------------------------------------------
+
+    def place(self) -> None:
+        """Project the contactors where bodies and targets are now."""
+        if self.linear is not None:
+            self.linear.place()
+        self._here = None
+        if not self.pairs:
+            return
+        self.bodies.check_displacement(min(pair.target.stride for pair in self.pairs))
+        with timed("search and projection"):
+            self.far_apart.place()
+            for pair in self.pairs:
+                pair.project()
+
+    def return_to_targets(self, bound: float) -> bool:
+        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets (collective); see ``ContactMethod``."""
+        if not self.pairs:
+            return False
+        assert self.bodies.stiffness is not None
+        ways = [pair.return_vectors() for pair in self.pairs]
+        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(self.pairs, ways)]
+        disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
+        if not 0.0 < disturbance <= bound:
+            return False
+        shared = self.over_constraints.shared
+        for k, (pair, way) in enumerate(zip(self.pairs, ways)):
+            for j, rows in enumerate(pair.turns() if shared else [slice(None)]):
+                if shared and j + k > 0:
+                    # what another pair has returned is returned
+                    pair.project()
+                    way = pair.return_vectors()
+                self.config.shift(pair.nodes[rows], way[rows])
+        self.bodies.u.x.scatter_forward()
+        self.place()
+        return True
+
+    def begin_step(self) -> None:
+        """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
+        self._not_unique, self._led = None, False
+        self.exchanges.begin_step()
+        for pair in self.pairs:
+            pair.discretisation.begin_step()
+            if pair.sliding == "small":
+                pair.project()
+        self.floating.begin_step(self.place)
+        if self.pairs and self.bodies.dynamics is None and self.floating.motions is None:
+            touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place, self.far_apart.look_within)
+
+    def end_step(self) -> None:
+        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
+        for pair in self.pairs:
+            check_prescribed(pair)
+        if self.linear is not None:
+            self.linear.check()
+        self.floating.end_step()
+        if self._not_unique is not None:
+            state, negative = self._not_unique
+            added = together(self.curvature, state.added)
+            if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
+                raise several_answers()
+
+    # -- equations and forces --------------------------------------------------------------------------------------------
+
+    def residual(self) -> PETSc.Vec:
+        """Forces of the bodies less loads of contacts, and friction that does not grow with the force along the normal (collective)."""
+        F = self.bodies.residual
+        for nodes, forces in filter(None, (*known_forces(self.pairs), *(pair.applied_forces() for pair in self.pairs))):
+            F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
+        for heat in self._heats:
+            F.array[:] += heat.residual()
+        return F
+
+    def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
+        """Where the contactors belong at the present displacement, and the equations that follow.
+
+        1. Take Q'F with the present equations.
+        2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem predicted.
+        3. Let go of contactors past an end, and follow the others across bends, into corners and out of them.
+        4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
+        5. Take the equations that follow, Q'F with them, and which contactors break the conditions of contact.
+        """
+        bodies, pairs, turning = self.bodies, self.pairs, self.linear is not None and self.linear.turning
+        if bodies.stiffness is None and pairs:
+            # what tells tension from rounding
+            bodies.update_tangent()
+        F, rounding = self.residual(), self.rounding()
+        with timed("uniting equations"):
+            rows, self._here = self._rows_here(), None
+            y = rows.test.pass_on(F)
+            residual = rows.test.reduce(y)
+            at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
+            if at_rest or (turning and not pairs):
+                self._take(self._read_forces(rows, y))
+                if any(heat.lags for heat in self._heats):
+                    residual = rows.test.transpose(F := self.residual())
+                    at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
+            self._swept = not at_rest
+            moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
+            if moved:
+                for pair in pairs:
+                    pair.place_again()
+            here = [(pair, pair.stiffness_across(bodies.stiffness), bodies.rounding_at(pair.nodes)) for pair in pairs]
+            found = [pair.violated(pair.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here]
+            violated = count(pairs, found)
+            # one that is let go of falls, whatever the active set lacks
+            unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
+            wanting = not (at_rest and violated == 0 and not moved)
+            # the residual that a step begins with does not know how far conditions lead the bodies
+            if wanting and pairs and self._led and self.exchanges.visit(first(self.unknowns.norms(residual))):
+                for pair in pairs:
+                    pair.place_again()
+                moved = True
+            fallen = self.floating.fall_again(self.place, unsettled, at_rest)
+            if moved or fallen:
+                rows = self._rows()
+                residual = rows.test.transpose(self.residual())
+        trial, added, held, active, gap = self._trial_of(rows)
+        torn = max([heat.torn() for heat in self._heats], default=0.0)
+        return BodyState(
+            trial=trial,
+            test=rows.test,
+            residual=residual,
+            norm=self.unknowns.norms(residual),
+            scale=self.bodies.forces_at_work(self.bodies.residual),
+            rounding=rounding,
+            gap=gap,
+            active=active,
+            changed=moved or fallen,
+            right=at_rest and violated == 0,
+            closed=gap <= CLOSED * self.config.size and torn <= CLOSED and self.bodies.dirichlet_met(),
+            in_contact=bool(pairs),
+            rows=rows,
+            added=added,
+            held=held,
+        )
+
+    def _rows_here(self) -> Rows:
+        """Equations where the contactors have been placed, with the directions of slip there (collective)."""
+        if self._here is None:
+            for pair in self.pairs:
+                assert self.bodies.stiffness is not None
+                pair.turn(self.bodies.stiffness)
+            self._here = self._rows()
+        return self._here
+
+    def _rows(self) -> Rows:
+        """Equations of all pairs in their present states, and Q (collective)."""
+        hold = partial(self.floating.hold, self.bodies.free_rows)
+        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed, self.linear)
+
+    def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
+        """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
+        # where equations conflict, those of P might eliminate other components than those of Q
+        contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
+        apart = None if contested else rows.trial
+        self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
+        trial = rows.frictionless
+        if apart is not None:
+            trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
+        gaps = [pair.largest_gap_here() for pair in self.pairs]
+        gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
+        united = sum(int(pair.united.sum()) for pair in self.pairs)
+        told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
+        terms = slip_terms(self.pairs, self.unknowns.vector(), self.linear)
+        return trial, *terms, int(told[:, 0].sum()), float(told[:, 1].max())
+
+    def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
+        """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
+        if not self.pairs:
+            return None
+        state, du, left = problem.state, step.du, step.left
+        assert isinstance(state, BodyState)
+        driving = max(first(self.unknowns.norms(rhs)) for rhs in (problem.rhs, step.rhs)) if left > 0.0 else 0.0
+        with timed("uniting equations"):
+            increment = du.array_r[: self._n].reshape(-1, self.config.gdim)
+            way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
+            self.far_apart.look_within(way)
+            F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
+            forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
+            near = max(PREDICTED, left) * way
+            predicted = [pair.predicted(increment) for pair in self.pairs]
+            sliding = self._sliding(F, forces)
+            moved = increment if sliding is None else increment + sliding
+            violated = []
+            for pair, gap, seen in zip(self.pairs, predicted, forces):
+                along = pair.stiffness_across(self.bodies.stiffness)
+                least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
+                violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
+            if self._adrift:
+                chosen = violated if count(self.pairs, violated) else None
+            else:
+                chosen = self.exchanges.choose(violated, predicted, self.curvature is not None, way)
+            if chosen is None and sliding is not None and not self.exchanges.frozen:
+                raise not_held()
+            if chosen is None or self._adrift:
+                negative, either = self.solver.negative, self.unknowns.mixed and self.solver.tells_sign
+                self._not_unique = (state, negative) if negative or either else None
+                self._take(forces)
+                return None
+            if self.exchanges.straight:
+                self.curvature = None
+            if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen)]):
+                self.exchanges.start_again()
+            rows = self._rows()
+            # a body that is let go has to fall first
+            self._adrift = self.floating.adrift
+            return self._with_rows(state, rows)
+
+    def _with_rows(self, state: BodyState, rows: Rows) -> BodyState:
+        """The same bodies and residual with other rows (collective)."""
+        trial, added, held, active, _ = self._trial_of(rows)
+        return replace(state, trial=trial, test=rows.test, rows=rows, added=added, held=held, active=active, right=False)
+
+    def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
+        """What contact, friction and present forces add to ``F = K du`` (collective)."""
+        for more in (self.curvature, state.added):
+            if more is not None:
+                F.axpy(1.0, forms.product(more, du))
+        F.axpy(1.0, self.residual())
+        if state.held is not None:
+            F.axpy(1.0, state.held)
+        return F
+
+    def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
+        """How bodies slide without end under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
+        if self.floating.motions is None or not self.frictional:
+            return None
+        # known forces are among those of the contact
+        every = F + (self.bodies.residual - self.residual())
+        more = None if self.linear is None else self.linear.forces(self._multipliers)
+        return self.floating.slide(*unbalanced(self.pairs, every, forces, more))
+
+    def restriction(self) -> Restriction:
+        """Q of the present equations (collective)."""
+        return self._rows().test
+
+    def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[Traction]:
+        """Contact forces of every pair, from forces that were passed on (collective)."""
+        forces, self._multipliers = read_forces(self.pairs, rows, y, du)
+        return forces
+
+    def _take(self, forces: list[Traction]) -> None:
+        """Hand the contact forces to the pairs."""
+        for pair, own in zip(self.pairs, forces):
+            pair.set_forces(own)
+        if self.linear is not None:
+            self.linear.multipliers = self._multipliers
+
+    def rounding(self) -> float:
+        """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
+        active = [pair.nodes[pair.united] for pair in self.pairs]
+        of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
+        return of_bodies + FORCE_ROUNDING * sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
+
+    def reduced_residual(self, state: IterationState) -> PETSc.Vec:
+        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``.
+
+        Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
+        """
+        return self._rows_here().test.transpose(self.residual())
+
+    def accelerate(self) -> None:
+        """Find the acceleration that the bodies start with (collective)."""
+        dynamics = self.bodies.dynamics
+        if dynamics is not None and not dynamics.accelerated:
+            self.place()
+            self.bodies.assemble()
+            self.floating.begin_motion()
+            Q, F = self.restriction(), self.residual()
+            dynamics.accelerate(Q, F, added_mass(self.linear, F))
+            if self.linear is not None:
+                self.linear.settle(dynamics)
+
+    # -- linear system ---------------------------------------------------------------------------------------------------
+
+    def _differentiate(self, first: bool) -> None:
+        """Tangent of the bodies and curvature of the contact at the present displacement (collective)."""
+        forms.free_petsc_garbage(self.comm)
+        self._led = True
+        if first:
+            self.solver.begin_step()
+        if first or self.newton == "full":
+            self.bodies.update_tangent()
+        with timed("contact curvature"):
+            how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex, self.linear
+            self.curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
+        self.exchanges.begin()
+        self._adrift = False
+
+    def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
+        """United matrix ``Q'KP`` of a state, and the right-hand side ``Q'(r - K c)`` (collective)."""
+        if iteration is not None:
+            self._differentiate(first=iteration == 0)
+        assert isinstance(state, BodyState)
+        K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
+        state = state.with_pressures(self.pairs, K, self.curvature) if self._heats else state
+        curvature = together(self.curvature, state.added)
+        refuse_bare(self.bodies, P, Q, curvature)
+        # a modified Newton loop lets small changes of P pass
+        self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
+        linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
+        # momentum is kept exactly where solves can be
+        passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
+        return LinearisedProblem(
+            state=state,
+            rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
+            exact=not iterative and (self.bodies.dynamics is not None or not passing),
+            iterative=iterative,
+            passing=passing,
+            fits=linear,
+            convex=self.exchanges.convex,
+        )
+
+    def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
+        """Unknowns dq, and ``du = P dq + c``, first of all nodes where motions or contactors untouched so far ask (collective)."""
+        # held limits follow what a solve predicts: it is as good as a direct one
+        accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
+        self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
+        dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
+        if near is None:
+            some = None if self.floating.neutral or any(pair.far for pair in self.pairs) else [pair.nodes for pair in self.pairs]
+            dq = self.solver.complete(dq, some)
+        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
+
+    def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
+        """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
+        dq = self.solver.complete(step.dq)
+        return step if dq is step.dq else step._replace(dq=dq, du=self.move(problem.state, dq))
+
+    def forget(self) -> None:
+        """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
+        self.solver.forget()
+
+    def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
+        """``du = P dq + c``; bodies stay where they are along neutral motions."""
+        du = state.trial.expand(dq)
+        du.axpy(1.0, state.trial.c)
+        du.array[: self._n] = self.floating.without_open_motions(du.array_r[: self._n])
+        return du
+
+    @property
+    def frictional(self) -> bool:
+        """Whether there is friction."""
+        return any(pair.frictional for pair in self.pairs)
