@@ -18,12 +18,12 @@ it is solved, ``help(uem.ResultsWriter)`` and ``help(uem.plot_scene)`` what is w
 
 The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
 
-1. Unite: the normal displacement of each active contactor follows the target: ``contact.node_to_surface`` and
-   ``contact.bernstein``, or ``contact.mortar``, write the equations, ``algebra.restriction`` builds P and c from them.
+1. Unite: the normal displacement of each active contactor follows the target: ``contact.nodes.node_to_surface`` and
+   ``contact.nodes.bernstein``, or ``contact.mortar.placement``, write the equations, ``algebra.restriction`` builds P and c from them.
 2. Solve the united system (``algebra.linear_solver``); once forces are in equilibrium, return each contactor along the normal onto the
-   moved target (``contact.interface``, with projections from ``geometry``).
-3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.system``.
-4. Activate contactors that have gone through, release those that pull (``contact.active_set``), iterate (``solve.newton``).
+   moved target (``contact.pair.interface``, with projections from ``geometry``).
+3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.united.system``.
+4. Activate contactors that have gone through, release those that pull (``contact.seam.active_set``), iterate (``solve.united.newton``).
 
 [UEM]: K. Farahani, M. Mofid, A. Vafai: United elements method for general contact-impact problems. Computer Methods in Applied
 Mechanics and Engineering 191 (2001) 843-860.

@@ -18,8 +18,15 @@ REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
     ("arrays", "errors", "compiled", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
-    ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("output",), ("scripting",),
+    ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("gradients",), ("output",), ("scripting",),
 ]  # fmt: skip
+#: Folders within contact/ from the ground up, and files of its own among them; ``""`` is all its other files.
+FLOORS = {
+    "uem_dolfinx.contact": [
+        "laws", "seam", "nodes", "mortar", "friction", "ties", "thermal", "pair", "offsets", "results", "warnings", "", "general",
+    ],
+    "uem_dolfinx.solve": ["bodies", "rigid", "united", "", "steps"],
+}  # fmt: skip
 LONGEST = 450
 #: Names of modules whose versions differ.
 THIRD = {"dolfinx", "fem", "mesh", "io", "gmshio", "geometry", "ufl", "basix", "np", "numpy", "PETSc", "gmsh", "la", "cpp"}
@@ -102,6 +109,25 @@ def test_imports_point_one_way():
     edges = package()
     assert {room(name) for name in edges} == set(floor)
     assert [(a, b) for a, found in edges.items() for b in found if floor[room(b)] > floor[room(a)]] == []
+
+
+@pytest.mark.parametrize("top", FLOORS)
+def test_imports_within_a_room_point_one_way(top):
+    """A folder knows only those before it."""
+
+    def floor(name):
+        first = name.removeprefix(f"{top}.").split(".")[0]
+        return FLOORS[top].index(first if first in FLOORS[top] else "")
+
+    edges = {a: {b for b in found if b.startswith(f"{top}.")} for a, found in package().items() if a.startswith(f"{top}.")}
+    assert len(edges) > 20
+    assert [(a, b) for a, found in edges.items() for b in found if floor(b) > floor(a)] == []
+
+
+def test_nothing_imports_gradients():
+    """They read everything; what only gives them their types is no import."""
+    wing = {a: {b for b in found if room(b) == "gradients"} for a, found in package().items() if room(a) != "gradients"}
+    assert {a: found for a, found in wing.items() if found} == {}
 
 
 def test_demos_stand_on_their_own():

@@ -41,7 +41,6 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
-    from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
@@ -104,8 +103,6 @@ class Contact(WatchedContact, given.Sealed):
     SETTABLE = dict.fromkeys(("friction", "offset"))
     #: Whether it is one of those that a general contact consists of.
     of_all_surfaces = False
-    #: What friction by pairs of surfaces it has, as one of those.
-    _by_pairs: ValuesOfPairs | None = None
 
     def __init__(
         self,
@@ -214,10 +211,13 @@ class Contact(WatchedContact, given.Sealed):
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
                 "the friction that it is to have, and set friction = 0 until then"
             )
-        self._by_pairs = None
+        self._take_friction(law, mu)
+        self._friction = value
+
+    def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
+        """Take a law with these values at the contactors ``(n,)``, None for zeros."""
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
-        self._friction = value
 
     def take_load(self, at: float, known: bool = False) -> None:
         """Take friction at a load factor or a time, if it follows these (collective).

@@ -1,6 +1,6 @@
-"""What an interface with friction adds along the target: equations of contactors that stick, rotated rows and forces of those that slip.
+"""Friction of an interface: equations of contactors that stick, rotated rows and forces of those that slip, along the target.
 
-``friction`` says, as functions of arrays, which contactors stick and which slip, and a law how much force that takes.
+``stick_slip`` decides on arrays which contactors stick and which slip, by a law's limit.
 """
 
 from __future__ import annotations
@@ -57,8 +57,7 @@ class Sliding:
 
     frame: Frame
 
-    #: Makes what tells where slip begins, for another linearised problem.
-    front: Any = Front
+    front: Any = Front  #: Makes what tells where slip begins, for another linearised problem.
 
     def __init__(
         self,

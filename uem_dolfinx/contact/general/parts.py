@@ -22,6 +22,7 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.general.mortar import Body
+    from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
     from uem_dolfinx.geometry.neighbours import Neighbours
     from uem_dolfinx.geometry.skin import Skin
 
@@ -32,6 +33,8 @@ class GeneralPart(Contact):
     of_all_surfaces = True
     #: Of all bodies.
     _skin: Skin
+    #: Friction by pairs of surfaces.
+    _by_pairs: ValuesOfPairs | None = None
 
     @cached_property
     def surface(self) -> Areas:
@@ -41,6 +44,11 @@ class GeneralPart(Contact):
     def friction_values(self) -> Array:
         """Values that friction has at this rank's contactors, by whatever pair."""
         return super().friction_values() if self._by_pairs is None else self._by_pairs.values.ravel()
+
+    def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
+        """One value for all pairs is all that there is from then on."""
+        self._by_pairs = None
+        super()._take_friction(law, mu)
 
     def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
         """Values at contactors ``(n,)``, of pairs those to begin with; None if none has friction (collective)."""

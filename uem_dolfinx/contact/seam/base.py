@@ -33,7 +33,7 @@ class OnTarget:
         frictional: whether there is friction.
         anchor: projection whose feet a contact with small or fixed sliding keeps.
         offset: by how much both surfaces together are taken to be thicker at the contactors ``(n,)``; None for nothing.
-        far: whether the surfaces are so far apart that contactors are not looked at, see ``solve.far_apart``.
+        far: whether the surfaces are so far apart that contactors are not looked at, see ``solve.bodies.far_apart``.
     """
 
     ordered_by = -1

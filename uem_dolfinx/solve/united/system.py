@@ -1,7 +1,4 @@
-"""The united system: bodies, contact pairs, P and Q brought together for the Newton loop.
-
-It implements ``newton.ContactMethod`` by elimination, and leaves load steps and commits to the problem.
-"""
+"""The united system: bodies, contact pairs, P and Q together, as the ``newton.ContactMethod`` of elimination."""
 
 from __future__ import annotations
 
@@ -30,18 +27,10 @@ from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, known_for
 from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.rigid.unheld import refuse_bare
+from uem_dolfinx.solve.united import rows as united_rows
 from uem_dolfinx.solve.united.exchanges import Exchanges, count
 from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
-from uem_dolfinx.solve.united.rows import (
-    BodyState,
-    OverConstraints,
-    Rows,
-    make_rows,
-    not_held,
-    read_forces,
-    several_answers,
-    unbalanced,
-)
+from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
@@ -172,7 +161,7 @@ class BodySystem:
             state, negative = self._not_unique
             added = together(self.curvature, state.added)
             if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
-                raise several_answers()
+                raise united_rows.several_answers()
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
@@ -306,7 +295,7 @@ class BodySystem:
             else:
                 chosen = self.exchanges.choose(violated, predicted, self.curvature is not None, way)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
-                raise not_held()
+                raise united_rows.not_held()
             if chosen is None or self._adrift:
                 negative, either = self.solver.negative, self.unknowns.mixed and self.solver.tells_sign
                 self._not_unique = (state, negative) if negative or either else None
@@ -343,7 +332,7 @@ class BodySystem:
         # known forces are among those of the contact
         every = F + (self.bodies.residual - self.residual())
         more = None if self.linear is None else self.linear.forces(self._multipliers)
-        return self.floating.slide(*unbalanced(self.pairs, every, forces, more))
+        return self.floating.slide(*united_rows.unbalanced(self.pairs, every, forces, more))
 
     def restriction(self) -> Restriction:
         """Q of the present equations (collective)."""
@@ -351,7 +340,7 @@ class BodySystem:
 
     def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[Traction]:
         """Contact forces of every pair, from forces that were passed on (collective)."""
-        forces, self._multipliers = read_forces(self.pairs, rows, y, du)
+        forces, self._multipliers = united_rows.read_forces(self.pairs, rows, y, du)
         return forces
 
     def _take(self, forces: list[Traction]) -> None:
