@@ -111,6 +111,55 @@ def test_imports_point_one_way():
     assert [(a, b) for a, found in edges.items() for b in found if floor[room(b)] > floor[room(a)]] == []
 
 
+#: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
+BUDGETS = {
+    "members of the seam": 49, "members of Interface": 95, "heuristics": 14, "arrows within contact": 60, "arrows within solve": 32,
+    "lines of the package": 43917,
+}  # fmt: skip
+
+
+def members(module, *names):
+    """Methods, properties and declared attributes of classes, all their ``self.`` attributes among them."""
+    found = set()
+    for node in ast.parse((thresholds.PACKAGE / module).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef) and node.name in names:
+            found |= {n.name for n in node.body if isinstance(n, ast.FunctionDef)}
+            found |= {n.target.id for n in node.body if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+            stored = (n for n in ast.walk(node) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store))
+            found |= {n.attr for n in stored if isinstance(n.value, ast.Name) and n.value.id == "self"}
+    return found - {name for name in found if name.startswith("__")}
+
+
+def arrows(top):
+    """Pairs of folders, or files beside them, within a room of which one imports from the other."""
+    first = {name: name.removeprefix(f"{top}.").split(".")[0] for name in package() if name.startswith(f"{top}.")}
+    return {
+        (first[a], first[b]) for a, found in package().items() if a in first for b in found & first.keys() if first[a] != first[b]
+    }
+
+
+def counts():
+    """What the budgets count."""
+    return {
+        "members of the seam": sum(
+            len(members("contact/seam/placement.py", name)) for name in ("Kinematics", "Discretisation", "Stretching")
+        ),
+        "members of Interface": len(members("contact/pair/interface.py", "Interface") | members("contact/pair/told.py", "Told")),
+        "heuristics": sum(row.kind == "heuristic" for row in thresholds.thresholds()),
+        "arrows within contact": len(arrows("uem_dolfinx.contact")),
+        "arrows within solve": len(arrows("uem_dolfinx.solve")),
+        "lines of the package": sum(p.read_text(encoding="utf-8").count("\n") for p in python_files("uem_dolfinx")),
+    }
+
+
+def test_budgets():
+    """Members of the seam and of an interface, heuristics, imports between folders and lines: none grows, and what shrinks lowers them."""
+    found = counts()
+    assert found.keys() == BUDGETS.keys()
+    assert {name: n for name, n in found.items() if n > BUDGETS[name]} == {}
+    assert {name: n for name, n in found.items() if n < 0.95 * BUDGETS[name]} == {}, "lower the budget"
+
+
 @pytest.mark.parametrize("top", FLOORS)
 def test_imports_within_a_room_point_one_way(top):
     """A folder knows only those before it."""
