@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import common
@@ -74,10 +75,11 @@ def python_files(*tops):
     return [p for top in tops for p in sorted((REPOSITORY / top).rglob("*.py"))]
 
 
+@cache
 def package():
     """Imports among the modules of the package; its front door collects them all."""
     edges = imports(modules(thresholds.PACKAGE))
-    edges.pop("uem_dolfinx")
+    del edges["uem_dolfinx"]
     return {name: {to for to in found if to != "uem_dolfinx"} for name, found in edges.items()}
 
 
