@@ -121,7 +121,7 @@ class TargetFacets:
             )
         agree(self.config.comm, error)
 
-    def _side_keys(self) -> Ints:
+    def side_keys(self) -> Ints:
         """What tells each side of each facet, alike on both facets that share it ``(m n_sides, k)``."""
         corners = 1 if self.shape.dim == 1 else 2
         sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
@@ -129,7 +129,7 @@ class TargetFacets:
 
     def _open_sides(self) -> npt.NDArray[np.bool_]:
         """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
-        return (count_keys(self.config.comm, self._side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges()))
+        return (count_keys(self.config.comm, self.side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges()))
 
     def _open_nodes(self) -> npt.NDArray[np.bool_]:
         """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""

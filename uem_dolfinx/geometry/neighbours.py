@@ -118,7 +118,7 @@ class Neighbours:
         itself: Bools,
     ):  # fmt: skip
         self.skin, self.nodes, self.place, self._n = skin, nodes, place, n_lists
-        self._apart, self._overlap, self.itself = apart, overlap, itself
+        self.apart, self._overlap, self.itself = apart, overlap, itself
         config = self._config = skin.config
         watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
         #: Nodes whose motion counts, body by body, and where those of each body begin.
@@ -301,13 +301,13 @@ class Neighbours:
     @cached_property
     def sides(self) -> Bools:
         """In which sets of facets that never touch each other nodes are ``(n, s)``."""
-        sets = [a[0] for a in self._apart] + [a[2] for a in self._apart] + [np.zeros(self._config.n_local, bool)]
+        sets = [a[0] for a in self.apart] + [a[2] for a in self.apart] + [np.zeros(self._config.n_local, bool)]
         return np.column_stack([a[self.nodes] for a in sets])
 
     def excluded(self, sides: Bools, facet: Ints) -> Bools:
         """Which nodes in these sets ``(k, s)`` never touch this rank's facets ``(k,)``."""
-        out, n = np.zeros(len(facet), bool), len(self._apart)
-        for k, (_, a, _, b) in enumerate(self._apart):
+        out, n = np.zeros(len(facet), bool), len(self.apart)
+        for k, (_, a, _, b) in enumerate(self.apart):
             out |= (sides[:, k] & b[facet]) | (sides[:, n + k] & a[facet])
         return out
 

@@ -111,7 +111,7 @@ class Skin(TargetFacets):
         n_sides = len(self.shape.edges())
         number = self.first[self.config.comm.rank] + np.arange(len(X))
         told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), n_sides, axis=0)
-        others = sums_by_keys(self.config.comm, self._side_keys(), told) - told
+        others = sums_by_keys(self.config.comm, self.side_keys(), told) - told
         g, one = self.config.gdim, others[:, 0] == 1
         self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), n_sides)
         cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])

@@ -36,7 +36,7 @@ class Body(MeshTarget):
 
     def __init__(self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[Apart], overlap: float):
         super().__init__(facets)
-        self.skin, self.number = skin, body
+        self.skin, self.number, self.apart = skin, body, apart
         own = np.flatnonzero(skin.body == body)
         #: Numbers of its facets among those of all bodies, over all ranks ``(m,)``.
         self.numbers: Ints = skin.first[skin.config.comm.rank] + own

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -12,7 +12,9 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.results import ContactResults
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
-from uem_dolfinx.errors import UEMError
+from uem_dolfinx.errors import OrientationError, UEMError
+from uem_dolfinx.geometry.facets import facets_of
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
+    from uem_dolfinx.contact.warnings.edges_inside import EdgesInside, Meeting
     from uem_dolfinx.contact.warnings.target_corners import CornerInside, TargetCorners
 
 
@@ -28,9 +31,13 @@ class WatchedContact(ContactResults):
 
     Attributes:
         adjust: whether gaps at the start have been closed, and how far.
+        tied: whether contactors are tied from the start, or ``"after"``.
+        target: facets, or a rigid surface.
     """
 
     adjust: float | bool
+    tied: bool | str
+    target: Any
     _offsets: Offsets | None
 
     def begin(self) -> None:
@@ -59,6 +66,19 @@ class WatchedContact(ContactResults):
     def sees_corners(self) -> bool:
         """Whether convex corners of the target may enter facets between contactors."""
         return self.pair.discretisation.at_feet and self.contactor.dim > 0
+
+    def edges_that_meet(self) -> Meeting | None:
+        """Surfaces whose sharp edges may cross, in 3D; the same two of contacts that have them together (collective)."""
+        from uem_dolfinx.contact.warnings.edges_inside import Meeting
+
+        config = self.config
+        if config.tdim < 3 or self.contactor.dim < 2 or self.tied is True or not isinstance(self.target, Tag):
+            return None
+        try:
+            return Meeting(facets_of(config, self.contactor, "contactor"), facets_of(config, self.target))
+        except OrientationError:
+            # a surface inside a body has no outside which an edge could come from
+            return None
 
     @property
     def corner(self) -> CornerInside | None:
@@ -101,10 +121,26 @@ class Watch:
     def __init__(self, contacts: Sequence[WatchedContact]):
         self._contacts = contacts
         self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
+        self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._off_at_start: dict[int, Bools] = {}
         self.begin()
+        self._take_edges()
         for group in _by_interface([c for c in contacts if not c.adjust]).values():
             _warn_of_sagging_facets(group)
+
+    def _take_edges(self) -> None:
+        """Find the sharp edges of surfaces that may meet (collective)."""
+        meetings: dict[tuple[int, int], tuple[Meeting, list[WatchedContact]]] = {}
+        for contact in self._contacts:
+            meeting = contact.edges_that_meet()
+            if meeting is not None:
+                meetings.setdefault((id(meeting.own), id(meeting.theirs)), (meeting, []))[1].append(contact)
+        if not meetings:
+            return
+        from uem_dolfinx.contact.warnings.edges_inside import EdgesInside
+
+        edges = [(EdgesInside(meeting), group) for meeting, group in meetings.values()]
+        self._edges = [(one, group) for one, group in edges if one.any]
 
     def begin(self) -> None:
         """Begin with the interfaces that contacts have now, or go on with them (collective)."""
@@ -130,9 +166,21 @@ class Watch:
         looked_at = [c for c in self._contacts if c.on and not c.pair.far]
         for group in _by_interface(looked_at).values():
             self._look_at_ends(group)
+        self._look_at_edges()
         self._look_at_corners([c for c in looked_at if c.corner is None], stiffness)
         for contact in looked_at:
             contact.look_at_wear(before.get(id(contact.pair)), stiffness)
+
+    def _look_at_edges(self) -> None:
+        """Warn of sharp edges that cross, once for each contact and step (collective)."""
+        for edges, group in self._edges:
+            # edges may be near where no contactor is
+            looked_at = [c for c in group if c.on]
+            found = edges.find() if looked_at else None
+            if found is not None:
+                from uem_dolfinx.contact.warnings.edges_inside import warn
+
+                warn(looked_at[0].name, found)
 
     def _look_at_ends(self, group: Sequence[WatchedContact]) -> None:
         """Warn of contactors that have slid off the ends of targets, of contacts that are treated together (collective)."""

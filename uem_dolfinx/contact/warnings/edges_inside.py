@@ -1,0 +1,81 @@
+"""Sharp edges that cross each other between their nodes: no node of either is inside the other body, and nothing holds them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.geometry.crossing_edges import Crossing, SharpEdges, find_crossing
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.skin import Apart, Skin
+from uem_dolfinx.log import logger
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Two surfaces whose edges may cross.
+
+    Attributes:
+        own: the one.
+        theirs: the other, or the same one.
+        apart: sets of facets that never touch each other, of the surfaces of many bodies.
+        itself: which bodies may touch themselves ``(n_bodies,)``, likewise; None for two surfaces.
+    """
+
+    own: TargetFacets
+    theirs: TargetFacets
+    apart: Sequence[Apart] = ()
+    itself: Bools | None = None
+
+
+class EdgesInside:
+    """Edges of two surfaces of 3D bodies (collective).
+
+    Args:
+        meeting: the surfaces.
+    """
+
+    def __init__(self, meeting: Meeting):
+        self._meeting = meeting
+        self._own = SharpEdges(meeting.own)
+        self._theirs = self._own if meeting.own is meeting.theirs else SharpEdges(meeting.theirs)
+        self._told = tuple(self._of(edges) for edges in (self._own, self._theirs))
+
+    @property
+    def any(self) -> bool:
+        """Whether both surfaces have any."""
+        return self._own.total > 0 and self._theirs.total > 0
+
+    def _of(self, edges: SharpEdges) -> Ints:
+        """Body of each piece of an edge, and in which sets its facet is ``(k, 1 + 2 n_sets)``; nothing of two surfaces ``(k, 0)``."""
+        skin, f = edges.facets, edges.facet
+        if not isinstance(skin, Skin):
+            return np.zeros((len(f), 0), dtype=np.int64)
+        sets = [facets[f] for _, a, _, b in self._meeting.apart for facets in (a, b)]
+        return np.column_stack([skin.body[f], *sets]).astype(np.int64)
+
+    def _may_meet(self, one: Ints, other: Ints) -> Bools:
+        """Which of pieces, by what ``_of`` tells of them, may meet ``(k,)``."""
+        if self._meeting.itself is None:
+            return np.ones(len(one), dtype=bool)
+        may: Bools = (one[:, 0] != other[:, 0]) | self._meeting.itself[one[:, 0]]
+        for k in range(1, one.shape[1], 2):
+            a, b = (part[:, k : k + 2] > 0 for part in (one, other))
+            may &= ~((a[:, 0] & b[:, 1]) | (a[:, 1] & b[:, 0]))
+        return may
+
+    def find(self) -> Crossing | None:
+        """The deepest crossing; None for none (collective)."""
+        return find_crossing(self._own, self._theirs, (self._told[0], self._told[1]), self._may_meet)
+
+
+def warn(name: str, found: Crossing) -> None:
+    """Tell of edges that cross."""
+    place = ", ".join(f"{x:.6g}" for x in found.place)
+    logger.warning(
+        "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s): contact acts at nodes of the "
+        "contactor alone, and nothing holds these edges apart; refine both edges there, or round them off", name, found.depth, place,
+    )  # fmt: skip

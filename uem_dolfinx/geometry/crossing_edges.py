@@ -1,0 +1,138 @@
+"""Sharp convex edges of surfaces in 3D, and where those of two surfaces cross each other inside both bodies, between their nodes.
+
+Points of one edge and of the other that are nearest to each other lie on their common normal. Where bodies overlap, each lies behind the
+mean of the facets at the other's edge. Edges of degree 2 are two straight pieces each.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.candidates import balls_that_meet
+from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets
+from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
+
+#: Edges that cross less deep than this part of the shorter one have met by what facets are bent between their nodes.
+#: [convention; length of an edge between nodes; test_crossing_edges.py::test_how_deep_edges_cross]
+DEEP = 0.02
+
+
+class Crossing(NamedTuple):
+    """The deepest of the places where edges cross.
+
+    Attributes:
+        depth: a length.
+        place: of the middle ``(3,)``.
+        n_pairs: number of pairs of edges that cross, each of which two facets have.
+    """
+
+    depth: float
+    place: Array
+    n_pairs: int
+
+
+class SharpEdges:
+    """Sharp convex edges within a surface of 3D bodies, in straight pieces between neighbouring nodes (collective).
+
+    Both facets at an edge have it.
+
+    Args:
+        facets: of the surface.
+
+    Attributes:
+        total: number of pieces over all ranks.
+        facet: this rank's facet of each piece ``(k,)``.
+    """
+
+    def __init__(self, facets: TargetFacets):
+        self.facets, comm = facets, facets.config.comm
+        keys, (middle, normal) = facets.side_keys(), facets.middles(facets.config.X[facets.dofs])
+        sides = [nodes for _, nodes, _, _ in facets.shape.edges()]
+        told = np.repeat(np.column_stack([np.ones(len(normal)), normal, middle]), len(sides), axis=0)
+        others = sums_by_keys(comm, keys, told) - told
+        bends = np.einsum("kg,kg->k", others[:, 1:4], told[:, 1:4]) < SHARP_EDGE
+        falls = np.einsum("kg,kg->k", others[:, 4:] - told[:, 4:], told[:, 1:4]) < 0
+        sharp = (others[:, 0] == 1) & bends & falls
+        self._keys, (facet, side) = keys[sharp], np.divmod(np.flatnonzero(sharp), len(sides))
+        #: One for each side ``(n,)``, and the ends of its pieces, which it has one or two of.
+        self._facet: Ints = facet
+        order = np.array([[nodes[0], *nodes[2:], nodes[1]] for nodes in sides])
+        along = facets.dofs[facet[:, None], order[side]]
+        self._ends = np.stack([along[:, :-1], along[:, 1:]], axis=2).reshape(-1, 2)
+        self._pieces = along.shape[1] - 1
+        self.facet = np.repeat(facet, self._pieces)
+        self.total = int(reduced(comm, len(self.facet)))
+
+    @property
+    def nodes(self) -> Ints:
+        """Global numbers of the ends of pieces ``(k, 2)``."""
+        return np.asarray(self.facets.config.to_global(self._ends.ravel())).reshape(-1, 2)
+
+    def now(self) -> tuple[Array, Array]:
+        """Ends of pieces ``(k, 2, 3)``, and sums of the outward unit normals of both facets ``(k, 3)``, as bodies are now (collective)."""
+        config = self.facets.config
+        x = (config.X[self._ends] + config.displacement[self._ends]).reshape(-1, 2, config.gdim)
+        _, normal = self.facets.middles(self.facets.x)
+        return x, np.repeat(sums_by_keys(config.comm, self._keys, normal[self._facet]), self._pieces, axis=0)
+
+
+def find_crossing(own: SharpEdges, theirs: SharpEdges, told: tuple[Ints, Ints], meet: Any) -> Crossing | None:
+    """The deepest crossing of edges of two surfaces, which may be the same one; None for none (collective).
+
+    Args:
+        own: edges of the one.
+        theirs: edges of the other.
+        told: what is known of pieces ``(k, m)`` of each.
+        meet: which of pieces may meet, by what is known of them ``(n, m)`` each: ``(n,)``.
+    """
+    comm = own.facets.config.comm
+    (x, n), (y, m) = own.now(), theirs.now()
+    (c, r), (d, q) = (_balls(z) for z in (x, y))
+    box = np.stack([(d - q[:, None]).min(axis=0, initial=np.inf), (d + q[:, None]).max(axis=0, initial=-np.inf)])
+    rows = [np.flatnonzero(((c - r[:, None] <= b[1]) & (c + r[:, None] >= b[0])).all(axis=1)) for b in gathered(comm, box)]
+    a, na, nodes, what = Exchange(comm, rows).send(x, n, own.nodes, told[0])
+    depth, place = np.zeros(0), np.zeros((0, 3))
+    if len(a) and len(y):
+        c, r = _balls(a)
+        i, j = balls_that_meet(c, r, d, q)
+        apart = (nodes[i][:, :, None] != theirs.nodes[j][:, None]).all(axis=(1, 2))
+        some = apart & meet(what[i], told[1][j])
+        i, j = i[some], j[some]
+        depth, place = _depths((a[i], na[i]), (y[j], m[j]))
+        deep = depth > 2.0 * DEEP * np.minimum(r[i], q[j])
+        depth, place = depth[deep], place[deep]
+    k = int(np.argmax(depth)) if len(depth) else -1
+    best = gathered(comm, np.append(depth[k], place[k]) if k >= 0 else np.zeros(4))
+    count = int(reduced(comm, len(depth)))
+    deepest = best[int(np.argmax(best[:, 0]))]
+    return Crossing(float(deepest[0]), deepest[1:], count) if count else None
+
+
+def _balls(x: Array) -> tuple[Array, Array]:
+    """Middles ``(k, 3)`` and radii ``(k,)`` of the smallest balls round pieces with these ends ``(k, 2, 3)``."""
+    return x.mean(axis=1), 0.5 * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+
+
+def _depths(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    """How deep edges cross inside both bodies ``(k,)``, 0 where they do not, and middles of the nearest points ``(k, 3)``.
+
+    Args:
+        one: ends ``(k, 2, 3)`` and normals ``(k, 3)`` of the first.
+        other: of the second.
+    """
+    (a, na), (b, nb) = one, other
+    e, f, w = a[:, 1] - a[:, 0], b[:, 1] - b[:, 0], b[:, 0] - a[:, 0]
+    ee, ff, ef, ew, fw = (np.einsum("kg,kg->k", p, q) for p, q in ((e, e), (f, f), (e, f), (e, w), (f, w)))
+    square = ee * ff - ef**2
+    # edges along each other have no common normal
+    across = square > np.finfo(float).eps ** 0.5 * ee * ff
+    over = np.where(across, square, 1.0)
+    s, t = (ew * ff - fw * ef) / over, (ew * ef - fw * ee) / over
+    inside: Bools = across & (s > 0) & (s < 1) & (t > 0) & (t < 1)
+    p, q = a[:, 0] + s[:, None] * e, b[:, 0] + t[:, None] * f
+    way = q - p
+    inside &= (np.einsum("kg,kg->k", way, na) < 0) & (np.einsum("kg,kg->k", way, nb) > 0)
+    return np.where(inside, np.linalg.norm(way, axis=1), 0.0), 0.5 * (p + q)
