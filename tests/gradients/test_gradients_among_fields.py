@@ -133,6 +133,6 @@ def test_what_has_no_gradient():
     refused(uem.InputError, ("J holds 'field_1'", "a copy"), lambda: uem.gradient(problem, copy**2 * ufl.dx, E))
     contact = uem.Contact(s.b.high, s.b.low, heat=uem.Conductance(1.0, field=1))
     hot = uem.UnitedProblem(s.F, w, displacement=0, bcs=problem.bodies.bcs, contacts=[contact])
-    refused(uem.InputError, "heat that passes through a contact", lambda: uem.gradient(hot, w[0] * ufl.dx, E))
+    refused(uem.InputError, "heat conducted through a contact", lambda: uem.gradient(hot, w[0] * ufl.dx, E))
     F = s.F + w.sub(1) * ufl.TestFunction(w.function_space)[0] * ufl.dx
     refused(uem.InputError, "F holds u.sub(i)", lambda: uem.UnitedProblem(F, w, displacement=0))

@@ -105,7 +105,7 @@ def test_what_is_refused():
     begun = problem()
     run(begun)
     refused(uem.InputError, "expected a problem that is recorded from its first step on", lambda: record(begun))
-    refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(begun, J, []))
+    refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(begun, J, []))
     new = problem()
     with uem.recording(new) as history:
         refused(uem.InputError, "has taken no step", lambda: history.gradient(J, []))

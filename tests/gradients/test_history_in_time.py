@@ -88,7 +88,7 @@ def test_what_is_refused():
     s = thrown(wall=False, end=0.02, damped=False)
     problem = s.solve().problem
     refused(uem.InputError, "expected a problem that is recorded from its first step on", uem.recording(problem).__enter__)
-    refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, []))
+    refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, []))
     history = s.solve().history
     ask, w, mesh = history.gradient, history.problem.dynamics.mean_velocity, s.V.mesh
     refused(uem.InputError, "the shape, on which masses depend", lambda: ask(s.u[0] * ufl.dx, ufl.SpatialCoordinate(mesh)))

@@ -141,4 +141,4 @@ def test_what_is_refused():
     refused(uem.InputError, "expected VonMises without back stresses", uem.recording(problem).__enter__)
     law = uem.VonMises(s.u, s.E, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
-    refused(uem.InputError, "take the steps while uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))
+    refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))
