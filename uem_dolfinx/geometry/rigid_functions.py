@@ -13,7 +13,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 
 #: Functions are asked about so many points at least: more than there are coordinates, so that shapes tell which axis is that of points.
-#: [convention; points; test_rigid.py::test_functions_of_places]
+#: [format; points; test_rigid.py::test_functions_of_places]
 LEAST_POINTS = 5
 
 

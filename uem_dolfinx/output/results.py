@@ -33,9 +33,9 @@ ENDINGS = ("scalars", "vectors")
 class HistoryWriter(Closing, given.Sealed):
     """CSV file with one row per load step or time step, complete after every row.
 
-    Columns: ``factor`` or ``time``, ``step`` (how many steps the problem has done), ``newton_iterations``, and for every contact
-        ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin, each
-        followed by the contact's name where there are several; then further columns, in this order::
+    Columns: ``factor`` or ``time``, ``step`` (the number of steps of the problem so far), ``newton_iterations``, and for every contact
+    ``active``, ``max_gap``, the resultant ``force_x`` ... on the contactor's body and its ``moment`` about the origin. If there are
+    several contacts, their names follow these. Further columns come last, in the order of ``columns``::
 
         uem.HistoryWriter("out/run.csv", problem, reaction=tags["foot"], columns={"heat": lambda: uem.integrate(q * ufl.dx)})
 

@@ -20,8 +20,8 @@ class Stribeck:
 
     With ``velocity=0`` mu falls to ``kinetic`` at once (stiction). The speed is that of the present time step, the slip over its
     length: the law is implicit, with a consistent tangent, and of first order in the step. If friction decreases with the speed so
-        fast that ``-mu' lam / dt > k``, with the stiffness k of the surface, a step has several answers, as with stiction, of which
-        it finds one that goes on slipping.
+    fast that ``-mu' lam / dt > k``, with the stiffness k of the surface, a step has several solutions, as with stiction; the one
+    that is found continues to slip.
 
     Args:
         field: the static coefficient, a number, or a function as of ``Contact``; where it is 0 there is no friction.
