@@ -71,9 +71,6 @@ from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.tresca import Tresca
 from uem_dolfinx.contact.results import Balance, Resultant
-from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
-from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark
 from uem_dolfinx.errors import (
     CheckpointError,
     ConflictError,
@@ -108,12 +105,9 @@ from uem_dolfinx.geometry.rigid import RigidCylinder, RigidParaboloid, RigidPlan
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
-from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
-from uem_dolfinx.solve.steps.time_steps import TimeStep, time_steps
 
 if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
@@ -123,6 +117,9 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.preload import Preload
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
+    from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark
     from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.gradients.gradient import gradient, tangent, taylor_test
@@ -137,14 +134,23 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene, plot_setup
     from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
     from uem_dolfinx.output.surfaces import SurfaceWriter
+    from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+    from uem_dolfinx.restart.state import State
     from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.steps.step import Step
+    from uem_dolfinx.solve.steps.time_steps import TimeStep, time_steps
 
 #: Modules that are imported when one of their names is asked for.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
+    "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
+    "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",
+    "Scheme": "dynamics.scheme", "generalised_alpha": "dynamics.scheme", "newmark": "dynamics.scheme",
+    "TimeStep": "solve.steps.time_steps", "time_steps": "solve.steps.time_steps",
+    "Checkpoint": "restart.checkpoint", "read_checkpoint": "restart.checkpoint", "write_checkpoint": "restart.checkpoint",
+    "State": "restart.state",
     "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",

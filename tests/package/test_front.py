@@ -137,7 +137,6 @@ def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
 
 
 @serial
-@pytest.mark.slow
 def test_errors_of_the_compiler_are_shown(tmp_path):
     done = first_run(tmp_path, 1, CC=shutil.which("false"))
     assert done.returncode != 0 and "Error" in done.stderr and "false" in done.stderr

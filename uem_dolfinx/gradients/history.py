@@ -90,7 +90,9 @@ class History(given.Sealed):
 
     def note_start(self) -> None:
         """Keep what a motion begins with, and its first acceleration."""
-        led = Taken().with_led(led_by(self.problem, self.problem.dynamics.time))
+        dynamics = self.problem.dynamics
+        assert dynamics is not None
+        led = Taken().with_led(led_by(self.problem, dynamics.time))
         self._start = self._record(Memory.of(self.problem), led.by_id(), 1.0)
 
     def _record(self, before: Memory, shares: dict[int, float], held: Array | float) -> Record:

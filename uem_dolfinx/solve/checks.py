@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -23,6 +23,9 @@ from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
 from uem_dolfinx.parallel import agreed
+
+if TYPE_CHECKING:
+    from uem_dolfinx.dynamics.inertia import Dynamics
 
 #: Laws with history that belong to problems, by their ids.
 _taken: WeakValueDictionary[int, Any] = WeakValueDictionary()
@@ -44,6 +47,32 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
     for part in chain.from_iterable(traverse_unique_terminals(integral.integrand()) for integral in F.integrals()):
         if isinstance(part, ScalarValue) and not np.isfinite(complex(part)):
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
+
+
+def check_dynamics(dynamics: Any) -> Dynamics | None:
+    """The mass and motion that a problem has, if any.
+
+    Raises:
+        InputTypeError: for anything else.
+    """
+    if dynamics is None:
+        return None
+    from uem_dolfinx.dynamics.inertia import Dynamics
+
+    given.kind("dynamics", dynamics, isinstance(dynamics, Dynamics), "Dynamics, or None")
+    return dynamics
+
+
+def check_checkpoint(checkpoint: Any) -> None:
+    """Refuse to step with anything else than a checkpoint, or None.
+
+    Raises:
+        InputTypeError: naming it.
+    """
+    if checkpoint is not None:
+        from uem_dolfinx.restart.checkpoint import Checkpoint
+
+        given.kind("checkpoint", checkpoint, isinstance(checkpoint, Checkpoint), "a Checkpoint, or None")
 
 
 def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: int | None = None) -> list[HistoryMaterial]:

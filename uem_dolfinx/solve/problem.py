@@ -17,21 +17,17 @@ from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
-from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.forms import in_all_cells
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
-from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import end_together
-from uem_dolfinx.restart.state import State
+from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.norms import Norm
-from uem_dolfinx.solve.checks import check_conditions, check_materials, check_residual, check_values, take_materials
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
 from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
@@ -45,6 +41,9 @@ if TYPE_CHECKING:
     from uem_dolfinx.conditions.equation import Equation, Periodic
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.materials.elastic import HistoryMaterial
+    from uem_dolfinx.restart.state import State
 
 ACCURACY = given.between(0.0, 1.0)
 
@@ -130,9 +129,9 @@ class UnitedProblem(given.Sealed):
         self.config = configured(u, displacement)
         self.comm = self.config.comm
         with agreed(self.comm):
-            check_residual(F, u)
+            checks.check_residual(F, u)
             self.load = check_load(load)
-            bcs = check_conditions(self.config, bcs)
+            bcs = checks.check_conditions(self.config, bcs)
             contacts = given.items(
                 "contacts", contacts, lambda one: isinstance(one, Contact | GeneralContact), "a Contact or a GeneralContact"
             )
@@ -149,9 +148,8 @@ class UnitedProblem(given.Sealed):
 
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, equations, **others)
-            self.materials = check_materials(materials, F, u, displacement)
-            there = dynamics is None or isinstance(dynamics, Dynamics)
-            self.dynamics = given.kind("dynamics", dynamics, there, "Dynamics, or None")
+            self.materials = checks.check_materials(materials, F, u, displacement)
+            self.dynamics = checks.check_dynamics(dynamics)
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
@@ -175,7 +173,7 @@ class UnitedProblem(given.Sealed):
         self.contacts: list[Contact] = parts_of(contacts, self.config, couplings)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
-            check_residual(damping, u, "the damping form")
+            checks.check_residual(damping, u, "the damping form")
         # cells that conditions hold or a coupling makes rigid may have no stiffness, nor be in F
         F, at_points = revolved(F if self.config.unknowns.mixed else in_all_cells(F, u, bool(self.materials))), None
         if points or couplings:
@@ -252,7 +250,7 @@ class UnitedProblem(given.Sealed):
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
         refuse_idle(self, self.load, self.bodies.bcs)
-        take_materials(self.materials)
+        checks.take_materials(self.materials)
 
     def __repr__(self) -> str:
         """Its size, contacts, and how far it is."""
@@ -332,7 +330,7 @@ class UnitedProblem(given.Sealed):
             fraction = given.number("fraction", fraction)
         wanted = np.array(start)
         compat.set_bc_values(wanted, self.bodies.bcs)
-        check_values(self, wanted)
+        checks.check_values(self, wanted)
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:
             self.bodies.begin_step()
@@ -447,4 +445,4 @@ def check_steps(problem: Any, checkpoint: Any) -> None:
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
-        given.kind("checkpoint", checkpoint, checkpoint is None or isinstance(checkpoint, Checkpoint), "a Checkpoint, or None")
+        checks.check_checkpoint(checkpoint)

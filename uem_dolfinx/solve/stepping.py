@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from mpi4py import MPI
 
@@ -18,12 +18,14 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.log import logger
-from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
-from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.taken import Taken
 from uem_dolfinx.solve.united.newton import Iteration
+
+if TYPE_CHECKING:
+    from uem_dolfinx.restart.checkpoint import Checkpoint
+    from uem_dolfinx.restart.state import State
 
 S = TypeVar("S", bound="ConvergedStep")
 

@@ -17,18 +17,18 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
 from uem_dolfinx.arrays import AnyArray, Array, Bools
-from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, NotFiniteError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
-from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.bodies.tangent import Inversions, Tangent
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import AtPoints
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.materials.elastic import HistoryMaterial
 
 #: Multiple of the rounding of K u that the residual may be left with.
 #: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]

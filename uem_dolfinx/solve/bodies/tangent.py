@@ -19,17 +19,17 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
-from uem_dolfinx.materials.elastic import HistoryMaterial
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import AtPoints
     from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.materials.elastic import HistoryMaterial
 
 
 class Tangent:

@@ -13,7 +13,6 @@ from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
-from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
@@ -23,6 +22,7 @@ from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.united.newton import Iteration
 
 if TYPE_CHECKING:
+    from uem_dolfinx.restart.checkpoint import Checkpoint
     from uem_dolfinx.solve.steps.arc_length import AlongArc
     from uem_dolfinx.solve.steps.step import Step
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import compress
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -19,12 +20,14 @@ from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.restart.checkpoint import Checkpoint
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import ConvergedStep, begin_checkpoint, between_steps
 from uem_dolfinx.solve.united.newton import Iteration
 from uem_dolfinx.solve.united.system import CLOSED
+
+if TYPE_CHECKING:
+    from uem_dolfinx.restart.checkpoint import Checkpoint
 
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
