@@ -81,8 +81,8 @@ def test_solves_are_as_accurate_as_they_need_be(law):
         iterations.append(sum(i.linear_iterations for i in history))
     (u, active, force), *others = answers
     assert 0 < active.sum() < 36
-    # on two ranks 18 to 20 of 33 from run to run: multigrid adds in the order in which messages come
-    assert iterations[0] < 0.7 * iterations[1]
+    # on several ranks 18 to 20 of 33 from run to run: multigrid adds in the order in which messages come
+    assert iterations[0] < (0.6 if COMM.size == 1 else 0.7) * iterations[1]
     for v, same, push in others:
         assert np.array_equal(active, same)
         assert np.abs(u - v).max() < 1e-7 * np.abs(u).max()

@@ -12,7 +12,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.candidates import balls_that_meet
-from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets
+from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
 #: Edges that cross less deep than this part of the shorter one have met by what facets are bent between their nodes.
@@ -49,14 +49,9 @@ class SharpEdges:
 
     def __init__(self, facets: TargetFacets):
         self.facets, comm = facets, facets.config.comm
-        keys, (middle, normal) = facets.side_keys(), facets.middles(facets.config.X[facets.dofs])
+        _, _, convex = facets.across_sides(np.arange(len(facets.dofs)))
         sides = [nodes for _, nodes, _, _ in facets.shape.edges()]
-        told = np.repeat(np.column_stack([np.ones(len(normal)), normal, middle]), len(sides), axis=0)
-        others = sums_by_keys(comm, keys, told) - told
-        bends = np.einsum("kg,kg->k", others[:, 1:4], told[:, 1:4]) < SHARP_EDGE
-        falls = np.einsum("kg,kg->k", others[:, 4:] - told[:, 4:], told[:, 1:4]) < 0
-        sharp = (others[:, 0] == 1) & bends & falls
-        self._keys, (facet, side) = keys[sharp], np.divmod(np.flatnonzero(sharp), len(sides))
+        self._keys, (facet, side) = facets.side_keys()[convex.ravel()], np.nonzero(convex)
         #: One for each side ``(n,)``, and the ends of its pieces, which it has one or two of.
         self._facet: Ints = facet
         order = np.array([[nodes[0], *nodes[2:], nodes[1]] for nodes in sides])
@@ -74,9 +69,8 @@ class SharpEdges:
     def now(self) -> tuple[Array, Array]:
         """Ends of pieces ``(k, 2, 3)``, and sums of the outward unit normals of both facets ``(k, 3)``, as bodies are now (collective)."""
         config = self.facets.config
-        x = (config.X[self._ends] + config.displacement[self._ends]).reshape(-1, 2, config.gdim)
         _, normal = self.facets.middles(self.facets.x)
-        return x, np.repeat(sums_by_keys(config.comm, self._keys, normal[self._facet]), self._pieces, axis=0)
+        return config.x[self._ends], np.repeat(sums_by_keys(config.comm, self._keys, normal[self._facet]), self._pieces, axis=0)
 
 
 def find_crossing(own: SharpEdges, theirs: SharpEdges, told: tuple[Ints, Ints], meet: Any) -> Crossing | None:

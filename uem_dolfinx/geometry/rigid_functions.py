@@ -34,20 +34,19 @@ class OfPoints:
 
         def asked(points: Array) -> Any:
             n, g = points.shape
-            if not n:
-                return f(points)
-            x = _places(points)
-            if self._takes_places(x):
+            if n and self._takes_places(points):
+                x = _places(points)
                 return _rows(np.asarray(f(x), dtype=float), x.shape[1], g)[:n]
             values = f(points)
-            if f is self._distance and np.shape(values) == (n,):
+            if n and f is self._distance and np.shape(values) == (n,):
                 self._of_places = False
             return values
 
         return asked
 
-    def _takes_places(self, x: Array) -> bool:
+    def _takes_places(self, points: Array) -> bool:
         if self._of_places is None:
+            x = _places(points)
             try:
                 with np.errstate(all="ignore"):
                     told = np.shape(self._distance(x)) == (x.shape[1],)

@@ -17,7 +17,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import SHARP_EDGE, FacetData, TargetFacets, pairs_of_equals, spread_of, unit
 from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import Exchange, reduced, sums_by_keys
+from uem_dolfinx.parallel import Exchange, reduced
 
 #: Classes of bodies by the size of their facets, which differs by less than this factor in a class: there the order of the mesh's
 #: input tells who follows.
@@ -104,21 +104,10 @@ class Skin(TargetFacets):
 
     def _open_sides(self) -> Bools:
         """Sides that bound the surface, or lie on a sharp convex edge, round which no facet reaches ``(m, n_sides)``."""
-        X = self.config.X[self.dofs]
-        normal = self._area_vectors(X).mean(axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        middle = X[:, : len(self.shape.topology[0])].mean(axis=1)
-        n_sides = len(self.shape.edges())
-        number = self.first[self.config.comm.rank] + np.arange(len(X))
-        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), n_sides, axis=0)
-        others = sums_by_keys(self.config.comm, self.side_keys(), told) - told
-        g, one = self.config.gdim, others[:, 0] == 1
-        self.across: Ints = np.where(one, others[:, -1], -1).astype(np.int64).reshape(len(X), n_sides)
-        cosine = np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g])
-        falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
-        self.sharp_sides: Bools = (one & (cosine < SHARP_EDGE)).reshape(len(X), n_sides)
-        self._rims: Bools = (one & falls & (cosine < SHARP_EDGE)).reshape(len(X), n_sides)
-        return ~one.reshape(len(X), n_sides) | self._rims
+        self.across, self.sharp_sides, self._rims = self.across_sides(
+            self.first[self.config.comm.rank] + np.arange(len(self.dofs))
+        )
+        return (self.across < 0) | self._rims
 
     @cached_property
     def _sharp_nodes(self) -> Bools:

@@ -46,7 +46,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
-from uem_dolfinx.gradients.parameters import ContactParameter, motion_of, rubbed, thickened, turned_by
+from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of, rubbed, thickened, turned_by
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
@@ -254,8 +254,7 @@ class Linearised:
 
     def share(self, m: Control | ContactParameter) -> float:
         """How much of a change of a control the state has seen: all of it, unless load steps lead it there."""
-        one = m.contact if isinstance(m, ContactParameter) and m.parameter == "offset" else m
-        return self.problem.progress.taken.of(one)
+        return self.problem.progress.taken.of(led_for(m))
 
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
         """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).

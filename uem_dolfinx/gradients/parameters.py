@@ -61,6 +61,11 @@ def keeps_distance(contact: Contact) -> bool:
     return not hasattr(contact.target, "project") or getattr(contact.target, "measures", False)
 
 
+def led_for(m: object) -> object:
+    """The object that steps lead for a control: the contact for its offset, else the control itself."""
+    return m.contact if isinstance(m, ContactParameter) and m.parameter == "offset" else m
+
+
 def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:
     """How points ``x (n, gdim)`` of a rigid target move with an entry of its place or turn ``(n, gdim)``."""
     if m.parameter == "place":

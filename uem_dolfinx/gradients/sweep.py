@@ -32,7 +32,7 @@ from uem_dolfinx.gradients.adjoint import Adjoint, Linearised
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.derivatives import Derivatives, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
-from uem_dolfinx.gradients.parameters import ContactParameter, motion_of
+from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
@@ -194,7 +194,7 @@ class LinearisedStep(Linearised):
 
     def share(self, m: Any) -> float:
         """How much of a change of a control the step has seen."""
-        return self._led.get(id(m), 1.0)
+        return self._led.get(id(led_for(m)), 1.0)
 
     def _linearise(self) -> None:
         problem = self.problem

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.warnings.edges_inside import Meeting
     from uem_dolfinx.geometry.neighbours import Neighbours
-    from uem_dolfinx.geometry.skin import Apart, Skin
+    from uem_dolfinx.geometry.skin import Skin
 
 
 class GeneralPart(Contact):
@@ -82,18 +81,6 @@ class BodiesContact(GeneralPart):
             return super()._friction_now(kinematics)
         return None if kinematics.idle else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
 
-    def edges_that_meet(self) -> Meeting | None:
-        """Those of all bodies (collective)."""
-        if self.config.tdim < 3:
-            return None
-        from uem_dolfinx.contact.warnings.edges_inside import Meeting
-
-        return Meeting(self._skin, self._skin, *self._never_meet())
-
-    def _never_meet(self) -> tuple[Sequence[Apart], Bools]:
-        """Sets of facets that never touch each other, and which bodies may touch themselves ``(n_bodies,)``."""
-        raise NotImplementedError
-
     @property
     def watches_ends(self) -> bool:
         """No: contactors come and go past the edges of bodies."""
@@ -134,8 +121,11 @@ class AmongContact(BodiesContact):
         body = skin.values_at(self.pair.projection.facet, skin.body)
         return np.asarray((body >= 0) & (place[skin.body_of_node[self.pair.nodes]] <= place[body]))
 
-    def _never_meet(self) -> tuple[Sequence[Apart], Bools]:
-        return self._neighbours.apart, self._neighbours.itself
+    def edges_that_meet(self) -> Meeting:
+        """Those of all bodies."""
+        from uem_dolfinx.contact.warnings.edges_inside import Meeting
+
+        return Meeting(self._skin, self._skin, self._neighbours.apart, self._neighbours.itself)
 
     def _received(self) -> Array:
         """Forces on active contactors by nodes of the body that they touch which follow them, where either is at a sharp edge.
@@ -183,8 +173,11 @@ class MortarContact(BodiesContact):
         surface = TargetFacets(self.config, self.contactor, "contactor")
         return AmongBodiesMortar(self.config, nodes, target, surface=surface, **how), None
 
-    def _never_meet(self) -> tuple[Sequence[Apart], Bools]:
-        return self._body.apart, np.zeros(self._skin.n_bodies, dtype=bool)
+    def edges_that_meet(self) -> Meeting:
+        """Those of all bodies, none with itself."""
+        from uem_dolfinx.contact.warnings.edges_inside import Meeting
+
+        return Meeting(self._skin, self._skin, self._body.apart, np.zeros(self._skin.n_bodies, dtype=bool))
 
     def on_skin(self, facet: Ints) -> Ints:
         """See ``BodiesContact``."""

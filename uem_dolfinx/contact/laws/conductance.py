@@ -51,7 +51,7 @@ class Conductance(given.Sealed):
         dt: float | fem.Constant = 1.0,
     ):
         self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
-        self.field = part_number(field)
+        self.field = given.part_number("field", field, "the temperature")
         self.temperature = temperature if temperature is None else _number("temperature", temperature, given.FINITE)
         self.friction_share = friction_share if friction_share is None else given.number("friction_share", friction_share, SHARE)
         self.dt = _number("dt", dt, given.POSITIVE)
@@ -128,8 +128,3 @@ def _number(what: str, number: Any, within: given.Range) -> float | fem.Constant
         given.number(what, number.value, within)
         return number
     return given.number(what, number, within)
-
-
-def part_number(field: Any) -> int:
-    """Which part of a mixed space is the temperature; raises as ``given.part_number``."""
-    return given.part_number("field", field, "the temperature")

@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.laws.conductance import part_number
 
 
 class OfTemperature(given.Sealed):
@@ -30,7 +29,7 @@ class OfTemperature(given.Sealed):
 
     def __init__(self, f: Callable[[Array, float, Array], npt.ArrayLike], *, field: int):
         self.f = given.kind("f", f, callable(f), "a function of places, load factor and temperatures, f(x, t, T)")
-        self.field = part_number(field)
+        self.field = given.part_number("field", field, "the temperature")
 
     def __call__(self, x: Array, t: float, T: Array) -> Any:
         """Its values ``(n,)``."""

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-
-if TYPE_CHECKING:
-    pass
 
 Renumber = Callable[[Ints], Ints]
 

@@ -71,11 +71,10 @@ class WatchedContact(ContactResults):
         """Surfaces whose sharp edges may cross, in 3D; the same two of contacts that have them together (collective)."""
         from uem_dolfinx.contact.warnings.edges_inside import Meeting
 
-        config = self.config
-        if config.tdim < 3 or self.contactor.dim < 2 or self.tied is True or not isinstance(self.target, Tag):
+        if self.contactor.dim < 2 or self.tied is True or not isinstance(self.target, Tag):
             return None
         try:
-            return Meeting(facets_of(config, self.contactor, "contactor"), facets_of(config, self.target))
+            return Meeting(facets_of(self.config, self.contactor, "contactor"), facets_of(self.config, self.target))
         except OrientationError:
             # a surface inside a body has no outside which an edge could come from
             return None
@@ -129,7 +128,9 @@ class Watch:
             _warn_of_sagging_facets(group)
 
     def _take_edges(self) -> None:
-        """Find the sharp edges of surfaces that may meet (collective)."""
+        """Find the sharp edges of surfaces in 3D that may meet (collective)."""
+        if not self._contacts or self._contacts[0].config.tdim < 3:
+            return
         meetings: dict[tuple[int, int], tuple[Meeting, list[WatchedContact]]] = {}
         for contact in self._contacts:
             meeting = contact.edges_that_meet()
