@@ -63,19 +63,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """How many cases of each parametrised test run, and which share of the tests."""
     parser.addoption("--cases", type=int, default=1, help="so many cases of each parametrised test are not marked slow (1)")
     parser.addoption("--most", type=int, help="at most so many cases of each parametrised test run, slow ones among them (all)")
-    parser.addoption("--every", type=int, default=1, help="every so many tests of each file run, its first among them (1)")
+    parser.addoption("--every", type=int, default=1, help="every so many tests of each file run (1)")
+    parser.addoption("--start", type=int, default=0, help="the first of them, from 0 (0)")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark as slow all but a few cases of each parametrised test, and leave out those that are not to run."""
-    quick, most, every = (config.getoption(name) for name in ("--cases", "--most", "--every"))
+    quick, most, every, start = (config.getoption(name) for name in ("--cases", "--most", "--every", "--start"))
     files = defaultdict[Path, dict[str, list[pytest.Item]]](dict)
     for item in items:
         files[item.path].setdefault(item.nodeid.partition("[")[0], []).append(item)
     runs = set()
     for tests in files.values():
-        for cases in list(tests.values())[::every]:
+        for cases in list(tests.values())[start::every]:
             first = _spread([item for item in cases if item.get_closest_marker("slow") is None], quick)
             for item in cases:
                 if item not in first:

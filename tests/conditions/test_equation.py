@@ -32,6 +32,7 @@ from helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -145,7 +146,8 @@ def test_goes_on_from_a_checkpoint(folder):
             if step.number == stop + 1 and stop < 3:
                 break
         ends.append(np.array(c.u.x.array))
-    assert np.array_equal(ends[2], ends[0]) and not np.array_equal(ends[1], ends[0])
+    goes_on_alike(ends[2], ends[0])
+    assert not np.array_equal(ends[1], ends[0])
     c = Cell()
     problem = c.problem(bcs=clamp(c.V, c.left), law=st_venant)
     refused(uem.CheckpointError, "equations", lambda: next(uem.load_steps(problem, 3, checkpoint=uem.Checkpoint(folder / "run"))))

@@ -210,6 +210,7 @@ def test_dual_functions_are_kept():
         assert COMM.allreduce(int(duals.kept.sum())) == 1 + kept and COMM.allreduce(int(duals.own.sum())) == kept
 
 
+@pytest.mark.slow
 def test_off_the_end_and_back():
     """A block is drawn off the end of a slab and back again: it lets go without a cut, and takes hold again."""
     s = scene(COMM, "quadrilateral", [

@@ -190,6 +190,7 @@ def test_what_is_held_tells():
             np.testing.assert_allclose(ties.relative(du), [[far, 0.0]], atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_half_model(coupling):
     """With half the force of the whole one; mortar's relative motions, means over facets, have parts across the plane of symmetry."""

@@ -244,6 +244,7 @@ def test_frames_of_a_film(folder, monkeypatch):
     assert len(bounds) == 4 * (COMM.rank == 0) and len(set(bounds)) == COMM.allreduce(len(set(bounds))) * (COMM.rank == 0)
 
 
+@pytest.mark.slow
 def test_every_second_step_in_3d(folder):
     need_pyvista()
     problem = pressed(COMM, "hexahedron")

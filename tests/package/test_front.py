@@ -127,6 +127,7 @@ def first_run(folder, ranks, **environment):
 
 
 @serial
+@pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_first_run_prints_nothing_of_the_compiler(tmp_path, ranks):
     done = first_run(tmp_path, ranks)

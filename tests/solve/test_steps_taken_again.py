@@ -198,8 +198,13 @@ def test_signals_while_a_step_is_taken_again(number, kept, folder):
             scene.problem.solve()
 
     found = []
-    with pytest.raises(ends[number]):
-        loop()
+    # a shell that runs tests in the background has Ctrl-C ignored
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(ends[number]):
+            loop()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert len(found) == 1 and np.array_equal(found[0], scene.b.u.x.array)
     assert (folder / "run").exists() == kept
     assert scene.problem.progress.interruption is None and not scene.problem.progress.inside

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, mesh
-from helpers import linear, refused
+from helpers import highest, linear, refused
 
 import uem_dolfinx as uem
 
@@ -73,6 +73,11 @@ def test_values_of_all_ranks(what):
     KINDS[what](Square(), 1.0)
 
 
+def alike(one, other):
+    """Assert that two solutions are the same to rounding, which may hang on where arrays lie in memory and on what comes first."""
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * highest(COMM, np.abs(other)))
+
+
 @pytest.mark.parametrize("size", [1.0, 1e-9, 1e3])
 def test_functions_whose_ghosts_differ(size):
     """Values in Functions are those of the nodes' owners, whatever other ranks have at their copies; so are ramps, steps and gradients."""
@@ -95,8 +100,9 @@ def test_functions_whose_ghosts_differ(size):
         (by,) = uem.gradient(problem, J, g)
         sums = [COMM.allreduce(float(f.x.array[:own].sum())) for f in (s.u, by)]
         ends.append([np.array(s.u.x.array), np.array(by.x.array), sums, steps])
+    assert ends[0].pop() == ends[1].pop()
     for one, other in zip(*ends):
-        assert np.array_equal(one, other)
+        alike(one, other)
 
 
 def test_conditions_that_their_owner_lacks():
@@ -110,7 +116,7 @@ def test_conditions_that_their_owner_lacks():
         s.u.x.array[:] = 0.0
         s.run(bcs=[*s.hold, *more])
         ends.append(np.array(s.u.x.array))
-    assert np.array_equal(*ends)
+    alike(*ends)
     copies = [fem.dirichletbc(np.array([0.0, -0.01]), np.arange(n, len(s.u.x.array) // 2, dtype=np.int32), s.V)]
     if COMM.size > 1:
         refused(uem.InputError, ("a Dirichlet condition holds", "owns the node"), lambda: s.run(bcs=[*s.hold, *copies]))
