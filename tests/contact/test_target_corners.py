@@ -312,10 +312,10 @@ def test_advice_that_does_not_help(text, left):
     assert str(error) == f"{left}; more"
 
 
-@pytest.mark.parametrize("slope, factor, expected", [(0.5, 1, 1), (0.5, 10, 0), (0.05, 1, 0), (0.05, 0.1, 1)])
-def test_what_is_a_corner(slope, factor, expected, monkeypatch):
+@pytest.mark.parametrize("slope, cosine, expected", [(0.5, None, 1), (0.5, 0.1, 0), (0.05, None, 0), (0.05, 0.9995, 1)])
+def test_what_is_a_corner(slope, cosine, expected, monkeypatch):
     """The wedge's tip, besides the ends of its surface; smooth surfaces have none."""
-    monkeypatch.setattr(target_corners, "FALLS", factor * target_corners.FALLS)
+    monkeypatch.setattr(target_corners, "CORNER", cosine or target_corners.CORNER)
     (problem, contact, _), _ = wedge(slope=slope)
     nodes = corner_nodes(problem.config, contact.pair.target.facets)
     assert COMM.allreduce(len(nodes)) == 2 + expected

@@ -98,7 +98,7 @@ def test_which_edges_are_sharp(cell, degree, angle, sharp):
     faces = (np.abs(side[..., :-1] - 0.5) > 0.49).sum(axis=2) + (side[..., -1] < 0.01) + on_top
     box_edge = faces > 1
     assert COMM.allreduce(int(crest.sum())) >= 2
-    assert np.array_equal(skin.sharp_sides, box_edge | (crest & sharp))
+    assert np.array_equal(skin.edges.sharp, box_edge | (crest & sharp))
     assert np.array_equal(skin.open_sides, box_edge | (crest & sharp & (angle > 0)))
 
 
@@ -107,7 +107,7 @@ def test_the_end_of_a_surface_is_open():
     _, skin = skin_of("hexahedron", [box("hexahedron", [0.0] * 3, [1.0] * 3, [2] * 3)], tag=lambda s: s.tag("top", 0, at(2, 1.0)))
     side = side_middles(skin)
     assert np.array_equal(skin.open_sides, (np.abs(side[..., :2] - 0.5) > 0.49).any(axis=2))
-    assert not skin.sharp_sides.any()
+    assert not skin.edges.sharp.any()
 
 
 @pytest.mark.parametrize("cell", CELLS)

@@ -13,6 +13,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.candidates import balls_that_meet
 from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.sharp import sharp_edges
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
 #: Edges that cross less deep than this part of the shorter one have met by what facets are bent between their nodes.
@@ -49,7 +50,7 @@ class SharpEdges:
 
     def __init__(self, facets: TargetFacets):
         self.facets, comm = facets, facets.config.comm
-        _, _, convex = facets.across_sides(np.arange(len(facets.dofs)))
+        convex = sharp_edges(facets).convex
         sides = [nodes for _, nodes, _, _ in facets.shape.edges()]
         self._keys, (facet, side) = facets.side_keys()[convex.ravel()], np.nonzero(convex)
         #: One for each side ``(n,)``, and the ends of its pieces, which it has one or two of.

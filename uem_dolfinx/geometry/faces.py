@@ -37,8 +37,8 @@ def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
     first = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first, face, skin.keys)
     first = reduced(skin.config.comm, first, op=MPI.MIN)
-    facet, side = np.nonzero(skin.sharp_sides & (skin.across >= 0))
-    meeting = np.unique(np.column_stack([face[facet], skin.values_at(skin.across[facet, side], face)]), axis=0)
+    facet, side = np.nonzero(skin.edges.sharp & (skin.edges.across >= 0))
+    meeting = np.unique(np.column_stack([face[facet], skin.values_at(skin.edges.across[facet, side], face)]), axis=0)
     meeting = np.concatenate(skin.config.comm.allgather(meeting))
     beside: list[set[int]] = [set() for _ in range(count)]
     for a, b in meeting[meeting[:, 0] != meeting[:, 1]].tolist():
@@ -53,8 +53,8 @@ def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
 def _faces(skin: Skin) -> tuple[Ints, int]:
     """The smooth face of each facet of this rank ``(m,)``, alike on all ranks, and their number (collective)."""
     n, begin = len(skin.dofs), skin.first[skin.config.comm.rank]
-    facet, side = np.nonzero(~skin.sharp_sides & (skin.across >= 0))
-    other = skin.across[facet, side]
+    facet, side = np.nonzero(~skin.edges.sharp & (skin.edges.across >= 0))
+    other = skin.edges.across[facet, side]
     here = (other >= begin) & (other < begin + n)
 
     def shared(mine: Ints) -> Ints:

@@ -18,14 +18,9 @@ from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered, reduced, sums_by_keys
+from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered, reduced
 
 FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": "triangle", "hexahedron": "quadrilateral"}
-
-
-#: A convex edge between facets whose normals have a smaller cosine bounds both: neither reaches round it.
-#: [convention; cosine; test_skin.py::test_which_edges_are_sharp]
-SHARP_EDGE = 0.7
 
 
 @dataclass(frozen=True)
@@ -159,28 +154,6 @@ class TargetFacets:
         tab = self.shape.at_middle(len(x))
         return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
 
-    def across_sides(self, number: Ints) -> tuple[Ints, Bools, Bools]:
-        """What is across each side of the facets in the reference configuration, ``(m, n_sides)`` each (collective).
-
-        Args:
-            number: of each facet over all ranks ``(m,)``.
-
-        Returns:
-            Number of the facet that shares the side, -1 where there is none or several; which sides are sharp edges, and which of these
-            are convex.
-        """
-        X, n_sides = self.config.X[self.dofs], len(self.shape.edges())
-        normal = unit(self._area_vectors(X).mean(axis=1))
-        middle = X[:, : len(self.shape.topology[0])].mean(axis=1)
-        told = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), n_sides, axis=0)
-        others = sums_by_keys(self.config.comm, self.side_keys(), told) - told
-        g, one = self.config.gdim, others[:, 0] == 1
-        sharp = one & (np.einsum("kg,kg->k", others[:, 1 : 1 + g], told[:, 1 : 1 + g]) < SHARP_EDGE)
-        falls = np.einsum("kg,kg->k", others[:, 1 + g : -1] - told[:, 1 + g : -1], told[:, 1 : 1 + g]) < 0
-        across = np.where(one, others[:, -1], -1).astype(np.int64)
-        of_sides = len(X), n_sides
-        return across.reshape(of_sides), sharp.reshape(of_sides), (sharp & falls).reshape(of_sides)
-
     def _area_vectors(self, x: Array) -> Array:
         """Outward normals at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``, as long as the facets are large."""
         return self.sign[:, None, None] * nodal_area_vectors(self.shape, x)
@@ -291,14 +264,3 @@ def _facet_closure(config: Configuration, shape: FacetShape) -> Indices:
                 row += list(layout.entity_dofs(dim, number[dim][tuple(sorted(vertices[v] for v in local))]))
         rows.append(row)
     return np.array(rows, dtype=np.int32)
-
-
-def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
-    """Places of numbers ``(n,)`` that are equal, each with each and with itself ``(k,)``."""
-    order = np.argsort(numbers, kind="stable")
-    first = np.searchsorted(numbers[order], numbers[order], side="left")
-    end = np.searchsorted(numbers[order], numbers[order], side="right")
-    count = end - first
-    i = np.repeat(np.arange(len(numbers)), count)
-    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
-    return order[i], order[j]

@@ -201,12 +201,12 @@ class Neighbours:
         home, row = exchange.origins[node], rows[node]
         # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
         meeting, first = Exchange.to(comm, home), self.skin.first[comm.rank]
-        pairs = meeting.send(row, skin.body[facet], facet + first, skin.across[facet], skin.keys[facet], *about_pairs)
+        pairs = meeting.send(row, skin.body[facet], facet + first, skin.edges.across[facet], skin.keys[facet], *about_pairs)
         seen = self._on_this_side(pairs[0], pairs[1], *pairs[4:])
         rows, bodies, facets, across, _, distance = (a[seen] for a in pairs[:6])
         self.body = self._shared_out(rows, bodies, distance)
-        number, opened = np.full(len(row), -1), np.zeros((len(row), skin.across.shape[1]), bool)
-        which, ends = np.full(len(seen), -1), np.ones((len(seen), skin.across.shape[1]), bool)
+        number, opened = np.full(len(row), -1), np.zeros((len(row), skin.edges.across.shape[1]), bool)
+        which, ends = np.full(len(seen), -1), np.ones((len(seen), skin.edges.across.shape[1]), bool)
         which[seen] = np.where(self.body[:, rows] == bodies, np.arange(self._n)[:, None], -1).max(axis=0)
         ends[seen] = self._open_sides(rows, facets, across)
         # bodies that are in reach, but on no list, may not be met before lists are made anew

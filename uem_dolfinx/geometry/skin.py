@@ -14,7 +14,8 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import SHARP_EDGE, FacetData, TargetFacets, pairs_of_equals, spread_of, unit
+from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
+from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
 from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced
@@ -40,7 +41,7 @@ class Skin(TargetFacets):
         n_bodies: number of bodies of the mesh.
         body_of_node: body of each local node, numbered by the first cell in the mesh's input ``(n_local,)``.
         body: of each facet ``(m,)``.
-        across: number over all ranks of the neighbour across each side of each facet ``(m, n_sides)``, -1 for none.
+        edges: what is at each side of each facet.
         size: mean length of the sides of each body's facets, 0 where it has none ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
@@ -104,20 +105,13 @@ class Skin(TargetFacets):
 
     def _open_sides(self) -> Bools:
         """Sides that bound the surface, or lie on a sharp convex edge, round which no facet reaches ``(m, n_sides)``."""
-        self.across, self.sharp_sides, self._rims = self.across_sides(
-            self.first[self.config.comm.rank] + np.arange(len(self.dofs))
-        )
-        return (self.across < 0) | self._rims
-
-    @cached_property
-    def _sharp_nodes(self) -> Bools:
-        """Which nodes of facets lie on a sharp edge, of any facet ``(m, nn)`` (first time: collective)."""
-        return self.on_sides(self.sharp_sides)[self.dofs]
+        self.edges = sharp_edges(self)
+        return (self.edges.across < 0) | self.edges.convex
 
     @cached_property
     def corners(self) -> Bools:
         """Which owned nodes lie on a sharp convex edge ``(n_owned,)`` (first time: collective)."""
-        return self.on_sides(self._rims)[: self.config.n_owned]
+        return self.on_sides(self.edges.convex)[: self.config.n_owned]
 
     @cached_property
     def _around(self) -> tuple[Ints, Ints, Exchange, Ints, Ints]:
@@ -127,7 +121,7 @@ class Skin(TargetFacets):
             Facets and their nodes ``(k,)``, the exchange of these with the nodes' owners, and of those received pairs that are alike in
             the reference configuration, each with itself.
         """
-        facet, node = np.nonzero(self._sharp_nodes)
+        facet, node = np.nonzero(self.on_sides(self.edges.sharp)[self.dofs])
         exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes[facet, node]))
         drawn = unit(self._area_vectors(self.config.X[self.dofs]))[facet, node]
         there, normal = exchange.send(self.nodes[facet, node], drawn)

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -17,8 +15,9 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import OrientationError, SurfaceError
 from uem_dolfinx.geometry.axisymmetry import circumference
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import SHARP_EDGE, TargetFacets, facets_of, pairs_of_equals
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of
 from uem_dolfinx.geometry.shapes import FacetShape, integrals
+from uem_dolfinx.geometry.sharp import sharp_nodes
 from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.parallel import Exchange, agree, reduced
 
@@ -93,27 +92,17 @@ class Areas:
         except OrientationError:
             # inside a body there is no outside to face
             return None
-        nodes, drawn = facets.nodes.ravel(), facets.normals(drawn=True).reshape(-1, config.gdim)
-        exchange = Exchange.to(comm, config.owner_of(nodes))
-        there, normal = exchange.send(nodes, drawn)
-        i, j = pairs_of_equals(there)
-        apart = np.einsum("kg,kg->k", normal[i], normal[j]) < SHARP_EDGE
-        at = np.isin(there, there[i[apart]])
-        if not reduced(comm, bool(at.any()), op=MPI.LOR):
+        facet, node = np.nonzero(sharp_nodes(facets))
+        if not reduced(comm, len(facet)):
             return None
-        sharp = np.zeros(len(nodes), bool)
-        (sharp[exchange.rows],) = exchange.back(at)
-        facet, node = np.nonzero(sharp.reshape(facets.nodes.shape))
         return facets, facet, node, Exchange.to(comm, config.owner_of(facets.nodes[facet, node]))
 
     def at_sharp_edges(self, nodes: Indices) -> Bools:
         """Which owned ``nodes (n,)`` are at edges or corners where normals of facets are more than 45 degrees apart (collective)."""
-        at = np.zeros(self._config.n_owned, bool)
-        if self._tag.dim > 0 and self._sharp is not None:
-            facets, facet, node, exchange = self._sharp
-            (there,) = exchange.send(facets.nodes[facet, node])
-            at[there - self._config.first] = True
-        return at[nodes]
+        if self._tag.dim == 0 or self._sharp is None:
+            return np.zeros(len(nodes), bool)
+        facets, facet, node, _ = self._sharp
+        return followed_nodes(self._config, facets.dofs[facet, node])[nodes]
 
     def facing(self, nodes: Indices, normal: Array, current: bool) -> Array:
         """Areas of contactors towards what they touch ``(n,)`` (collective).

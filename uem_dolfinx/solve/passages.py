@@ -21,7 +21,6 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.warnings.checks import CORNER
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
@@ -29,6 +28,7 @@ from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.sharp import SHARP_EDGE, to_mean
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
@@ -239,7 +239,7 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
         beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
         beside &= ~(nearest.beyond != 0.0).any(axis=1)
         # the mean of the normals about an edge leans from those of both faces
-        sharp = 1.0 / np.hypot(1.0, CORNER)
+        sharp = to_mean(SHARP_EDGE)
         normal = target.outward(touched)
         # from a face that stands before the one that they touch, they come by a concave edge or across free space
         turned = (_dot(normal, outward) < sharp) & (_dot(nearest.foot - touched.foot, normal) <= PASSAGE_DEPTH * target.stride)

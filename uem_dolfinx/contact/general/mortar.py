@@ -90,7 +90,7 @@ class AmongBodiesMortar(Mortar):
 
     def __init__(self, config: Configuration, nodes: Indices, target: Body, **how: Any):
         super().__init__(config, nodes, target, **how)
-        self._at_edge = target.skin.on_sides(target.skin.sharp_sides)[nodes]
+        self._at_edge = target.skin.on_sides(target.skin.edges.sharp)[nodes]
         self._sets, self._middles = target.sets_of(self.surface), self.surface.x.mean(axis=1)
 
     def place(self, points: Array, state: PairState) -> MortarKinematics:

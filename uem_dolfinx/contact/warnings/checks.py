@@ -22,6 +22,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.sharp import SHARP_EDGE, to_mean
 from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, reduced
@@ -29,9 +30,6 @@ from uem_dolfinx.parallel import agree, reduced
 #: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
 #: [convention; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
 LEFT_OUT = 1e-6
-#: Facets whose normals turn by more than this from their nodes' meet at a corner; they are not straight pieces of a curve.
-#: [convention; slope; test_warnings.py::test_corners_are_no_curves]
-CORNER = 0.5
 #: Surfaces that come nearer than their facets sag on more facets than this, in every direction, conform.
 #: [convention; facets; test_warnings.py::test_surfaces_that_conform]
 CONFORMING = 4
@@ -151,8 +149,10 @@ def facet_curvatures(target: MeshTarget) -> Array:
     Positive where the target is convex; zero at corners and on facets that are curved themselves (collective).
     """
     data = target.facets.current()
-    arms, turns = data.x - data.x.mean(axis=1, keepdims=True), data.nodal_normals - target.facets.normals()
-    turns[np.linalg.norm(turns, axis=2) > CORNER] = 0.0
+    normals = target.facets.normals()
+    arms, turns = data.x - data.x.mean(axis=1, keepdims=True), data.nodal_normals - normals
+    # facets that meet at a sharp edge are not straight pieces of a curve
+    turns[np.einsum("mag,mag->ma", data.nodal_normals, normals) < to_mean(SHARP_EDGE)] = 0.0
     # turn = B arm in the mean
     squares = np.einsum("mag,mah->mgh", arms, arms)
     return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)

@@ -23,13 +23,12 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.search import MeshTarget, nearest_of
+from uem_dolfinx.geometry.sharp import CORNER, sharp_nodes
+from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: A node of a target is at a convex corner if a facet falls away from the mean of the normals there by more than this.
-#: [convention; sine; test_target_corners.py::test_what_is_a_corner]
-FALLS = 0.15
 #: Corners that are no deeper in a facet than this part of its size lie on it.
 #: [convention; size of the facet; test_target_corners.py::test_what_is_told]
 ON_FACET = 1e-2
@@ -199,11 +198,5 @@ class TargetCorners:
 
 def corner_nodes(config: Configuration, facets: TargetFacets) -> Indices:
     """Owned nodes of a surface at its convex corners and edges, and at its ends ``(k,)`` (collective)."""
-    data = facets.current()
-    arms = data.x[:, None] - data.x[:, :, None]
-    length = np.linalg.norm(arms, axis=3)
-    falls = -np.einsum("mabg,mag->mab", arms, data.nodal_normals) > FALLS * length
-    falls &= length > 0.0
-    at_corner = falls.any(axis=2) | facets.open_nodes
-    marked = config.to_owners(facets.dofs[at_corner], np.ones(int(at_corner.sum())))
-    return np.flatnonzero(marked[: config.n_owned] > 0).astype(np.int32)
+    at_corner = facets.dofs[sharp_nodes(facets, CORNER, convex=True) | facets.open_nodes]
+    return np.flatnonzero(followed_nodes(config, at_corner)[: config.n_owned]).astype(np.int32)
