@@ -199,7 +199,7 @@ def test_control_forces_of_a_pressure_press(top, seed, share):
     forms.assemble_vector(b, top.push)
     f = np.array(b.array_r)[top.pair.nodes]
     control = top.pair.kinematics.control
-    lam, nodal = control.forces(control.areas(f) / control.scale, np.ones(len(f), bool))
+    lam, nodal = control.forces(control.basis.of(f) / control.basis.scale, np.ones(len(f), bool))
     total = float(COMM.allreduce(f.sum()))
     assert lowest(COMM, lam) >= -1e-15 * max(total, 1e-300)
     assert COMM.allreduce(lam.sum()) == pytest.approx(total, rel=1e-12, abs=1e-300)
@@ -211,7 +211,7 @@ def test_areas(top):
     """Positive, and together the surface's, where those of the shape functions are zero or negative at vertices."""
     top.open(np.zeros(top.config.n_local), active=True)
     plain = tributary_areas(top.config, top.tag)[top.pair.nodes]
-    areas = top.pair.kinematics.areas(plain, False)
+    areas = top.pair.kinematics.pressure_map(False).areas(plain)
     assert lowest(COMM, areas) > 0.01
     assert COMM.allreduce(areas.sum()) == pytest.approx(1.0, rel=1e-12)
     if top.g == 3 and len(np.unique(COMM.allreduce([len(f) for f in top.facets]))) == 1:

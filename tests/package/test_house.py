@@ -115,7 +115,7 @@ def test_imports_point_one_way():
 
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
-    "members of the seam": 49, "members of Interface": 95, "heuristics": 14, "arrows within contact": 63, "arrows within solve": 36,
+    "members of the seam": 42, "members of Interface": 95, "heuristics": 14, "arrows within contact": 63, "arrows within solve": 36,
     "lines of the package": 45006,
 }  # fmt: skip
 
@@ -143,9 +143,7 @@ def arrows(top):
 def counts():
     """What the budgets count."""
     return {
-        "members of the seam": sum(
-            len(members("contact/seam/placement.py", name)) for name in ("Kinematics", "Discretisation", "Stretching")
-        ),
+        "members of the seam": sum(len(members("contact/seam/placement.py", name)) for name in ("Kinematics", "Discretisation")),
         "members of Interface": len(members("contact/pair/interface.py", "Interface") | members("contact/pair/told.py", "Told")),
         "heuristics": sum(row.kind == "heuristic" for row in thresholds.thresholds()),
         "arrows within contact": len(arrows("uem_dolfinx.contact")),

@@ -5,7 +5,7 @@ contactor,
 
     p' = lam' / A - p A' / A + p s'
 
-where A' is the change of integrals of shape functions, and s' that of what :class:`Stretching` tells beside.
+where A' is the change of integrals of shape functions, and s' the relative change by :class:`Stretch`.
 """
 
 from __future__ import annotations
@@ -69,16 +69,15 @@ class PressureSlopes:
             )
         areas, self._pressures = contact.measured_areas(), contact.pressures
         self._over = np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)
-        self._stretching = self._pair.kinematics.stretching(self._current)
+        self._map = self._pair.kinematics.pressure_map(self._current)
 
     def back(self, weights: Array) -> PressureWeights:
         """The derivative of ``sum w_i p_i`` for weights of this rank's contactors ``(n,)`` (collective)."""
-        config, nodes, kinematics = self._config, self._pair.nodes, self._pair.kinematics
-        own, eq = kinematics.forces_back(self._pair.trial, weights * self._over), self._equations
+        config, nodes, own, eq = self._config, self._pair.nodes, weights * self._over * self._map.force, self._equations
         now, drawn = np.zeros((2, config.n_owned, config.gdim))
-        if self._stretching is not None:
-            now, drawn = self._stretching.back(weights * self._pressures)
-        by_areas = kinematics.areas_back(-weights * self._pressures * self._over)
+        if self._map.stretch is not None:
+            now, drawn = self._map.stretch.back(weights * self._pressures)
+        by_areas = self._map.back(-weights * self._pressures * self._over)
         areas = None
         if self.contact.contactor.dim > 0:
             q = fem.Function(compat.function_space(config.mesh, config.degree))
@@ -95,7 +94,7 @@ class PressureSlopes:
             du: change of the displacement, and of all other fields.
             shape: of the places of the nodes where they were drawn, in the displacement's space.
         """
-        config, nodes, kinematics, p = self._config, self._pair.nodes, self._pair.kinematics, self._pressures
+        config, nodes, p = self._config, self._pair.nodes, self._pressures
         lam, areas = self._pair.forces(self._equations, multipliers).lam, np.zeros(len(nodes))
         if self.contact.contactor.dim > 0:
             V = compat.function_space(config.mesh, config.degree)
@@ -104,8 +103,8 @@ class PressureSlopes:
             for form in (along_u, forms.by_places(area, config.mesh, shape)):
                 if form is not None:
                     areas += forms.assemble_array(V, forms.form(form))[nodes]
-        slopes = self._over * (lam - p * kinematics.areas_along(areas))
-        if self._stretching is not None:
+        slopes = self._over * (lam - p * self._map.along(areas))
+        if self._map.stretch is not None:
             drawn = shape.x.array.reshape(-1, config.gdim)
-            slopes += p * self._stretching.along(config.of(du.x.array) + drawn, drawn)
+            slopes += p * self._map.stretch.along(config.of(du.x.array) + drawn, drawn)
         return slopes

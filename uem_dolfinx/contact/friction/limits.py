@@ -53,7 +53,7 @@ class Limits:
     def grow(self, kinematics: Kinematics) -> None:
         """Take the areas where contactors are now (collective)."""
         if self.law.per_area:
-            self.area = kinematics.areas(self.areas_of(kinematics.projection.normal), False)
+            self.area = kinematics.pressure_map(False).areas(self.areas_of(kinematics.projection.normal))
 
     def see(self, way: Array) -> None:
         """Take how far contactors have slipped in the present step ``(n,)``."""

@@ -16,6 +16,7 @@ from uem_dolfinx.contact.mortar.turning import Frictional, turning
 from uem_dolfinx.contact.seam.base import OnTarget
 from uem_dolfinx.contact.seam.ends import past_end
 from uem_dolfinx.contact.seam.placement import Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.pressure_map import PressureMap, Stretch
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -78,13 +79,14 @@ class Contactors(OnTarget):
             return 2 * np.pi * size[:, None] * (x[:, :, 0] @ self.basis.products.T)
         return size[:, None] * self.basis.mean
 
-    def share_slopes(self, facets: Ints, x: Array) -> Array:
-        """Derivatives of the ``shares`` of some facets by their nodes at ``x (m, nn, gdim)``: ``(m, nn, nn, gdim)``."""
+    def share_slopes(self, facets: Ints, x: Array) -> tuple[Array, Array]:
+        """The ``shares`` of some facets, and their derivatives by their nodes at ``x (m, nn, gdim)``: ``(m, nn, nn, gdim)``."""
         size = Planes.of(self.surface.shape, x, self.surface.sign[facets]).size
-        out = (self.shares(size, x) / size[:, None])[:, :, None, None] * self.growth(facets, x)[:, None]
+        shares = self.shares(size, x)
+        out = (shares / size[:, None])[:, :, None, None] * self.growth(facets, x)[:, None]
         if self.config.axisymmetric:
             out[..., 0] += 2 * np.pi * size[:, None, None] * self.basis.products
-        return out
+        return shares, out
 
     def stretch(self, facets: Ints, size: Array) -> Array:
         """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
@@ -247,13 +249,17 @@ class MortarKinematics:
         frictional = Frictional(which[kept], self.normal[which[kept]], tau[kept], slips[kept])
         return turning(of.elimination, rows, of.surface.dofs[rows.facets], frictional, rows.weights)
 
-    def areas(self, areas: Array, current: bool) -> Array:
-        """Integrals of the dual functions over what is covered (collective)."""
-        of, rows = self.of, self.rows
-        own = rows.area if current and of.sliding == "finite" else rows.area / rows.stretch
-        if current and of.sliding != "finite":
-            own = own * of.stretch(np.arange(len(of.surface.dofs)), of.sizes(of.surface.x))
-        return np.where(rows.covered, own, areas)
+    def pressure_map(self, current: bool) -> PressureMap:
+        """Multipliers are pressures where the surface is now, and forces over kept areas with small and fixed sliding (collective)."""
+        of, rows, finite, every = self.of, self.rows, self.of.sliding == "finite", np.arange(len(self.of.surface.dofs))
+        area = rows.area if current and finite else rows.area / rows.stretch
+        stretch = None
+        if current and not finite:
+            area = area * of.stretch(every, of.sizes(of.surface.x))
+        if current != finite:
+            facets, power = rows.facets if finite else every, np.where(rows.covered, 1.0 if finite else -1.0, 0.0)
+            stretch = Stretch(of.config, of.nodes, of.surface.dofs[facets], lambda x: of.share_slopes(facets, x), power)
+        return PressureMap(rows.share / rows.length, known=rows.covered, area=area, stretch=stretch)
 
     def heights(self) -> Array:
         """Nodal heights whose means, weighted with dual functions, are those of the gaps (collective).
@@ -292,72 +298,3 @@ class MortarKinematics:
         """Integrals of the dual functions with the target's shape functions."""
         at = self.rows.points
         return terms_of(at.nodes[at.facet], at.opposite, (at.duals.A[at.facet] @ at.covered.N)[..., None])
-
-    def mean_areas(self, areas: Array, current: bool) -> Array:
-        """The same as those of forces."""
-        return self.areas(areas, current)
-
-    def areas_along(self, areas: Array) -> Array:
-        """Of contactors that nothing covers; others see their facets, as ``stretching`` tells."""
-        return np.where(self.rows.covered, 0.0, areas)
-
-    def areas_back(self, weights: Array) -> Array:
-        """The same."""
-        return np.where(self.rows.covered, 0.0, weights)
-
-    def forces_back(self, state: PairState, weights: Array) -> Array:
-        """From pressures times areas, which are the same in ``areas``."""
-        return weights * self.rows.share / self.rows.length
-
-    def stretching(self, current: bool) -> MortarStretching | None:
-        """Multipliers are pressures where the surface is now, and forces over kept areas with small and fixed sliding."""
-        of, finite = self.of, self.of.sliding == "finite"
-        if current == finite:
-            return None
-        facets = self.rows.facets if finite else np.arange(len(of.surface.dofs))
-        return MortarStretching(of, np.where(self.rows.covered, 1.0 if finite else -1.0, 0.0), facets)
-
-
-@dataclass(frozen=True)
-class MortarStretching:
-    """Implements ``Stretching``: of pressures that are as a power of the stretch of the facets around their contactor.
-
-    Attributes:
-        of: what ties the contactors to their target.
-        power: ``(n,)``.
-        facets: numbers of the contactor's facets that count ``(m,)``.
-    """
-
-    of: Contactors
-    power: Array
-    facets: Ints
-
-    @cached_property
-    def _parts(self) -> tuple[tuple[Array, Array], ...]:
-        """Derivatives of facets' shares ``(m, nn, nn, gdim)``, and powers over their sums ``(n,)``: now and as drawn (collective)."""
-        of, parts = self.of, []
-        dofs = of.surface.dofs[self.facets]
-        for x, sign in ((of.config.x[dofs], 1.0), (of.config.X[dofs], -1.0)):
-            size = Planes.of(of.surface.shape, x, of.surface.sign[self.facets]).size
-            whole = of.config.to_owners(dofs.ravel(), of.shares(size, x).ravel())[of.nodes]
-            parts.append((of.share_slopes(self.facets, x), sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
-        return tuple(parts)
-
-    def along(self, now: Array, drawn: Array) -> Array:
-        """Areas of the facets change, and their sums at the contactors (collective)."""
-        of, found = self.of, np.zeros(len(self.power))
-        dofs = of.surface.dofs[self.facets]
-        for (slopes, over), moved in zip(self._parts, (now, drawn)):
-            change = np.einsum("mbag,mag->mb", slopes, moved[dofs])
-            found += over * of.config.to_owners(dofs.ravel(), change.ravel())[of.nodes]
-        return found
-
-    def back(self, weights: Array) -> tuple[Array, Array]:
-        """The same backwards (collective)."""
-        of, found = self.of, []
-        dofs = of.surface.dofs[self.facets]
-        for slopes, over in self._parts:
-            at = of.config.from_owners(of.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
-            values = np.einsum("mb,mbag->mag", at, slopes)
-            found.append(of.config.add_at_owners(of.config.to_global(dofs.ravel()), values.reshape(-1, of.config.gdim)))
-        return found[0], found[1]

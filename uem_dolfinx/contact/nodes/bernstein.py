@@ -16,6 +16,7 @@ add up to the resultant.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface
+from uem_dolfinx.contact.seam.pressure_map import Basis, PressureMap, Sums
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
@@ -76,12 +78,16 @@ class Family:
         targets, weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
         return ControlGaps(self, ~alone[i], gap, normal, targets, weights)
 
-    def spread(self, values: Array) -> Array:
-        """Integrals of Bernstein's basis times what ``values (n,)`` are integrals of with the shape functions (collective)."""
-        k, g = len(self.child), self.config.gdim
-        every: Bools = np.ones(k, dtype=bool)
-        all_shared = ControlGaps(self, every, np.zeros(k), np.zeros((k, g)), np.zeros((k, 0), np.int64), np.zeros((k, 0)))
-        return all_shared.areas(values)
+    def sums(self, terms: Bools) -> Sums:
+        """At the parents of some of the terms ``(k,)``, of weight times child."""
+        return Sums(self.config, self.nodes, self.child[terms], self.parent[terms], self.weight[terms])
+
+    def basis(self, shared: Bools) -> Basis:
+        """Bernstein's, where gaps are quadratic in the terms ``shared (k,)``: its scale is over functions that scaled gaps belong to."""
+        scale = np.ones(len(self.nodes))
+        scale[self.child[shared]] = 0.5
+        scale[self.child[shared & self.of_facet]] = 0.25
+        return Basis(scale, (self.sums(shared & ~self.of_facet), self.sums(shared & self.of_facet)))
 
 
 @dataclass(frozen=True)
@@ -112,16 +118,17 @@ class ControlGaps:
     def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
-        return self.scale * control, control - self.handed_on(control, self.shared)
+        return self.basis.scale * control, control - self.sums.of(control)
 
-    @property
-    def scale(self) -> Array:
-        """Bernstein's basis functions over those that belong to the scaled gaps ``(n,)``."""
-        f = self.family
-        scale = np.ones(len(f.nodes))
-        scale[f.child[self.shared]] = 0.5
-        scale[f.child[self.shared & f.of_facet]] = 0.25
-        return scale
+    @cached_property
+    def basis(self) -> Basis:
+        """Functions that control forces are integrals with."""
+        return self.family.basis(self.shared)
+
+    @cached_property
+    def sums(self) -> Sums:
+        """Of children at their parents, what control forces are more than nodal forces."""
+        return self.family.sums(self.shared)
 
     def extend(self, equations: UnitingEquations) -> UnitingEquations:
         """Add the terms of the parents to the equations of all contactors."""
@@ -135,33 +142,6 @@ class ControlGaps:
             followed=np.concatenate([equations.followed, f.config.to_global(f.parent[k]), self.targets[k][a, b]]),
             coefficients=np.concatenate([equations.coefficients, own, -self.weights[k][a, b][:, None] * own[a]]),
         )
-
-    def areas(self, areas: Array) -> Array:
-        """What the control forces are integrals over, from the integrals of the shape functions ``(n,)`` (collective)."""
-        areas = areas + self.handed_on(areas, self.shared & self.family.of_facet)
-        return self.scale * (areas + self.handed_on(areas, self.shared & ~self.family.of_facet))
-
-    def forces_back(self, weights: Array, active: Bools) -> Array:
-        """The transpose of the map from multipliers to control forces, for weights of these ``(n,)``."""
-        return np.where(active, self.scale * weights, 0.0)
-
-    def areas_back(self, weights: Array) -> Array:
-        """The transpose of ``areas`` (collective)."""
-        weights = self.scale * weights
-        weights = weights + self._handed_back(weights, self.shared & ~self.family.of_facet)
-        return weights + self._handed_back(weights, self.shared & self.family.of_facet)
-
-    def _handed_back(self, values: Array, terms: Bools) -> Array:
-        """The transpose of ``handed_on`` (collective)."""
-        f = self.family
-        at_parent = f.config.from_owners(f.nodes, values[:, None], f.parent)[:, 0]
-        return np.asarray(np.bincount(f.child, np.where(terms, f.weight * at_parent, 0.0), minlength=len(f.nodes)), dtype=float)
-
-    def handed_on(self, values: Array, terms: Bools) -> Array:
-        """Sum over the children of each contactor of weight times value ``(n,)`` (collective)."""
-        f = self.family
-        amounts = np.where(terms, f.weight * values[f.child], 0.0)
-        return f.config.to_owners(f.parent, amounts)[f.nodes]
 
 
 class Bernstein(NodeToSurface):
@@ -177,7 +157,7 @@ class Bernstein(NodeToSurface):
 
     def spread(self, values: Array) -> Array:
         """Integrals with Bernstein's basis (collective)."""
-        return self.family.spread(values)
+        return self.family.basis(np.ones(len(self.family.child), bool)).of(values)
 
     def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
         """The kinematics with control gaps (collective)."""
@@ -213,7 +193,7 @@ class ControlKinematics(NodalKinematics):
     @property
     def force_per_multiplier(self) -> Array:
         """Bernstein's basis functions over those that belong to the scaled gaps."""
-        return self.control.scale
+        return np.asarray(self.control.basis.scale)
 
     def _normal_rows(self, weights: Array) -> UnitingEquations:
         return self.control.extend(super()._normal_rows(weights))
@@ -223,23 +203,11 @@ class ControlKinematics(NodalKinematics):
 
     def nodal_friction(self, tau: Array) -> Array:
         """Handed on from the control points to the nodes; what targets get that are contactors themselves is not theirs (collective)."""
-        return np.column_stack([along - self.control.handed_on(along, self.control.shared) for along in tau.T])
+        return np.column_stack([along - self.control.sums.of(along) for along in tau.T])
 
-    def areas(self, areas: Array, current: bool) -> Array:
-        """Integrals of Bernstein's basis (collective)."""
-        return self.control.areas(areas)
-
-    def areas_along(self, areas: Array) -> Array:
-        """Of Bernstein's basis (collective)."""
-        return self.control.areas(areas)
-
-    def areas_back(self, weights: Array) -> Array:
-        """From Bernstein's basis (collective)."""
-        return self.control.areas_back(weights)
-
-    def forces_back(self, state: PairState, weights: Array) -> Array:
-        """From control forces (collective)."""
-        return self.control.forces_back(weights, state.active)
+    def pressure_map(self, current: bool) -> PressureMap:
+        """Of control forces, integrals with Bernstein's basis."""
+        return PressureMap(self.force_per_multiplier, self.control.basis)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:

@@ -19,6 +19,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget
 from uem_dolfinx.contact.seam.ends import END_HOLDS, past_end
 from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -309,9 +310,9 @@ class NodalKinematics:
         i, p = which[plain], self.projection
         return [(np.column_stack([self.of.config.to_global(self.of.nodes[i]), p.nodes[i]]), p.turnings(i, tau[plain]))]
 
-    def areas(self, areas: Array, current: bool) -> Array:
-        """A nodal force is the integral of the pressure over the node's shape function."""
-        return areas
+    def pressure_map(self, current: bool) -> PressureMap:
+        """Of nodal forces, each the integral of the pressure over the node's shape function."""
+        return PressureMap(np.ones(len(self.points)))
 
     def heights(self) -> Array:
         """Of the nodes."""
@@ -321,26 +322,6 @@ class NodalKinematics:
         """At the nodes themselves, and at their feet."""
         n = len(self.points)
         return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)
-
-    def mean_areas(self, areas: Array, current: bool) -> Array:
-        """Integrals of the shape functions."""
-        return areas
-
-    def areas_along(self, areas: Array) -> Array:
-        """The same."""
-        return areas
-
-    def areas_back(self, weights: Array) -> Array:
-        """The same."""
-        return weights
-
-    def forces_back(self, state: PairState, weights: Array) -> Array:
-        """The same."""
-        return weights
-
-    def stretching(self, current: bool) -> None:
-        """Pressures change with the areas alone."""
-        return None
 
 
 class NothingNear(NodalKinematics):

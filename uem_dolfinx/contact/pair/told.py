@@ -184,8 +184,8 @@ class Told:
         return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
 
     def areas(self, areas: Array, current: bool, reference: Array) -> Array:
-        """As of ``Kinematics``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
-        found = self.kinematics.areas(areas, current)
+        """As of ``PressureMap``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
+        found = self.kinematics.pressure_map(current).areas(areas)
         return found if self.tie is None else self.tie.areas(areas, reference, found)
 
     def kept_gaps(self) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
@@ -260,46 +261,14 @@ class Kinematics(Protocol):
             Lists of global nodes, negative where there is none, and blocks, as of ``curvature``.
         """
 
-    def areas(self, areas: Array, current: bool) -> Array:
-        """What ``lam`` is an integral of the pressure over, in the reference or the current configuration (collective).
-
-        Args:
-            areas: integrals of the shape functions over the one or the other ``(n,)``.
-            current: which of the two.
-        """
+    def pressure_map(self, current: bool) -> PressureMap:
+        """From multipliers along normals to pressures, in the reference or the ``current`` configuration (collective)."""
 
     def heights(self) -> Array:
         """Of the contactors over the target ``(n,)``, which have the gaps that decide, but for offsets (collective)."""
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Of a field at the contactors, and of what is opposite: places, global nodes and weights, which add up to one (collective)."""
-
-    def mean_areas(self, areas: Array, current: bool) -> Array:
-        """What these are means over; arguments as those of :meth:`areas` (collective)."""
-
-    # -- derivatives of pressures ----------------------------------------------------------------------------------------
-
-    def areas_along(self, areas: Array) -> Array:
-        """What changes of the ``areas (n,)`` given to :meth:`areas` make of what it returns ``(n,)`` (collective)."""
-
-    def areas_back(self, weights: Array) -> Array:
-        """The transpose of :meth:`areas_along` (collective)."""
-
-    def forces_back(self, state: PairState, weights: Array) -> Array:
-        """The transpose of the map from the multipliers of equations along normals to ``lam``, ``(n,)`` each (collective)."""
-
-    def stretching(self, current: bool) -> Stretching | None:
-        """How pressures change with the facets around contactors beside; ``current`` as of :meth:`areas`; None if they do not."""
-
-
-class Stretching(Protocol):
-    """Relative changes of pressures with the areas of facets, forces and all else being the same."""
-
-    def along(self, now: Array, drawn: Array) -> Array:
-        """Of contactors ``(n,)`` whose nodes move where they are and where they were drawn ``(n_local, gdim)`` each (collective)."""
-
-    def back(self, weights: Array) -> tuple[Array, Array]:
-        """The transpose of :meth:`along`, for weights ``(n,)``: of the owned nodes ``(n_owned, gdim)`` each (collective)."""
 
 
 class Discretisation(Protocol):

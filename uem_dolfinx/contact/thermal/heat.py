@@ -96,21 +96,18 @@ class Passage(Sides):
 
     Attributes:
         areas: that heat passes through ``(n,)``.
+        force: contact forces over multipliers, as of ``PressureMap`` ``(n,)``.
         leads: contactors that it passes where they touch ``(n,)``.
     """
 
     areas: Array
+    force: Array
     leads: Bools
 
     @property
     def jump(self) -> Array:
         """By what the contactor's mean exceeds the target's ``(k,)``."""
         return self.own - self.theirs
-
-
-def passage(pair: Pair, areas: Array, current: bool, leads: Bools) -> Passage:
-    """What is opposite to contactors where they have been placed; ``areas`` and ``current`` as of ``Kinematics`` (collective)."""
-    return Passage(**vars(sides_of(pair)), areas=pair.kinematics.mean_areas(areas, current), leads=leads)
 
 
 class HeatEquations(NamedTuple):
@@ -223,7 +220,8 @@ class Heat:
         if self._passage is None or self._passage.projection is not self._pair.projection:
             pair, current = self._pair, self._contact.measure == "current"
             areas = self._contact.areas_facing(pair.nodes, pair.projection.normal, current)
-            self._passage = passage(pair, areas, current, self._contact.leads())
+            pressures, leads = pair.kinematics.pressure_map(current), self._contact.leads()
+            self._passage = Passage(**vars(sides_of(pair)), areas=pressures.of_means(areas), force=pressures.force, leads=leads)
         return self._passage
 
     def conductances(self) -> Array:
@@ -352,7 +350,7 @@ class Heat:
         """
         pair, config = self._pair, self._pair.config
         slopes = np.where(pair.trial.active & (config.degree == 1), self._slopes(), 0.0)
-        weights, own = pair.kinematics.forces_back(pair.trial, slopes * self._per_area()), equations.kind == NORMAL
+        weights, own = slopes * self._per_area() * self.passage.force, equations.kind == NORMAL
         which = equations.contactor[own]
         return _dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
 

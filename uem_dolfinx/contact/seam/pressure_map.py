@@ -1,0 +1,147 @@
+"""Pressures of contactors from the multipliers of their equations, and back: a value that a discretisation makes of a placement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.geometry.configuration import Configuration
+
+
+class Sums(NamedTuple):
+    """A sparse matrix S of the contactors of all ranks.
+
+    Attributes:
+        config: configuration of the displacement.
+        nodes: owned contactors ``(n,)``.
+        column: place of the contactor of each entry ``(k,)``.
+        row: local node of each entry ``(k,)``.
+        entry: ``(k,)``.
+    """
+
+    config: Configuration
+    nodes: Indices
+    column: Ints
+    row: Ints
+    entry: Array
+
+    def of(self, values: Array) -> Array:
+        """``S values`` ``(n,)`` (collective)."""
+        return self.config.to_owners(self.row, self.entry * values[self.column])[self.nodes]
+
+    def back(self, weights: Array) -> Array:
+        """``S' weights`` ``(n,)`` (collective)."""
+        at_row = self.config.from_owners(self.nodes, weights[:, None], self.row)[:, 0]
+        return np.asarray(np.bincount(self.column, self.entry * at_row, minlength=len(self.nodes)), dtype=float)
+
+
+class Basis(NamedTuple):
+    """Integrals with functions that forces belong to, from those with the shape functions: ``B = W (I + S_1) ... (I + S_m)``.
+
+    Attributes:
+        scale: the diagonal of W ``(n,)``.
+        sums: ``S_1 ... S_m``.
+    """
+
+    scale: Array | float = 1.0
+    sums: tuple[Sums, ...] = ()
+
+    def of(self, integrals: Array) -> Array:
+        """``B integrals`` ``(n,)`` (collective)."""
+        for one in reversed(self.sums):
+            integrals = integrals + one.of(integrals)
+        return self.scale * integrals
+
+    def back(self, weights: Array) -> Array:
+        """``B' weights`` ``(n,)`` (collective)."""
+        weights = self.scale * weights
+        for one in self.sums:
+            weights = weights + one.back(weights)
+        return weights
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Pressures that are as powers of sums of facets' shares at their nodes, over these sums as drawn, all else being the same.
+
+    Attributes:
+        config: configuration of the displacement.
+        nodes: owned contactors ``(n,)``.
+        dofs: local nodes of the facets ``(m, nn)``.
+        shares: of facets with their nodes at ``(m, nn, gdim)``: ``(m, nn)``, and derivatives by these ``(m, nn, nn, gdim)``.
+        power: ``(n,)``.
+    """
+
+    config: Configuration
+    nodes: Indices
+    dofs: Indices
+    shares: Callable[[Array], tuple[Array, Array]]
+    power: Array
+
+    @cached_property
+    def _parts(self) -> list[tuple[Array, Array]]:
+        """Derivatives of shares, and powers over their sums ``(n,)``: where facets are now, and as drawn (first time: collective)."""
+        parts = []
+        for x, sign in ((self.config.x, 1.0), (self.config.X, -1.0)):
+            shares, slopes = self.shares(x[self.dofs])
+            whole = self.config.to_owners(self.dofs.ravel(), shares.ravel())[self.nodes]
+            parts.append((slopes, sign * self.power / np.where(self.power != 0.0, whole, 1.0)))
+        return parts
+
+    def along(self, now: Array, drawn: Array) -> Array:
+        """Relative changes ``(n,)`` if nodes move where they are and where they were drawn ``(n_local, gdim)`` each (collective)."""
+        found = np.zeros(len(self.power))
+        for (slopes, over), moved in zip(self._parts, (now, drawn)):
+            change = np.einsum("mbag,mag->mb", slopes, moved[self.dofs])
+            found += over * self.config.to_owners(self.dofs.ravel(), change.ravel())[self.nodes]
+        return found
+
+    def back(self, weights: Array) -> list[Array]:
+        """The transpose of :meth:`along`, for weights ``(n,)``: of the owned nodes ``(n_owned, gdim)`` each (collective)."""
+        config, dofs, found = self.config, self.dofs, []
+        for slopes, over in self._parts:
+            at = config.from_owners(self.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
+            values = np.einsum("mb,mbag->mag", at, slopes)
+            found.append(config.add_at_owners(config.to_global(dofs.ravel()), values.reshape(-1, config.gdim)))
+        return found
+
+
+class PressureMap(NamedTuple):
+    """Pressures ``p = F mu / A``: multipliers mu of equations along normals make forces ``lam = F mu``, which act on areas A.
+
+    Areas are ``A = B a`` with integrals a of the shape functions over the contactor, except where they are known.
+
+    Attributes:
+        force: the diagonal of F ``(n,)``.
+        basis: B.
+        known: contactors with known areas ``(n,)``.
+        area: these areas ``(n,)``.
+        stretch: by which pressures change as well, multipliers and areas being the same; None for nothing.
+    """
+
+    force: Array
+    basis: Basis = Basis()
+    known: Bools | bool = False
+    area: Array | float = 0.0
+    stretch: Stretch | None = None
+
+    def areas(self, integrals: Array) -> Array:
+        """A of ``integrals (n,)`` of the shape functions (collective)."""
+        return self.basis.of(self.of_means(integrals))
+
+    def of_means(self, integrals: Array) -> Array:
+        """Areas that means at the contactors' nodes are means over ``(n,)``: those of A without B."""
+        return np.where(self.known, self.area, integrals)
+
+    def along(self, integrals: Array) -> Array:
+        """Changes of A with changes of ``integrals (n,)`` (collective)."""
+        return self.basis.of(np.where(self.known, 0.0, integrals))
+
+    def back(self, weights: Array) -> Array:
+        """The transpose of :meth:`along`, of ``weights (n,)`` (collective)."""
+        return np.where(self.known, 0.0, self.basis.back(weights))
