@@ -83,7 +83,7 @@ def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
     """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` with the offset, in which both are linear (collective)."""
     d, kinematics = pair.discretisation, pair.kinematics
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
-    before, length = d.offset, _lengths(pair)
+    before, length = d.offset, pair.kinematics.gap_rows.scale
     try:
         gap, forces = _gaps_and_forces(pair, multipliers, length)
         d.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
@@ -103,17 +103,12 @@ def _least_side(pair: Interface) -> float:
     return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).min(initial=pair.config.size))
 
 
-def _lengths(pair: Interface) -> Array:
-    """What equations across the target were divided by ``(n,)``."""
-    return pair.kinematics.rows.length if isinstance(pair.kinematics, MortarKinematics) else np.ones(len(pair.nodes))
-
-
 def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tuple[Array, Array]:
     """Gaps of equations ``(m,)`` and contact forces at the owned nodes, as if they were divided by another ``length (n,)`` (collective)."""
     if isinstance(pair.discretisation, Mortar) and isinstance(pair.kinematics, MortarKinematics):
         pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
     own, config = pair.equations(), pair.config
-    longer = (_lengths(pair) / length)[own.contactor]
+    longer = (pair.kinematics.gap_rows.scale / length)[own.contactor]
     return own.trial.gap * longer, forces_of(config, own.test, multipliers * longer)
 
 

@@ -13,16 +13,15 @@ from uem_dolfinx.contact.mortar.duals import Basis, basis_of
 from uem_dolfinx.contact.mortar.ends import curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar.turning import Frictional, turning
-from uem_dolfinx.contact.seam.base import OnTarget
-from uem_dolfinx.contact.seam.ends import past_end
-from uem_dolfinx.contact.seam.placement import Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
+from uem_dolfinx.contact.seam.placement import GapRows
 from uem_dolfinx.contact.seam.pressure_map import PressureMap, Stretch
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.overlaps import Planes
-from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.search import MeshTarget
 
 #: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
@@ -97,31 +96,17 @@ class Contactors(OnTarget):
 
 
 @dataclass(frozen=True)
-class MortarKinematics:
-    """Implements ``Kinematics``: weighted gaps.
+class MortarKinematics(PlacedOnTarget):
+    """Implements ``Kinematics``: weighted gaps. The projection has these, and the directions of the plain rows.
 
     Attributes:
-        of: what ties the contactors to their target.
-        points: of the contactors ``(n, gdim)``.
-        projection: of the contactors, with weighted gaps and the directions of their plain rows.
-        nearest: of the contactors, on their nearest facets.
-        gap: weighted gaps ``(n,)``.
         rows: all equations and what they were made of.
         movable: contactors that can move along the normal, or something that they follow can ``(n,)``.
     """
 
     of: Contactors
-    points: Array
-    projection: Projection
-    nearest: Projection
-    gap: Array
     rows: WeightedRows
     movable: Bools
-
-    @property
-    def idle(self) -> bool:
-        """No: the target is one for all."""
-        return False
 
     @property
     def corners(self) -> None:
@@ -155,10 +140,6 @@ class MortarKinematics:
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def placed_again(self, state: PairState) -> MortarKinematics:
-        """No equation depends on the state."""
-        return self
-
     def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
         """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
 
@@ -191,12 +172,8 @@ class MortarKinematics:
         rows = self.rows
         if not self.of.target.n_nodes:
             return np.zeros(len(self.points), dtype=bool)
-        past = past_end(self.projection, state, self.of.thickness)
+        past = super().off(state)
         return np.where(rows.covered, state.at_end & (rows.ratio < COVERED_AGAIN), past)
-
-    def at_end(self, state: PairState) -> Bools:
-        """No end holds contactors: what is covered of them fades away."""
-        return np.zeros(len(self.points), dtype=bool)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
@@ -204,33 +181,6 @@ class MortarKinematics:
     def gap_rows(self) -> GapRows:
         """One row for each contactor, divided by the length of the weighted gap's derivative."""
         return GapRows.along_normals(self.of.config, self.rows.equations, self.rows.length, self.of.free)
-
-    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """Pressures times areas, and the contactors' forces (collective)."""
-        rows, config = self.rows, self.of.config
-        mu = np.zeros(len(self.points))
-        mu[equations.contactor] = multipliers
-        force = np.asarray(config.add_at_owners(*self._handed_on(mu))[self.of.nodes])
-        return Traction(mu / rows.length * rows.share, np.einsum("ng,ng->n", force, rows.plain.direction), force)
-
-    def nodal_friction(self, tau: Array) -> Array:
-        """Of the rows' weights, on both sides of contactors that follow each other (collective)."""
-        return np.asarray(self.of.config.add_at_owners(*self.ties.handed_on(tau))[self.of.nodes])
-
-    def _handed_on(self, mu: Array) -> tuple[Ints, Array]:
-        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``mu (n,)`` on both bodies."""
-        eq, nodes = self.rows.equations, self.of.nodes
-        own, terms = mu != 0, mu[eq.row] != 0
-        there = np.concatenate([self.of.config.to_global(nodes[own]), eq.followed[terms]])
-        return there, np.concatenate([mu[own, None] * eq.direction[own], -mu[eq.row[terms], None] * eq.coefficients[terms]])
-
-    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
-        """Nodal forces of the state's multipliers, by the equations."""
-        nodes, forces = self._handed_on(state.lam / self.rows.share * self.rows.length)
-        if state.friction is None:
-            return nodes, forces
-        along = self.ties.handed_on(state.friction.tau / self.force_per_multiplier[:, None])
-        return np.concatenate([nodes, along[0]]), np.concatenate([forces, along[1]])
 
     def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
         """Second derivatives of the weighted gaps."""

@@ -16,8 +16,8 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.seam.base import OnTarget
-from uem_dolfinx.contact.seam.ends import END_HOLDS, past_end
+from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
+from uem_dolfinx.contact.seam.ends import END_HOLDS
 from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, GapRows, Traction
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
@@ -128,38 +128,19 @@ class NodeToSurface(OnTarget):
 
 
 @dataclass(frozen=True)
-class NodalKinematics:
+class NodalKinematics(PlacedOnTarget):
     """Implements ``Kinematics``: nodes on the surface of one target.
 
     Attributes:
-        of: what ties the contactors to their target.
-        points: of the contactors ``(n, gdim)``.
-        projection: of the contactors; those that a corner holds are in the corner.
-        nearest: of the contactors, on their nearest facets.
-        gap: that decides on contact ``(n,)``.
         corners: of the target that hold contactors; None if no rank has any.
         target_moves: whether the target can move along the normal ``(n,)``; None where no contactor is prescribed.
         left: contactors that have just left a corner ``(n,)``; None if none has.
     """
 
     of: NodeToSurface
-    points: Array
-    projection: Projection
-    nearest: Projection
-    gap: Array
     corners: Corners | None
     target_moves: Bools | None
     left: Bools | None = None
-
-    @property
-    def idle(self) -> bool:
-        """No: the target is one for all."""
-        return False
-
-    @property
-    def normal(self) -> Array:
-        """The normals at the feet ``(n, gdim)``."""
-        return self.projection.normal
 
     @cached_property
     def movable(self) -> Bools:
@@ -216,10 +197,6 @@ class NodalKinematics:
         return replace(self, left=left), state, bool(left.any()) or entered
 
     # -- what decides ----------------------------------------------------------------------------------------------------
-
-    def off(self, state: PairState) -> Bools:
-        """Past an open end of the target in a direction in which contactors can move, or round it behind a thin target."""
-        return past_end(self.projection, state, self.of.thickness)
 
     def at_end(self, state: PairState) -> Bools:
         """Contactors that come to the target at its end, where edges coincide, are held there until they slide away from it.

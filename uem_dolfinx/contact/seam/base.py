@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mpi4py import MPI
@@ -10,6 +10,9 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.contact.seam.ends import past_end
+from uem_dolfinx.contact.seam.placement import Constraints, Kinematics, Traction
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.parallel import reduced
@@ -129,3 +132,69 @@ class OnTarget:
             self._renewing = True
             if not self.target.n_nodes:
                 self.let_go()
+
+
+@dataclass(frozen=True)
+class PlacedOnTarget:
+    """Implements ``Kinematics`` as far as ``gap_rows``, ``pressure_map`` and ``ties`` tell, for rows that are the same in every state.
+
+    Attributes:
+        of: what ties the contactors to their target.
+        points: of the contactors ``(n, gdim)``.
+        projection: of the contactors; where a corner holds some, of the corner.
+        nearest: of the contactors, on their nearest facets.
+        gap: that decides on contact ``(n,)``.
+    """
+
+    of: OnTarget
+    points: Array
+    projection: Projection
+    nearest: Projection
+    gap: Array
+
+    @property
+    def idle(self) -> bool:
+        """No: the target is one for all."""
+        return False
+
+    @property
+    def normal(self) -> Array:
+        """Of the projection ``(n, gdim)``."""
+        return self.projection.normal
+
+    def placed_again(self: Kinematics, state: PairState) -> Kinematics:
+        """No equation depends on the state."""
+        return self
+
+    def follow(self: Kinematics, state: PairState) -> tuple[Kinematics, PairState, bool]:
+        """There is no bend to follow contactors across."""
+        return self, state, False
+
+    def off(self, state: PairState) -> Bools:
+        """Past an open end of the target in a direction in which contactors can move, or round it behind a thin target."""
+        return past_end(self.projection, state, self.of.thickness)
+
+    def at_end(self, state: PairState) -> Bools:
+        """No end holds contactors."""
+        return np.zeros(len(self.points), dtype=bool)
+
+    def forces(self: Kinematics, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+        """Forces of the rows at both bodies, where contactors follow each other too (collective)."""
+        rows, mu = self.gap_rows, np.zeros(len(self.points))
+        mu[equations.contactor] = multipliers
+        force = np.asarray(rows.config.add_at_owners(*rows.forces(mu))[rows.equations.node])
+        lam = mu * self.pressure_map(False).force
+        return Traction(lam, np.einsum("ng,ng->n", force, self.projection.normal), force)
+
+    def nodal_friction(self: Kinematics, tau: Array) -> Array:
+        """Of the weights, on both sides of contactors that follow each other (collective)."""
+        rows = self.gap_rows
+        return np.asarray(rows.config.add_at_owners(*self.ties.handed_on(tau))[rows.equations.node])
+
+    def nodal_forces(self: Kinematics, state: PairState) -> tuple[Ints, Array]:
+        """Of the state's multipliers, by the rows, and of friction by the weights."""
+        nodes, forces = self.gap_rows.forces(state.lam / self.pressure_map(False).force)
+        if state.friction is None:
+            return nodes, forces
+        along = self.ties.handed_on(state.friction.tau / self.force_per_multiplier[:, None])
+        return np.concatenate([nodes, along[0]]), np.concatenate([forces, along[1]])

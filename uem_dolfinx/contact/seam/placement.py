@@ -146,6 +146,14 @@ class GapRows:
         """Deciding gaps ``(n,)`` after an increment of the owned nodes ``(n_owned, gdim)``, to first order (collective)."""
         return np.asarray(self.scale * (self.equations.gap[: len(self.scale)] + self.along(du)))
 
+    def forces(self, multipliers: Array) -> tuple[Ints, Array]:
+        """Global nodes of both bodies ``(k,)``, and forces there ``(k, gdim)``, of multipliers of all rows ``(m,)``."""
+        eq = self.equations
+        own, terms = multipliers != 0, multipliers[eq.row] != 0
+        nodes = np.concatenate([self.config.to_global(eq.node[own]), eq.followed[terms]])
+        along, against = multipliers[own, None] * eq.direction[own], -multipliers[eq.row[terms], None] * eq.coefficients[terms]
+        return nodes, np.concatenate([along, against])
+
     def select(self, which: Ints, active: Bools) -> Constraints:
         """Rows of the contactors ``which (k,)``, those of ``active (n,)`` contactors active."""
         chosen = np.zeros(len(self.scale), dtype=bool)
