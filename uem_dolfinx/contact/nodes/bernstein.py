@@ -207,7 +207,7 @@ class ControlKinematics(NodalKinematics):
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Of control forces, integrals with Bernstein's basis."""
-        return PressureMap(self.force_per_multiplier, self.control.basis)
+        return PressureMap(self.cone * self.force_per_multiplier, self.control.basis)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:

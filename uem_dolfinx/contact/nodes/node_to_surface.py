@@ -289,7 +289,7 @@ class NodalKinematics(PlacedOnTarget):
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Of nodal forces, each the integral of the pressure over the node's shape function."""
-        return PressureMap(np.ones(len(self.points)))
+        return PressureMap(self.cone)
 
     def heights(self) -> Array:
         """Of the nodes."""

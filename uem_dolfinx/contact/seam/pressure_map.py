@@ -117,7 +117,7 @@ class PressureMap(NamedTuple):
     Areas are ``A = B a`` with integrals a of the shape functions over the contactor, except where they are known.
 
     Attributes:
-        force: the diagonal of F ``(n,)``.
+        force: the diagonal of F ``(n,)``; of contactors in corners, whose forces are several rows', of no use.
         basis: B.
         known: contactors with known areas ``(n,)``.
         area: these areas ``(n,)``.
