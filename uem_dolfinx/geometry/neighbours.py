@@ -381,6 +381,9 @@ class Neighbour(MeshTarget):
         averaged: as of ``MeshTarget``.
     """
 
+    #: Lists tell what is near.
+    measures = False
+
     def __init__(self, neighbours: Neighbours, number: int, averaged: bool = False):
         super().__init__(neighbours.skin, averaged)
         self.neighbours, self.number = neighbours, number

@@ -125,6 +125,9 @@ class MeshTarget:
             )  # fmt: skip
         return replace(self._nowhere, foot=points)
 
+    #: Gaps are distances everywhere, and boxes around surfaces tell which are far apart.
+    measures = True
+
     @property
     def faceted(self) -> bool:
         """Whether normals jump from facet to facet."""

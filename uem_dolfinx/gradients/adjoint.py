@@ -96,7 +96,7 @@ class Linearised:
         F: the residual in UFL.
         derivatives: of it and of functionals.
         P: restriction matrix of the active contactors.
-        rows: their equations.
+        rows: their equations; ``equations`` are those of each contact.
         multipliers: of all equations of contacts, and of users ``(m,)``.
         ramp: share that Dirichlet values have of those that they are led to, in the rows of vectors ``(n_rows, gdim)``.
     """
@@ -141,7 +141,7 @@ class Linearised:
         bodies.assemble()
         state = system.assemble_constraints(lambda norm, scale, rounding: True)
         assert isinstance(state, BodyState)
-        self.P, self.rows = state.trial, state.rows
+        self.P, self.rows, self.equations = state.trial, state.rows, state.rows.of(self.problem.pairs)
         self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
         return state
 
@@ -196,14 +196,14 @@ class Linearised:
                 f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "
                 "replaced by others, so that pressures have no derivatives here; let nodes be contactors of one contact, with free normals"
             )
-        return PressureSlopes(contact, self.rows.equations[self.problem.contacts.index(contact)])
+        return PressureSlopes(contact, self.equations[self.problem.contacts.index(contact)])
 
     def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
         """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective with weights)."""
         if not weights:
             # what equations are replaced by that conflict may be of other ranks
             return self.config.vector()
-        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.rows.equations)]
+        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.equations)]
         return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
 
     def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
@@ -232,7 +232,7 @@ class Linearised:
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
         """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
-        return curvature_of([self.problem.pairs[k] for k in which], self.config.unknowns.vector(), True, False)
+        return curvature_of([p for k in which if (p := self.problem.pairs[k]).asked], self.config.unknowns.vector(), True, False)
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""
@@ -265,7 +265,7 @@ class Linearised:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
         """
         k, pair, config = self.problem.contacts.index(m.contact), m.contact.pair, self.config
-        gaps, first = np.zeros_like(self.multipliers), sum(len(own) for own in self.rows.equations[:k])
+        gaps, first = np.zeros_like(self.multipliers), sum(len(own) for own in self.equations[:k])
         if m.parameter == "friction":
             return gaps, rubbed(pair)
         if self.P.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
@@ -273,7 +273,7 @@ class Linearised:
                 f"contact '{m.contact.name}': equations follow each other in rings, or conflict, so that its {m.parameter} has no "
                 "derivative here; let nodes be contactors of one contact, with free normals"
             )
-        own, rows = slice(first, first + len(self.rows.equations[k])), self.rows.equations[k].trial
+        own, rows = slice(first, first + len(self.equations[k])), self.equations[k].trial
         if m.parameter == "offset":
             gaps[own], forces = thickened(pair, self.multipliers[own])
             return gaps, forces
@@ -331,9 +331,9 @@ class Linearised:
         """How a contact's pressure changes with a motion (collective)."""
         slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
         multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
-        ends = np.cumsum([len(own) for own in self.rows.equations])
+        ends = np.cumsum([len(own) for own in self.equations])
         found = fem.Function(contact.pressure.function_space)
-        part = multipliers[ends[k] - len(self.rows.equations[k]) : ends[k]]
+        part = multipliers[ends[k] - len(self.equations[k]) : ends[k]]
         found.x.array[contact.nodes] = slopes.along(part, motion.du, motion.shape)
         found.x.scatter_forward()
         return found

@@ -225,13 +225,13 @@ class LinearisedStep(Linearised):
         for pair, own in zip(pairs, slopes):
             pair.trial = pair.trial if own is None else own.without_stuck()
         try:
-            curvature = curvature_of(pairs, like, any(self._slopes), False)
+            curvature = curvature_of(asked := [pair for pair in pairs if pair.asked], like, any(self._slopes), False)
         finally:
             for pair, state in zip(pairs, states):
                 pair.trial = state
         if self.config.gdim == 2 or not any(slopes):
             return curvature
-        turned, _ = slip_terms(pairs, like)
+        turned, _ = slip_terms(asked, like)
         leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
         return together(together(curvature, turned), leaning)
 
@@ -260,7 +260,7 @@ class LinearisedStep(Linearised):
         """Derivatives by the anchors that the step began with, those of anchors that stay among them (collective)."""
         n, g = self.config.n_owned, self.config.gdim
         a, first, found = adjoint.a.x.array[: n * g].reshape(n, g), 0, []
-        for slopes, own, before in zip(self._slopes, self.rows.equations, kept):
+        for slopes, own, before in zip(self._slopes, self.equations, kept):
             part = adjoint.by_gaps[first : first + len(own)]
             first += len(own)
             found.append(before if slopes is None else slopes.by_anchors(part, own, a) + before)

@@ -14,6 +14,7 @@ from uem_dolfinx import given
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
 from uem_dolfinx.log import timed
@@ -89,10 +90,14 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         bodies.tangent.update()
         # bodies that float are to be free
         rows = make_rows(
-            system.over_constraints, system.pairs, lambda *_: bodies.free_rows, 0.0 * bodies.prescribed, system.linear
+            system.over_constraints,
+            pairs := in_question(system.pairs),
+            lambda *_: bodies.free_rows,
+            0.0 * bodies.prescribed,
+            system.linear,
         )
         like, M = config.unknowns.vector(), config.in_rows(mass.M)
-        curvature = curvature_of(system.pairs, like, False, False) if system.consistent_tangent else None
+        curvature = curvature_of(pairs, like, False, False) if system.consistent_tangent else None
         P = rows.frictionless
         with timed("united matrix"):
             added = added_mass(system.linear, like)

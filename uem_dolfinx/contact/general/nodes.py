@@ -10,7 +10,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.nodes.bernstein import Bernstein
-from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface, NothingNear
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.neighbours import Neighbour
@@ -21,8 +21,6 @@ class AmongBodies(NodeToSurface):
     """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
 
     target: Neighbour
-    #: Lists tell what is near.
-    can_be_far = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -33,9 +31,11 @@ class AmongBodies(NodeToSurface):
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
         self.target.hold(np.where(state.active, state.facet, -1))
-        if self.target.nothing_near() and not reduced(self.config.comm, bool(state.active.any()), op=MPI.LOR):
-            return NothingNear.at(self, points)
         return super().place(points, state)
+
+    def _asks(self, state: PairState) -> bool:
+        """Whether lists have anything, or a contactor is active, on any rank (collective)."""
+        return not self.target.nothing_near() or reduced(self.config.comm, bool(state.active.any()), op=MPI.LOR)
 
     def begin_step(self) -> None:
         """Lists are those that the step began with."""

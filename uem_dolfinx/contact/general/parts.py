@@ -79,7 +79,7 @@ class BodiesContact(GeneralPart):
         """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
         if self._by_pairs is None:
             return super()._friction_now(kinematics)
-        return None if kinematics.idle else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
+        return None if not self.pair.asked else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
 
     @property
     def watches_ends(self) -> bool:
@@ -108,7 +108,7 @@ class AmongContact(BodiesContact):
     def pressing(self) -> tuple[Array, Array]:
         """With forces by which nodes at sharp edges are followed by what they follow: these press on the same areas (collective)."""
         (across, along), pair = super().pressing(), self.pair
-        if pair.kinematics.idle:
+        if not pair.asked:
             return across, along
         received, normal, spread = self._received(), pair.projection.normal, pair.discretisation.spread
         pressing = np.einsum("ng,ng->n", received, normal)
@@ -134,7 +134,7 @@ class AmongContact(BodiesContact):
             ``(n, gdim)`` (collective).
         """
         skin, config, told = self._skin, self.config, []
-        for pair in (one.pair for one in self._together if not one.pair.kinematics.idle):
+        for pair in (one.pair for one in self._together if one.pair.asked):
             row, node, weight = pair.kinematics.means()[1]
             own = np.flatnonzero(pair.trial.active[row])
             row, i = row[own], pair.nodes[row[own]]

@@ -41,8 +41,6 @@ class NodeToSurface(OnTarget):
 
     chained, two_pass = False, True
     pointwise = at_feet = True
-    #: Whether it can be told ``far``.
-    can_be_far = True
     #: Whether an end of the target holds contactors that came to it there, one or each ``(n,)``.
     ends_hold: bool | Bools = True
 
@@ -82,8 +80,9 @@ class NodeToSurface(OnTarget):
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
-        if self.far:
-            return NothingNear.at(self, points)
+        self.asked = self._asks(state)
+        if not self.asked:
+            return self.nowhere(points)
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)
@@ -96,6 +95,15 @@ class NodeToSurface(OnTarget):
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.prescribed else None
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves), state)
+
+    def _asks(self, state: PairState) -> bool:
+        """Whether any contactor on any rank is in question (collective)."""
+        return not self.far
+
+    def nowhere(self, points: Array) -> NodalKinematics:
+        """Contactors at ``points (n, gdim)`` of which none on any rank is in question, at no price."""
+        p = self.target.nowhere(points) if isinstance(self.target, MeshTarget) else self.target.project(points)
+        return NodalKinematics(self, points, p, p, p.gap, None, None)
 
     def measured(self, kinematics: NodalKinematics, state: PairState) -> NodalKinematics:
         """The kinematics with the gaps that decide on contact (collective)."""
@@ -299,49 +307,3 @@ class NodalKinematics(PlacedOnTarget):
         """At the nodes themselves, and at their feet."""
         n = len(self.points)
         return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)
-
-
-class NothingNear(NodalKinematics):
-    """Implements ``Kinematics`` where no contactor of any rank has anything near, at no price."""
-
-    @classmethod
-    def at(cls, of: NodeToSurface, points: Array) -> NothingNear:
-        """Of contactors at ``points (n, gdim)``."""
-        p = of.target.nowhere(points) if isinstance(of.target, MeshTarget) else of.target.project(points)
-        return cls(of, points, p, p, p.gap, None, None)
-
-    @property
-    def idle(self) -> bool:
-        """Yes: nothing is near."""
-        return True
-
-    @property
-    def movable(self) -> Bools:  # type: ignore[override]
-        """None can close its gap ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    @property
-    def cone(self) -> Array:  # type: ignore[override]
-        """There are no facets to push ``(n,)``."""
-        return np.ones(len(self.gap))
-
-    def placed_again(self, state: PairState) -> NodalKinematics:
-        """They stay where they are."""
-        return self
-
-    def off(self, state: PairState) -> Bools:
-        """None is past an end ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    def at_end(self, state: PairState) -> Bools:
-        """None is held by an end ``(n,)``."""
-        return np.zeros(len(self.gap), bool)
-
-    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """There are none."""
-        none = np.zeros(len(self.gap))
-        return Traction(none, none, np.zeros(self.points.shape))
-
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Nothing turns."""
-        return []

@@ -95,16 +95,19 @@ class Interface(Told):
         Raises:
             NotFiniteError: if the target's functions return what is not finite.
         """
-        if not (self.far and self.kinematics.idle):
+        if self.asked or not self.far:
             self._project()
 
     @timed("projection")
     def _project(self) -> None:
         if self.tie is not None and not self.tie.begin_placement():
             return
-        first = not hasattr(self, "kinematics")
+        known = hasattr(self, "kinematics")
         self.kinematics = self.discretisation.place(self.points, self.trial)
-        if self.kinematics.idle and not first:
+        if known and not self.asked:
+            none, united = np.zeros(len(self.nodes)), sum(heat.law.perfect for heat in self.heats)
+            heat = np.zeros((len(none), united)) if united else None
+            self.set_forces(Traction(none, none, np.zeros(self.points.shape), heat=heat))
             return
         p = self.projection
         bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
@@ -128,8 +131,8 @@ class Interface(Told):
         # values that are the same on one rank are so on all
         if kinematics is not self.kinematics:
             self.kinematics = kinematics
-            if self.acting is not None:
-                self.acting.replace(kinematics)
+            if self.friction is not None:
+                self.friction.replace(kinematics)
 
     def look(self) -> None:
         """Place contactors that were not looked at since the surfaces are far apart (collective)."""
@@ -140,10 +143,10 @@ class Interface(Told):
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
         correction = np.zeros(self.points.shape)
-        if self.discretisation.at_feet and not self.kinematics.idle:
+        if self.discretisation.at_feet:
             correction = self.kinematics.gap_rows.normal_return(self.trial.active)
-        if self.acting is not None:
-            correction = correction + self.acting.return_vectors(self.trial)
+        if self.friction is not None:
+            correction = correction + self.friction.return_vectors(self.trial)
         # surfaces that follow each other would both make up for the same gap
         correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual] = 0.0
         return correction
@@ -161,8 +164,6 @@ class Interface(Told):
 
     def activate_touching(self) -> None:
         """Start with the contactors that touch without force as active, where they stick (collective)."""
-        if self.kinematics.idle:
-            return
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
         self._set_active(replace(state, at_end=self._at_end(self.trial)))
@@ -185,8 +186,6 @@ class Interface(Told):
 
     def follow(self) -> bool:
         """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
-        if self.kinematics.idle:
-            return False
         off = self.off
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
@@ -195,7 +194,7 @@ class Interface(Told):
 
     def predicted(self, du: Array) -> Array:
         """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
-        return self.gap if self.kinematics.idle else self.kinematics.gap_rows.gaps(du)
+        return self.kinematics.gap_rows.gaps(du)
 
     def violated(
         self,
@@ -218,8 +217,6 @@ class Interface(Told):
             swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
             du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
         """
-        if self.kinematics.idle:
-            return active_set.Violations.none(len(self.nodes))
         off = self.off
         if swept and self.thickness < np.inf:
             off = off | (self.trial.at_end & self.trial.passed)
@@ -243,8 +240,6 @@ class Interface(Told):
             self._set_active(active_set.exchange(state, violated))
             return self.trial
 
-        if self.kinematics.idle:
-            return False
         if self.friction is None:
             enter(self.trial)
             return False
@@ -262,13 +257,13 @@ class Interface(Told):
 
     def meet(self, others: Sequence[Interface]) -> None:
         """Take what other contacts with rigid surfaces do to the same contactors (collective)."""
-        if self.acting is None:
+        if self.friction is None:
             return
         normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
         for k, other in enumerate(others):
             _, own, theirs = np.intersect1d(self.nodes, other.nodes, return_indices=True)
             normals[own, k] = np.where(other.trial.active[theirs, None], other.projection.normal[theirs], 0.0)
-        self.acting.meet(self.kinematics, normals)
+        self.friction.meet(self.kinematics, normals)
 
     def place_again(self) -> None:
         """Put contactors whose equations have changed where they now belong (collective)."""
@@ -298,7 +293,7 @@ class Interface(Told):
 
     def release_apart(self) -> None:
         """Release contactors without friction that rigid motions have taken off their target (collective)."""
-        if not (self.frictional or self.kinematics.idle):
+        if not self.frictional:
             apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
             self._set_active(replace(self.trial, active=self.trial.active & ~apart))
 
@@ -309,14 +304,13 @@ class Interface(Told):
 
         Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
         """
-        if not self.kinematics.idle:
-            lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
-            if lacks:
-                near = near_target(self.projection, self.trial, self.kinematics.off(self.trial))
-                self.reserved = near & ~self.tied if known else self.trial.active.copy()
+        lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
+        if lacks:
+            near = near_target(self.projection, self.trial, self.kinematics.off(self.trial))
+            self.reserved = near & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.gap_rows.select(np.flatnonzero(self.reserved), self.trial.active)
-        if self.acting is not None:
-            own = self.acting.equations(own, self.trial, self.kinematics)
+        if self.friction is not None:
+            own = self.friction.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
@@ -327,8 +321,8 @@ class Interface(Told):
         normal = (equations.kind == NORMAL) & (equations.tangent < 0)
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
         self.redundant[equations.contactor[normal]] = redundant[normal]
-        if self.acting is not None:
-            self.acting.set_redundant(equations, redundant)
+        if self.friction is not None:
+            self.friction.set_redundant(equations, redundant)
 
     def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces from the multipliers of the equations ``(m,)`` (collective).
@@ -337,10 +331,10 @@ class Interface(Told):
         """
         contact = equations.contact
         of, trial, kinematics = multipliers[: len(contact)], self.trial, self.kinematics
-        if self.acting is None:
+        if self.friction is None:
             found = kinematics.forces(trial, contact, of)
         else:
-            found = self.acting.forces(contact, of, trial, kinematics, du)
+            found = self.friction.forces(contact, of, trial, kinematics, du)
         return found if self.tie is None else self.tie.with_forces(found, equations, multipliers)
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
@@ -363,28 +357,28 @@ class Interface(Told):
     @property
     def has_known_forces(self) -> bool:
         """Whether friction of contactors of this rank may not grow with the force along the normal."""
-        return self.acting is not None and self.acting.has_known_forces(self.trial)
+        return self.friction is not None and self.friction.has_known_forces(self.trial)
 
     def known_forces(self) -> tuple[Ints, Array]:
         """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)`` (collective)."""
-        assert self.acting is not None
-        return self.acting.known_forces(self.trial, self.kinematics)
+        assert self.friction is not None
+        return self.friction.known_forces(self.trial, self.kinematics)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
         parts = self.kinematics.curvature(self.trial)
-        if self.acting is not None:
-            parts = parts + self.acting.curvature(self.trial, self.kinematics)
+        if self.friction is not None:
+            parts = parts + self.friction.curvature(self.trial, self.kinematics)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:
         """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
-        if self.acting is not None:
-            self.trial = self.acting.turn(self.trial, self.kinematics, stiffness)
+        if self.friction is not None:
+            self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """What sliding friction adds to tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
-        return None if self.acting is None else self.acting.slip_terms(self.trial, self.kinematics)
+        return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 
@@ -400,7 +394,7 @@ class Interface(Told):
         if self.far:
             return
         if self.friction is not None:
-            if self.kinematics.idle:
+            if not self.asked:
                 self._place_friction()
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
         self.barred = self.barred & (self.projection.gap < 0)
@@ -448,3 +442,8 @@ class Interface(Told):
             self.tie.from_checkpoint(kept, self._past_end)
         reserved, redundant, barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
         self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant, barred))
+
+
+def in_question(pairs: Sequence[Interface]) -> list[Interface]:
+    """Pairs of which any rank has a contactor in question; the others have no part in an iteration, but for their placement."""
+    return [pair for pair in pairs if pair.asked]

@@ -19,8 +19,7 @@ from uem_dolfinx.contact.friction.limits import Limits
 from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.friction.slip_front import Front
 from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
-from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface, NothingNear
-from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.parallel import reduced
@@ -89,10 +88,6 @@ class JoinedNodes(NodeToSurface):
 
     def commit(self) -> None:
         """Contacts that are far apart stay so."""
-
-    def place(self, points: Array, state: PairState) -> NodalKinematics:
-        """Project contactors (collective); see ``Discretisation``."""
-        return NothingNear.at(self, points) if self.far else super().place(points, state)
 
 
 class JoinedLaw:

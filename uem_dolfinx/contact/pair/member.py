@@ -9,7 +9,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.laws.law import FrictionLaw
-from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NothingNear
+from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedLaw
 from uem_dolfinx.contact.seam.corners import Corners
@@ -102,9 +102,9 @@ class Member(Interface):
         """Largest gap of an active contactor of this rank, or distance from where it is to stick, a length."""
         whole = self.joined
         here = float(np.abs(self.gap[self.united & ~self.redundant]).max(initial=0.0))
-        if whole.acting is None:
+        if whole.friction is None:
             return here
-        return max(here, float(whole.acting.distances(whole.trial, whole.redundant)[self._rows].max(initial=0.0)))
+        return max(here, float(whole.friction.distances(whole.trial, whole.redundant)[self._rows].max(initial=0.0)))
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -124,6 +124,11 @@ class Member(Interface):
         self.joined.discretisation.look_at(of)
 
     @property
+    def asked(self) -> bool:
+        """Whether any contactor of this contact, on any rank, is in question."""
+        return self.joined.asked and not self.far
+
+    @property
     def kinematics(self) -> Kinematics:  # type: ignore[override]
         """Of its contactors; made when it is first asked for."""
         whole: Any = self.joined.kinematics
@@ -134,8 +139,8 @@ class Member(Interface):
     def _kinematics_of(self, whole: Any) -> Kinematics:
         some, points = self._rows, whole.points[self._rows]
         of: Any = self.discretisation
-        if whole.idle or self.far:
-            return NothingNear.at(of, points)
+        if not self.asked:
+            return of.nowhere(points)
         nearest = self._alone(whole.nearest)
         projection = nearest if whole.projection is whole.nearest else self._alone(whole.projection)
         moves, left = (None if a is None else a[some] for a in (whole.target_moves, whole.left))

@@ -46,11 +46,6 @@ class Told:
         return self.friction is not None
 
     @property
-    def acting(self) -> Sliding | None:
-        """Friction, where it can act: None also where no contactor of any rank has anything near."""
-        return None if self.kinematics.idle else self.friction
-
-    @property
     def members(self) -> Sequence[Any]:
         """Interfaces of single contacts that it consists of: itself, unless several are treated together."""
         return [self]
@@ -72,6 +67,11 @@ class Told:
     def name_at(self, i: int) -> str:
         """Name of the contact of a contactor."""
         return self.name
+
+    @property
+    def asked(self) -> bool:
+        """Whether any contactor on any rank is in question, as placed last."""
+        return self.discretisation.asked
 
     @property
     def far(self) -> bool:
@@ -154,8 +154,8 @@ class Told:
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
-        if self.acting is not None:
-            here = max(here, float(self.acting.distances(self.trial, self.redundant).max(initial=0.0)))
+        if self.friction is not None:
+            here = max(here, float(self.friction.distances(self.trial, self.redundant).max(initial=0.0)))
         return here if self.tie is None else max(here, self.tie.largest_gap_here())
 
     def largest_gap(self) -> float:

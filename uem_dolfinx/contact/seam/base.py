@@ -37,6 +37,7 @@ class OnTarget:
         anchor: projection whose feet a contact with small or fixed sliding keeps.
         offset: by how much both surfaces together are taken to be thicker at the contactors ``(n,)``; None for nothing.
         far: whether the surfaces are so far apart that contactors are not looked at, see ``solve.bodies.far_apart``.
+        asked: whether any contactor on any rank is in question, as placed last.
     """
 
     ordered_by = -1
@@ -49,7 +50,7 @@ class OnTarget:
         self.hold(free)
         self.anchor: Projection | None = None
         self.offset: Array | None = None
-        self.far = False
+        self.far, self.asked = False, True
         #: Whether the next step finds feet of small sliding anew.
         self._renewing = False
         #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
@@ -151,11 +152,6 @@ class PlacedOnTarget:
     projection: Projection
     nearest: Projection
     gap: Array
-
-    @property
-    def idle(self) -> bool:
-        """No: the target is one for all."""
-        return False
 
     @property
     def normal(self) -> Array:

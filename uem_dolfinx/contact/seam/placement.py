@@ -179,10 +179,6 @@ class Kinematics(Protocol):
     """Where contactors stand relative to their target, in one state and at one displacement: a value."""
 
     @property
-    def idle(self) -> bool:
-        """Whether no contactor of any rank has anything near."""
-
-    @property
     def points(self) -> Array:
         """Of the contactors ``(n, gdim)``."""
 
@@ -320,6 +316,8 @@ class Discretisation(Protocol):
 
     #: Whether the surfaces are so far apart that contactors are not looked at.
     far: bool
+    #: Whether any contactor on any rank is in question, as placed last; where none is no other function is called in an iteration.
+    asked: bool
 
     def with_friction(self, mu: Array) -> None:
         """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""

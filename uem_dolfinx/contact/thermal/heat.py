@@ -56,6 +56,10 @@ class Pair(Protocol):
     reserved: Bools
 
     @property
+    def asked(self) -> bool:
+        """Whether any contactor on any rank is in question, as placed last."""
+
+    @property
     def target(self) -> Target:
         """What the contactors may touch."""
 
@@ -293,7 +297,7 @@ class Heat:
 
         Collective.
         """
-        if self._pair.kinematics.idle:
+        if not self._pair.asked:
             none = np.zeros(self._pair.config.n_owned)
             return none, none
         at = self.passage
@@ -305,8 +309,6 @@ class Heat:
 
     def sizes(self) -> Array:
         """Sizes of what the heat's terms are differences of, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
-        if self._pair.kinematics.idle:
-            return self.field.rows(np.zeros(self._pair.config.n_owned))
         at, pair, hot = self.passage, self._pair, np.abs(self.field.values)
         size = np.zeros(len(at.areas))
         if not self.law.perfect:
@@ -328,8 +330,6 @@ class Heat:
         Returns:
             Pairs of global rows ``(k, m)``, -1 for none, and blocks ``(k, m gdim, m gdim)``.
         """
-        if self._pair.kinematics.idle:
-            return []
         at, jumps = self.passage, self._jumps()
         kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
         found = [_dyads(kappa, jumps, jumps)]

@@ -83,8 +83,6 @@ def check_prescribed(pair: Interface) -> None:
         ConflictError: naming the deepest or farthest such node of the first rank that has one.
         OverdeterminedError: likewise, if the node and its target may move and other contacts alone fight its equation.
     """
-    if pair.kinematics.idle:
-        return
     left_out = pair.trial.active & pair.redundant
     depth = -pair.projection.gap / pair.config.size
     inside = ~pair.off & ((~pair.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))

@@ -116,25 +116,29 @@ class FarApart:
 
     def place(self) -> None:
         """Look at those that are near where the bodies are now, from the next placement on (collective)."""
-        if self._any_far:
+        if self.any:
             self._boxes, _ = self._look(self._config.x)
             self._look_at(self._boxes.apart <= self._near)
 
-    def look_within(self, way: float) -> None:
-        """Look at those that may come near if nodes move by no more than ``way`` along any axis, a length (collective)."""
-        if self._any_far:
-            for pair in self._look_at(self._boxes.apart <= self._near + 2.0 * np.sqrt(self._config.gdim) * way):
-                pair.project()
+    def look_within(self, way: float) -> bool:
+        """Look at those that may come near if nodes move by no more than ``way`` along any axis, a length: whether any may (collective)."""
+        if not self.any:
+            return False
+        found = self._look_at(self._boxes.apart <= self._near + 2.0 * np.sqrt(self._config.gdim) * way)
+        for pair in found:
+            pair.project()
+        return bool(found)
 
     def look_along(self, ways: Array) -> bool:
         """Look at those that may come near on straight ways of the local nodes ``(n_local, gdim)``: whether any may (collective)."""
-        if not self._any_far:
+        if not self.any:
             return False
         then, _ = self._look(self._config.x + ways)
         return bool(self._look_at(self._boxes.apart_until(then) <= self._near))
 
     @property
-    def _any_far(self) -> bool:
+    def any(self) -> bool:
+        """Whether a contact is not looked at."""
         return bool(self._far.any())
 
     def _look(self, x: Array, more: Array | None = None) -> tuple[Boxes, Array]:
@@ -178,6 +182,5 @@ class FarApart:
 
 
 def _may_be_far(pair: Interface) -> bool:
-    measured = isinstance(pair.target, MeshTarget) or getattr(pair.target, "measures", False)
-    nodal = getattr(pair.discretisation, "can_be_far", False) and pair.sliding == "finite"
-    return nodal and measured and pair.tie is None and not pair.heats
+    measured = pair.discretisation.at_feet and getattr(pair.target, "measures", False)
+    return measured and pair.sliding == "finite" and pair.tie is None and not pair.heats

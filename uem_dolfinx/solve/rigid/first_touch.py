@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.geometry.configuration import Configuration
@@ -24,7 +24,7 @@ def touch_ahead(
     pairs: Sequence[Interface],
     rigid: RigidMotions | None,
     place: Callable[[], None],
-    look_within: Callable[[float], None],
+    look_within: Callable[[float], object],
 ) -> None:
     """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
 
@@ -48,6 +48,7 @@ def touch_ahead(
     way = float(reduced(comm, np.abs(du).max(initial=0.0), op=MPI.MAX))
     look_within(way)
     near = OPEN * way
+    pairs = in_question(pairs)
     gaps = [pair.predicted(du) for pair in pairs]
     violated = []
     for pair, gap in zip(pairs, gaps):

@@ -17,7 +17,7 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.form_checks import takes_values
@@ -287,7 +287,7 @@ class FloatingBodies:
         for _ in range(MOST_RIGID_STEPS):
             place()
             self._bodies.assemble()
-            for pair in self._pairs:
+            for pair in in_question(self._pairs):
                 pair.release_apart()
             v, took = self._step(damping, freely)
             changed |= took
@@ -314,15 +314,11 @@ class FloatingBodies:
         faster = np.where((along > 0) & small, 2.0 * damping, np.maximum(damping, np.minimum(1.0, 2.0 * damping)))
         return np.where(along < 0, 0.5 * damping, faster)
 
-    def _looked_at(self) -> list[Interface]:
-        """Pairs that are not far apart."""
-        return [pair for pair in self._pairs if not pair.far]
-
     def _held(self) -> _Held:
         """What contacts and equations of users hold where the bodies are now (collective)."""
         motions, g = self.motions, self._bodies.config.gdim
         assert motions is not None
-        pairs = self._looked_at()
+        pairs = in_question(self._pairs)
         equations = [pair.equations() for pair in pairs]
         more = [] if self._linear is None else [self._linear.at_present()]
         rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
@@ -367,7 +363,7 @@ class FloatingBodies:
         # where all bodies float, what equilibrium leaves is rounding, and small beside the loads that the step began with
         if size.max() <= max(LOADED * max(scale, self._loads), self._bodies.rounding_of_displacement()):
             return None, False
-        pairs = self._looked_at()
+        pairs = in_question(self._pairs)
         ahead = [pair.approach for pair in pairs]
         front = UnitingEquations.join(ahead, config.gdim)
         R = vstack([motions.rates(front), held.rates[~held.which]]).tocsr()

@@ -16,13 +16,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.friction.pivot import Pivot
 from uem_dolfinx.contact.friction.stick_slip import FrictionViolations
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
@@ -31,6 +31,9 @@ from uem_dolfinx.errors import ConvergenceError, FrictionError
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.rigid.first_touch import deepest_of
 from uem_dolfinx.solve.rigid.floating import FAR
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.pivot import Pivot
 
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
 #: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]

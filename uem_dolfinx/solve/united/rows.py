@@ -134,7 +134,8 @@ class Rows:
     """Uniting equations of all pairs in one state, and what was made of them.
 
     Attributes:
-        equations: of every pair; those of users come after them in P and Q.
+        pairs: that have them.
+        equations: of each; those of users come after them in P and Q.
         trial: all that P is made of; None where it is ``frictionless``.
         independent: how conflicts were resolved; None if there could be none.
         test: Q.
@@ -145,6 +146,7 @@ class Rows:
         given: what Q was made of before it was rewritten for these; None without any.
     """
 
+    pairs: Sequence[Interface]
     equations: list[Constraints]
     trial: UnitingEquations | None
     independent: IndependentEquations | None
@@ -153,6 +155,12 @@ class Rows:
     heat: dict[int, list[HeatEquations]]
     rigid: RigidNodes | None = None
     given: UnitingEquations | None = None
+
+    def of(self, pairs: Sequence[Interface]) -> list[Constraints]:
+        """Equations of each of all pairs."""
+        known = {id(pair): own for pair, own in zip(self.pairs, self.equations)}
+        none = np.zeros(0, np.int64)
+        return [known.get(id(pair), pair.kinematics.gap_rows.select(none, pair.trial.active)) for pair in pairs]
 
 
 @dataclass(frozen=True)
@@ -163,18 +171,17 @@ class BodyState(IterationState):
     added: PETSc.Mat | None
     held: PETSc.Vec | None
 
-    def with_pressures(self, pairs: Sequence[Interface], K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
+    def with_pressures(self, K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
         """The state with how heat changes with pressures, as far as they are forces of single contactors (collective).
 
         Args:
-            pairs: of all contacts.
             K: tangent of the bodies, whose rows at the contactors tell how contact forces change.
             G: curvature of the contact, or None.
         """
         state, test, parts, first = self, self.test, [], 0
         if test.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
             return self
-        for pair, own in zip(pairs, self.rows.equations):
+        for pair, own in zip(self.rows.pairs, self.rows.equations):
             parts += [heat.by_forces(own, test.lift[first : first + len(own)]) for heat in pair.heats if callable(heat.law.h)]
             first += len(own)
         if not parts:
@@ -197,7 +204,7 @@ def make_rows(
 
     Args:
         over_constraints: of the pairs.
-        pairs: of all contacts.
+        pairs: that have a contactor in question.
         hold: free components ``(n_rows, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
         prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
         linear: equations of users; None for none.
@@ -205,7 +212,7 @@ def make_rows(
     Raises:
         FrictionError: if contactors wedge where several equations meet.
     """
-    rigid = [pair for pair in pairs if not (pair.target.n_nodes or pair.kinematics.idle)]
+    rigid = [pair for pair in pairs if not pair.target.n_nodes]
     for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
@@ -240,6 +247,7 @@ def make_rows(
             raise
     couplings = None if linear is None else linear.rigid
     return Rows(
+        pairs,
         equations,
         None if trial is frictionless else trial,
         independent,
@@ -272,8 +280,8 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
     """Contact forces of every pair, with the heat that goes through it, and multipliers of users' equations ``(m,)`` (collective).
 
     Args:
-        pairs: of all contacts; they are told which of their equations are redundant.
-        rows: their equations.
+        pairs: of all contacts; those of the rows are told which of their equations are redundant.
+        rows: equations.
         y: forces that were passed on by Q.
         du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
     """
@@ -283,21 +291,22 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
     if rows.independent is not None:
         lam, redundant = rows.independent.forces(lam), rows.independent.redundant
     found, start = [], 0
-    for pair, own in zip(pairs, rows.equations):
+    for pair, own in zip(rows.pairs, rows.equations):
         part = slice(start, start + len(own))
         pair.set_redundant(own, redundant[part])
         found.append(pair.forces(own, lam[part], du))
         start = part.stop
     for i, fields in rows.heat.items():
         powers = []
-        for heat, equations in zip(_united_fields(pairs[i]), fields):
+        for heat, equations in zip(_united_fields(rows.pairs[i]), fields):
             part = slice(start, start + len(equations.which))
             powers.append(heat.read(equations, lam[part], redundant[part]))
             start = part.stop
         found[i] = found[i]._replace(heat=np.column_stack(powers))
     if rows.rigid is not None and rows.given is not None:
         last = rows.rigid.beside(last, rows.given.select(np.arange(len(rows.given)) < len(lam)), lam)
-    return found, np.append(lam[start:], last)
+    known = dict(zip(map(id, rows.pairs), found))
+    return [known.get(id(pair)) or pair.traction for pair in pairs], np.append(lam[start:], last)
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:

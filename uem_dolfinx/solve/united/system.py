@@ -16,7 +16,8 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, in_question
+from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed
 from uem_dolfinx.log import timed
@@ -34,6 +35,7 @@ from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.contact.thermal.heat import Heat
 
 #: A direct solve predicts gaps to this part of the increment, and forces to what moves a contactor that far.
 #: [convention; the increment; test_system.py::test_what_a_solve_predicts]
@@ -70,36 +72,37 @@ class BodySystem:
         self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
-        #: Curvature of the contact in the last united matrix; None where it had none.
-        self.curvature: PETSc.Mat | None = None
+        self.curvature: PETSc.Mat | None = None  # of the contact in the last united matrix
         self._petrov_galerkin = False  # whether P differs from Q
         #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
         self._not_unique: tuple[BodyState, bool] | None = None
-        #: Whether the bodies have moved in this step.
-        self._led = False
-        #: Whether the last exchange has let go of a body that loads drive.
-        self._adrift = False
-        #: Whether contactors that have slid off a thin target sweep past it, on the way to equilibrium.
-        self._swept = False
+        self._led = False  # whether the bodies have moved in this step
+        self._adrift = False  # whether the last exchange has let go of a body that loads drive
+        self._swept = False  # whether contactors that have slid off a thin target sweep past it, on the way to equilibrium
         self._multipliers: Array = np.zeros(0)  # of the equations of users, as read last ``(m,)``
-        #: Equations where the contactors were placed last, with the directions of slip there; None before they were asked for.
-        self._here: Rows | None = None
         self.take(pairs, linear)
         self.place()
         for pair in self.pairs:
             check_initial(pair)
+        for pair in self.near:
             pair.activate_touching()
 
     def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
         """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
         from uem_dolfinx.solve.bodies.far_apart import FarApart
 
-        self.pairs, self.linear, self._here = list(pairs), linear, None
-        self._heats = [heat for pair in self.pairs for heat in pair.heats]
+        self.pairs, self.linear = list(pairs), linear
+        self._here: Rows | None = None  # where contactors were placed last, with the directions of slip; None before it is needed
+        self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
         self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
         self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
+
+    def _look(self) -> None:
+        """Take the pairs of which any rank has a contactor in question now: the others are in no loop of an iteration."""
+        self.near: list[Interface] = in_question(self.pairs)
+        self._heats: list[Heat] = [heat for pair in self.near for heat in pair.heats]
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
@@ -115,19 +118,20 @@ class BodySystem:
             self.far_apart.place()
             for pair in self.pairs:
                 pair.project()
+        self._look()
 
     def return_to_targets(self, bound: float) -> bool:
         """Normal return [UEM, 4.2]: put active contactors back onto the moved targets (collective); see ``ContactMethod``."""
         if not self.pairs:
             return False
         assert self.bodies.stiffness is not None
-        ways = [pair.return_vectors() for pair in self.pairs]
-        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(self.pairs, ways)]
+        ways = [pair.return_vectors() for pair in self.near]
+        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(self.near, ways)]
         disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
         if not 0.0 < disturbance <= bound:
             return False
         shared = self.over_constraints.shared
-        for k, (pair, way) in enumerate(zip(self.pairs, ways)):
+        for k, (pair, way) in enumerate(zip(self.near, ways)):
             for j, rows in enumerate(pair.turns() if shared else [slice(None)]):
                 if shared and j + k > 0:
                     # what another pair has returned is returned
@@ -149,10 +153,11 @@ class BodySystem:
         self.floating.begin_step(self.place)
         if self.pairs and self.bodies.dynamics is None and self.floating.motions is None:
             touch_ahead(self.bodies, self.pairs, self.floating.rigid, self.place, self.far_apart.look_within)
+        self._look()
 
     def end_step(self) -> None:
         """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
-        for pair in self.pairs:
+        for pair in self.near:
             check_prescribed(pair)
         if self.linear is not None:
             self.linear.check()
@@ -168,7 +173,7 @@ class BodySystem:
     def residual(self) -> PETSc.Vec:
         """Forces of the bodies less loads of contacts, and friction that does not grow with the force along the normal (collective)."""
         F = self.bodies.residual
-        for nodes, forces in filter(None, (*known_forces(self.pairs), *(pair.applied_forces() for pair in self.pairs))):
+        for nodes, forces in filter(None, (*known_forces(pairs := self.near), *(pair.applied_forces() for pair in pairs))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         for heat in self._heats:
             F.array[:] += heat.residual()
@@ -183,8 +188,8 @@ class BodySystem:
         4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
         5. Take the equations that follow, Q'F with them, and which contactors break the conditions of contact.
         """
-        bodies, pairs, turning = self.bodies, self.pairs, self.linear is not None and self.linear.turning
-        if bodies.stiffness is None and pairs:
+        bodies, pairs, turning = self.bodies, self.near, self.linear is not None and self.linear.turning
+        if bodies.stiffness is None and self.pairs:
             # what tells tension from rounding
             bodies.update_tangent()
         F, rounding = self.residual(), self.rounding()
@@ -232,7 +237,7 @@ class BodySystem:
             changed=moved or fallen,
             right=at_rest and violated == 0,
             closed=gap <= CLOSED * self.config.size and torn <= CLOSED and self.bodies.dirichlet_met(),
-            in_contact=bool(pairs),
+            in_contact=bool(self.pairs),
             rows=rows,
             added=added,
             held=held,
@@ -241,7 +246,7 @@ class BodySystem:
     def _rows_here(self) -> Rows:
         """Equations where the contactors have been placed, with the directions of slip there (collective)."""
         if self._here is None:
-            for pair in self.pairs:
+            for pair in self.near:
                 assert self.bodies.stiffness is not None
                 pair.turn(self.bodies.stiffness)
             self._here = self._rows()
@@ -250,7 +255,7 @@ class BodySystem:
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         hold = partial(self.floating.hold, self.bodies.free_rows)
-        return make_rows(self.over_constraints, self.pairs, hold, self.bodies.prescribed, self.linear)
+        return make_rows(self.over_constraints, self.near, hold, self.bodies.prescribed, self.linear)
 
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
@@ -261,11 +266,11 @@ class BodySystem:
         trial = rows.frictionless
         if apart is not None:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
-        gaps = [pair.largest_gap_here() for pair in self.pairs]
+        gaps = [pair.largest_gap_here() for pair in self.near]
         gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
-        united = sum(int(pair.united.sum()) for pair in self.pairs)
+        united = sum(int(pair.united.sum()) for pair in self.near)
         told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        terms = slip_terms(self.pairs, self.unknowns.vector(), self.linear)
+        terms = slip_terms(self.near, self.unknowns.vector(), self.linear)
         return trial, *terms, int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
@@ -278,22 +283,24 @@ class BodySystem:
         with timed("uniting equations"):
             increment = du.array_r[: self._n].reshape(-1, self.config.gdim)
             way = float(reduced(self.comm, np.abs(increment).max(initial=0.0), op=MPI.MAX))
-            self.far_apart.look_within(way)
+            if self.far_apart.look_within(way):
+                self._look()
             F = self._predicted_forces(state, du, self.solver.forces(self.bodies.tangent.K, du))
             forces = self._read_forces(state.rows, state.rows.test.pass_on(F), increment)
             near = max(PREDICTED, left) * way
-            predicted = [pair.predicted(increment) for pair in self.pairs]
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            violated = []
-            for pair, gap, seen in zip(self.pairs, predicted, forces):
+            gaps, violated = [pair.gap for pair in self.pairs], [Violations.none(len(pair.nodes)) for pair in self.pairs]
+            for pair in self.near:
+                k = self.pairs.index(pair)
+                gaps[k] = pair.predicted(increment)
                 along = pair.stiffness_across(self.bodies.stiffness)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                violated.append(pair.violated(gap, seen, along, least, near, self._swept, moved))
+                violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
             if self._adrift:
                 chosen = violated if count(self.pairs, violated) else None
             else:
-                chosen = self.exchanges.choose(violated, predicted, self.curvature is not None, way)
+                chosen = self.exchanges.choose(violated, gaps, self.curvature is not None, way)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise united_rows.not_held()
             if chosen is None or self._adrift:
@@ -303,7 +310,7 @@ class BodySystem:
                 return None
             if self.exchanges.straight:
                 self.curvature = None
-            if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen)]):
+            if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen) if pair.asked]):
                 self.exchanges.start_again()
             rows = self._rows()
             # a body that is let go has to fall first
@@ -327,7 +334,7 @@ class BodySystem:
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
         """How bodies slide without end under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
-        if self.floating.motions is None or not self.frictional:
+        if self.floating.motions is None or not any(pair.frictional for pair in self.pairs):
             return None
         # known forces are among those of the contact
         every = F + (self.bodies.residual - self.residual())
@@ -352,7 +359,7 @@ class BodySystem:
 
     def rounding(self) -> float:
         """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
-        active = [pair.nodes[pair.united] for pair in self.pairs]
+        active = [pair.nodes[pair.united] for pair in self.near]
         of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
         return of_bodies + FORCE_ROUNDING * sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
 
@@ -387,7 +394,7 @@ class BodySystem:
             self.bodies.update_tangent()
         with timed("contact curvature"):
             how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex, self.linear
-            self.curvature = curvature_of(self.pairs, *how) if self.consistent_tangent else None
+            self.curvature = curvature_of(self.near, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
 
@@ -397,7 +404,7 @@ class BodySystem:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
         K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
-        state = state.with_pressures(self.pairs, K, self.curvature) if self._heats else state
+        state = state.with_pressures(K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
         refuse_bare(self.bodies, P, Q, curvature)
         # a modified Newton loop lets small changes of P pass
@@ -422,7 +429,7 @@ class BodySystem:
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
         if near is None:
-            some = None if self.floating.neutral or any(pair.far for pair in self.pairs) else [pair.nodes for pair in self.pairs]
+            some = None if self.floating.neutral or self.far_apart.any else [pair.nodes for pair in self.pairs]
             dq = self.solver.complete(dq, some)
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 
@@ -441,8 +448,3 @@ class BodySystem:
         du.axpy(1.0, state.trial.c)
         du.array[: self._n] = self.floating.without_open_motions(du.array_r[: self._n])
         return du
-
-    @property
-    def frictional(self) -> bool:
-        """Whether there is friction."""
-        return any(pair.frictional for pair in self.pairs)
