@@ -1,0 +1,172 @@
+"""Histories over features of contacts and of problems: derivatives as by differences of all steps, or refused by name.
+
+The page on gradients has a table of the same rows. Read first: ``EXACT`` and ``REFUSED``.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from gradient_scenes import dot, move, wave
+from helpers import blocks, highest, refused
+
+import uem_dolfinx as uem
+
+COMM = MPI.COMM_WORLD
+STEPS = 3
+
+
+def plane():
+    return uem.RigidPlane([0.4, 0.0], [0.02, 1.0])
+
+
+def ball():
+    return uem.RigidSphere([0.4, -3.0], 3.0)
+
+
+def dragged(target=None, moves=False, general=False, equation=False, joined=False, **how):
+    """A block pressed onto another or onto a rigid surface and dragged, on 3 steps; ``history`` takes the present ``values``."""
+    b = blocks(COMM, "triangle", 3, 4, overhang=0.25)
+    mesh, v = b.scene.mesh, ufl.TestFunction(b.V)
+    E, top = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(2))
+    F = uem.NeoHooke(E, 0.3, kind="plane_strain").residual(b.u, v) * ufl.dx
+    push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, 1, b.top.entities), b.V)
+    values = {
+        "E": np.array(1.0),
+        "top": np.array([0.05, -0.05]),
+        "offset": np.array(0.0),
+        "place": np.zeros(2),
+        "turn": np.array(0.0),
+    }
+    if isinstance(how.get("friction"), float):
+        values["friction"] = np.array(how.pop("friction"))
+    s = SimpleNamespace(
+        b=b, E=E, top=top, X=ufl.SpatialCoordinate(mesh), values=values, J=(ufl.inner(b.u, b.u) + E * b.u[0] * b.u[1]) * ufl.dx
+    )
+
+    def history():
+        b.u.x.array[:] = 0.0
+        E.value, top.value[:] = float(values["E"]), values["top"]
+        surface, load = b.low if target is None else target(), None
+        if target is not None:
+            # the place where it starts is changed with all others
+            surface.move(values["place"], float(values["turn"]))
+        if moves:
+
+            def load(f):
+                surface.move(values["place"] + f * np.array([0.05, 0.01]), float(values["turn"]) + 0.02 * f)
+
+        laws = how | ({"friction": float(values["friction"])} if "friction" in values else {})
+        offset = {} if general or not values["offset"] else {"offset": float(values["offset"])}
+        s.contact = uem.GeneralContact(**laws) if general else uem.Contact(b.high, surface, **offset, **laws)
+        more = {"equations": [uem.Equation([((0.0, 0.5), (1, 0)), ((1.0, 0.5), (-1, 0))])]} if equation else {}
+        if joined:
+            more = {"couplings": [uem.RigidCoupling(b.top, (0.5, 1.0), force=(0.0, -0.03))]}
+        bcs = [uem.dirichlet(b.V, b.bottom)] + ([] if joined else [push])
+        problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[s.contact], rtol=1e-13, **({"load": load} if load else {}), **more)
+        with uem.recording(problem) as history:
+            for _ in uem.load_steps(problem, STEPS):
+                pass
+        s.fields = [part.status for part in (s.contact.parts if general else [s.contact])]
+        return history
+
+    s.history = history
+    return s
+
+
+def deviation(s, name):
+    """Derivative along a change of one control, over all steps, over central differences of the runs, less 1."""
+    control = {"E": s.E, "top": s.top, "X": s.X}
+    found = s.history()
+    (by,) = found.gradient(s.J, [control.get(name) or uem.ContactParameter(s.contact, name)])
+    status = [np.array(f.x.array) for f in s.fields]
+    if name == "X":
+        change = wave(s.b.V, 1.0)
+        slope = dot(by, change)
+    else:
+        before = s.values[name]
+        change = np.linspace(1.0, 0.6, before.size).reshape(before.shape)
+        slope = float(np.sum(by * change))
+
+    def functional(h):
+        if name == "X":
+            move(s, change, h)
+        else:
+            s.values[name] = before + h * change
+        s.history()
+        assert all(np.array_equal(f.x.array, then) for f, then in zip(s.fields, status)), f"{name} changes the active set"
+        J = uem.integrate(s.J)
+        if name == "X":
+            move(s, change, -h)
+        else:
+            s.values[name] = before
+        return J
+
+    h = 1e-5
+    by_differences = (functional(h) - functional(-h)) / (2 * h)
+    # of a ball's turn both are zero
+    return abs(slope - by_differences) / max(abs(by_differences), 1e-6)
+
+
+#: What is exact, by what it is: options and controls.
+EXACT = {
+    "without friction": ({}, "E top X offset"),
+    "without friction, mortar": ({"coupling": "mortar"}, "E top X offset"),
+    "sliding='fixed'": ({"sliding": "fixed"}, "E top offset"),
+    "a plane that moves": ({"target": plane, "moves": True}, "E top X place turn"),
+    "a plane that moves, mortar": ({"target": plane, "moves": True, "coupling": "mortar"}, "E top X place turn"),
+    "a ball that moves": ({"target": ball, "moves": True}, "E top X place turn"),
+    "all surfaces": ({"general": True}, "E top X"),
+    "all surfaces, mortar": ({"general": True, "coupling": "mortar"}, "E top X"),
+    "friction": ({"friction": 0.3}, "E top X friction"),
+    "friction, a function of place": ({"friction": lambda x: 0.3 + 0.1 * x[0]}, "E top"),
+    "friction, a plane that moves": ({"friction": 0.3, "target": plane, "moves": True}, "E top X friction place turn"),
+    "friction, a ball": ({"friction": 0.3, "target": ball}, "E X place turn"),
+    "friction, a ball that moves": ({"friction": 0.3, "target": ball, "moves": True}, "E place turn"),
+}  # fmt: skip
+CASES = [(what, name) for what, (_, names) in EXACT.items() for name in names.split()]
+
+
+@pytest.mark.parametrize("what, name", CASES)
+def test_exact(what, name):
+    assert deviation(dragged(**EXACT[what][0]), name) <= 1e-6
+
+
+#: What is refused, by what it is: options, control, words of the refusal.
+REFUSED = {
+    "sliding='small'": ({"sliding": "small"}, "E", "projected where an earlier step ended"),
+    "the shape, sliding='fixed'": ({"sliding": "fixed"}, "X", "needs contacts of sliding='finite'"),
+    "friction, the shape and a function of place": ({"friction": lambda x: 0.3 + 0.1 * x[0]}, "X", "a function of place"),
+    "friction, mortar": ({"friction": 0.3, "coupling": "mortar"}, "E", "coupling='node_to_surface'"),
+    "friction, sliding='small'": ({"friction": 0.3, "sliding": "small"}, "E", "sliding='finite'"),
+    "friction, averaged normals": ({"friction": 0.3, "normals": "averaged"}, "E", "normals='facet'"),
+    "friction, all surfaces": ({"friction": 0.3, "general": True}, "E", "Contacts of pairs of surfaces"),
+    "Tresca": ({"friction": uem.Tresca(0.01)}, "E", "Coulomb's law"),
+    "Stribeck": ({"friction": uem.Stribeck(0.3, 0.2)}, "E", "Coulomb's law"),
+    "wear": ({"friction": 0.3, "wear": 1e-2}, "E", "no wear"),
+    "ties": ({"tied": True}, "E", "do not support ties"),
+    "equations": ({"equation": True}, "E", "do not support equations"),
+    "couplings": ({"joined": True, "friction": 0.3}, "E", "do not support equations"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused(what):
+    how, name, words = REFUSED[what]
+    s = dragged(**how)
+    control = {"E": s.E, "X": s.X}[name]
+    refused(uem.InputError, words, lambda: s.history().gradient(s.J, control))
+
+
+def test_a_ball_turns_about_its_centre():
+    """A turn of a ball about its centre does nothing where no friction takes it along."""
+    s = dragged(target=ball, moves=True)
+    found = s.history()
+    by_turn, by_place = found.gradient(s.J, [uem.ContactParameter(s.contact, name) for name in ("turn", "place")])
+    assert highest(COMM, np.abs(by_turn)) <= 1e-10 * highest(COMM, np.abs(by_place))
