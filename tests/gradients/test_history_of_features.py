@@ -44,6 +44,7 @@ def dragged(target=None, moves=False, general=False, equation=False, joined=Fals
         "place": np.zeros(2),
         "turn": np.array(0.0),
     }
+    values["more"] = np.array(0.0)
     if isinstance(how.get("friction"), float):
         values["friction"] = np.array(how.pop("friction"))
     s = SimpleNamespace(
@@ -62,7 +63,11 @@ def dragged(target=None, moves=False, general=False, equation=False, joined=Fals
             def load(f):
                 surface.move(values["place"] + f * np.array([0.05, 0.01]), float(values["turn"]) + 0.02 * f)
 
-        laws = how | ({"friction": float(values["friction"])} if "friction" in values else {})
+        laws = dict(how)
+        if "friction" in values:
+            laws["friction"] = float(values["friction"])
+        elif callable(how.get("friction")):
+            laws["friction"] = lambda x: how["friction"](x) + float(values["more"])
         offset = {} if general or not values["offset"] else {"offset": float(values["offset"])}
         s.contact = uem.GeneralContact(**laws) if general else uem.Contact(b.high, surface, **offset, **laws)
         more = {"equations": [uem.Equation([((0.0, 0.5), (1, 0)), ((1.0, 0.5), (-1, 0))])]} if equation else {}
@@ -84,7 +89,7 @@ def deviation(s, name):
     """Derivative along a change of one control, over all steps, over central differences of the runs, less 1."""
     control = {"E": s.E, "top": s.top, "X": s.X}
     found = s.history()
-    (by,) = found.gradient(s.J, [control.get(name) or uem.ContactParameter(s.contact, name)])
+    (by,) = found.gradient(s.J, [control.get(name) or uem.ContactParameter(s.contact, "friction" if name == "more" else name)])
     status = [np.array(f.x.array) for f in s.fields]
     if name == "X":
         change = wave(s.b.V, 1.0)
@@ -125,7 +130,8 @@ EXACT = {
     "all surfaces": ({"general": True}, "E top X"),
     "all surfaces, mortar": ({"general": True, "coupling": "mortar"}, "E top X"),
     "friction": ({"friction": 0.3}, "E top X friction"),
-    "friction, a function of place": ({"friction": lambda x: 0.3 + 0.1 * x[0]}, "E top"),
+    "friction, a function of place": ({"friction": lambda x: 0.15 + 0.1 * x[0]}, "E top more"),
+    "friction, a function of place, a plane": ({"friction": lambda x: 0.3 + 0.1 * x[0], "target": plane}, "place more"),
     "friction, a plane that moves": ({"friction": 0.3, "target": plane, "moves": True}, "E top X friction place turn"),
     "friction, a ball": ({"friction": 0.3, "target": ball}, "E X place turn"),
     "friction, a ball that moves": ({"friction": 0.3, "target": ball, "moves": True}, "E place turn"),
