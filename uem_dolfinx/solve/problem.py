@@ -242,7 +242,7 @@ class UnitedProblem(given.Sealed):
         for contact in self.contacts:
             contact.begin()
         #: What is warned of while steps are taken.
-        self.watch = Watch(self.contacts)
+        self.watch = Watch(self.contacts, equations)
         from uem_dolfinx.solve.settings import Settings
 
         #: What the run is made with, for checkpoints.

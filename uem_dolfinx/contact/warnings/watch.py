@@ -115,10 +115,15 @@ class Watch:
 
     Args:
         contacts: of the problem, which have begun.
+        equations: of users.
     """
 
-    def __init__(self, contacts: Sequence[WatchedContact]):
+    def __init__(self, contacts: Sequence[WatchedContact], equations: Sequence[Any] = ()):
         self._contacts = contacts
+        if contacts and equations:
+            from uem_dolfinx.contact.warnings.seams import warn_of_seams
+
+            warn_of_seams(equations, [contact.pair for contact in contacts])
         self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._off_at_start: dict[int, Bools] = {}
