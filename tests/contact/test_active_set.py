@@ -13,6 +13,7 @@ from hypothesis import given
 
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.active_set import Rule
+from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.state import PairState
 
 
@@ -208,7 +209,7 @@ def test_equals_are_exchanged_together(size):
 
 def test_past_the_end_is_let_go():
     """Whatever the force; a contactor that has slid off enters again only in front of the target."""
-    s = active_set.slide_off(state([True, False], lam=[5.0, 0.0]), np.array([True, True]))
+    s = slide_off(state([True, False], lam=[5.0, 0.0]), np.array([True, True]))
     assert not s.active.any() and s.at_end.tolist() == [True, False] and s.passed.tolist() == [True, False]
     assert not wrong_ones(s, [-1.0, -1.0], off=[True, True]).count
     again = active_set.exchange(s, wrong_ones(s, [-1.0, 1.0]))

@@ -195,7 +195,7 @@ def test_what_has_sunk_beside_the_end_does_not_come_back_with_a_blow(caplog):
     assert COMM.rank != 0 or "2 contactors that had slid past the end of the target and sunk" in caplog.text
     # each blow would be of 6e-3
     assert np.diff(path.energy, prepend=1.0).clip(0.0).sum() < 2e-3 and path.cuts <= 2
-    assert landing.contacts[0].n_active == 0 and COMM.allreduce(int(landing.problem.pairs[0].barred.sum())) == 0
+    assert landing.contacts[0].n_active == 0 and COMM.allreduce(int(landing.problem.pairs[0].trial.barred.sum())) == 0
 
 
 def test_both_sides_are_massless_where_bodies_can_carry_it(caplog):

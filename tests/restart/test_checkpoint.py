@@ -167,6 +167,7 @@ def random_state(pair, seed):
         counts[:, 0],
         r[:, 0] > 0,
         r[:, 1] > 0,
+        r[:, 0] + r[:, 1] > 0,
         counts.sum(axis=1),
     )
 

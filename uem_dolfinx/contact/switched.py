@@ -35,7 +35,7 @@ def switch_off(pair: Interface) -> None:
     for name in ("bond", "heat"):
         if getattr(pair.committed, name) is not None:
             state = replace(state, **{name: np.zeros_like(getattr(pair.committed, name))})
-    settle(pair, (state, none, none, none))
+    settle(pair, (state, none, none))
 
 
 def switch_on(pair: Interface) -> None:

@@ -6,7 +6,7 @@ An equation of mortar has one direction: facets that meet at sharp edges are con
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,17 +72,6 @@ class Body(MeshTarget):
         return np.asarray(may)
 
 
-@dataclass(frozen=True)
-class FacesOnBody(MortarKinematics):
-    """Implements ``Kinematics``: weighted gaps, with some contactors left ``out (n,)``."""
-
-    out: Bools
-
-    def off(self, state: PairState) -> Bools:
-        """As of ``MortarKinematics``, and those that are left out."""
-        return super().off(state) | self.out
-
-
 class AmongBodiesMortar(Mortar):
     """Implements ``Discretisation``: contactor facets against those of one body that theirs follow."""
 
@@ -99,7 +88,7 @@ class AmongBodiesMortar(Mortar):
         assert isinstance(found.nearest, FacetProjection)
         # a node of a sharp edge belongs to the faces that lie on the body
         out = self._at_edge | self.target.excluded(self.nodes, found.nearest.facet)
-        return FacesOnBody(**vars(found), out=out & ~found.rows.covered)
+        return replace(found, out=out & ~found.rows.covered)
 
     def told(self, facets: Ints) -> Array:
         """What tells which facets of the body may be opposite to these, see ``Body.allowed`` ``(m, k)``."""

@@ -14,6 +14,7 @@ from uem_dolfinx.contact.mortar.ends import curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar.turning import Frictional, turning
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
+from uem_dolfinx.contact.seam.ends import Ends
 from uem_dolfinx.contact.seam.placement import GapRows
 from uem_dolfinx.contact.seam.pressure_map import PressureMap, Stretch
 from uem_dolfinx.contact.seam.relative_motion import Ties
@@ -23,10 +24,6 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.overlaps import Planes
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.search import MeshTarget
-
-#: A contactor that has lost its cover in a step is taken back within it where so much of its share is covered again.
-#: [convention; part of its share of the facets; test_mortar.py::test_off_the_end_and_back]
-COVERED_AGAIN = 0.5
 
 
 class Contactors(OnTarget):
@@ -102,11 +99,13 @@ class MortarKinematics(PlacedOnTarget):
     Attributes:
         rows: all equations and what they were made of.
         movable: contactors that can move along the normal, or something that they follow can ``(n,)``.
+        out: contactors that are not to meet the target ``(n,)``; None for none.
     """
 
     of: Contactors
     rows: WeightedRows
     movable: Bools
+    out: Bools | None = None
 
     @property
     def corners(self) -> None:
@@ -164,16 +163,12 @@ class MortarKinematics(PlacedOnTarget):
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def off(self, state: PairState) -> Bools:
-        """Contactors past an end of the target, or that it has let go of in this step and hardly covers again.
-
-        A target that springs back when its end lets go would cover the contactor's last bit again, for ever.
-        """
-        rows = self.rows
-        if not self.of.target.n_nodes:
-            return np.zeros(len(self.points), dtype=bool)
-        past = super().off(state)
-        return np.where(rows.covered, state.at_end & (rows.ratio < COVERED_AGAIN), past)
+    @cached_property
+    def ends(self) -> Ends:
+        """Of contactors that the target covers, or not; rigid ones have none."""
+        rows, meshed = self.rows, self.of.target.n_nodes > 0
+        share = np.where(rows.covered, rows.ratio, -1.0) if meshed else np.ones(len(self.points))
+        return Ends(self.projection, self.of.thickness, share=share, out=self.out)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

@@ -162,7 +162,7 @@ class Bernstein(NodeToSurface):
     def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
         """The kinematics with control gaps (collective)."""
         k, gap = kinematics, kinematics.projection.gap
-        usable = ~k.off(state) & ~state.in_corner
+        usable = ~k.ends.past(state) & ~state.in_corner
         control = self.family.control_gaps(k.projection, usable)
         plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left)
         return ControlKinematics(*plain, control=control)

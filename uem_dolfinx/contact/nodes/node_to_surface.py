@@ -17,7 +17,7 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.ends import END_HOLDS
+from uem_dolfinx.contact.seam.ends import Ends
 from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, GapRows, Traction
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
@@ -206,13 +206,10 @@ class NodalKinematics(PlacedOnTarget):
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def at_end(self, state: PairState) -> Bools:
-        """Contactors that come to the target at its end, where edges coincide, are held there until they slide away from it.
-
-        One that let go of the target as soon as it is the least bit past the end would sink into it, and come back with a blow.
-        """
-        near = (self.projection.from_end <= END_HOLDS) & ~self.off(state) & self.of.ends_hold
-        return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
+    @cached_property
+    def ends(self) -> Ends:
+        """Which can hold contactors; see ``Kinematics``."""
+        return Ends(self.projection, self.of.thickness, self.of.ends_hold)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

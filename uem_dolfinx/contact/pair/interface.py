@@ -17,7 +17,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.pair.told import Told
 from uem_dolfinx.contact.seam import active_set
-from uem_dolfinx.contact.seam.ends import near_target
+from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
@@ -56,8 +56,6 @@ class Interface(Told):
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
-        barred: contactors that came back into the target from past its end with a blow; they are left out until they are in front of it
-            again ``(n,)``.
         mutual: whether contactor and target follow each other (two-pass).
         heats: what passes through, one of every conductance.
     """
@@ -84,7 +82,7 @@ class Interface(Told):
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.heats: list[Heat] = []
         none: Bools = np.zeros(n, dtype=bool)
-        self.redundant = self.reserved = self.barred = self._redundant = self._reserved = none
+        self.redundant = self.reserved = self._redundant = self._reserved = none
         self.initial_overlap, self.mutual = 0.0, False
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
@@ -177,18 +175,18 @@ class Interface(Told):
     def bar_returned(self) -> int:
         """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
         came = self.trial.active & ~self.committed.active & self.committed.passed
-        self.barred = self.barred | came
+        self.committed = replace(self.committed, barred=self.committed.barred | came)
         return int(reduced(self.config.comm, int(came.sum())))
 
     def _at_end(self, state: PairState) -> Bools:
         """Contactors that an end of the target holds in the next step ``(n,)``: where surfaces follow each other, the end touches."""
-        return self.kinematics.at_end(state) & np.logical_not(self.mutual)
+        return self.kinematics.ends.held(state) & np.logical_not(self.mutual)
 
     def follow(self) -> bool:
         """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
         off = self.off
         gone = bool((self.trial.active & off).any())
-        self.kinematics, state, moved = self.kinematics.follow(active_set.slide_off(self.trial, off))
+        self.kinematics, state, moved = self.kinematics.follow(slide_off(self.trial, off))
         self._set_active(state)
         return gone or moved
 
@@ -306,8 +304,7 @@ class Interface(Told):
         """
         lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
         if lacks:
-            near = near_target(self.projection, self.trial, self.kinematics.off(self.trial))
-            self.reserved = near & ~self.tied if known else self.trial.active.copy()
+            self.reserved = self.kinematics.ends.near(self.trial) & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.gap_rows.select(np.flatnonzero(self.reserved), self.trial.active)
         if self.friction is not None:
             own = self.friction.equations(own, self.trial, self.kinematics)
@@ -397,8 +394,9 @@ class Interface(Told):
             if not self.asked:
                 self._place_friction()
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
-        self.barred = self.barred & (self.projection.gap < 0)
-        passed = self.off | (self.trial.passed & (self.projection.gap < 0))
+        inside = self.projection.gap < 0
+        self.trial = replace(self.trial, barred=self.trial.barred & inside)
+        passed = self.off | (self.trial.passed & inside)
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
         self.reserved = self.reserved & bool(fresh.active.any())
@@ -419,13 +417,13 @@ class Interface(Told):
         if self.tie is not None:
             self.tie.lose()
 
-    def memory(self) -> tuple[PairState, Bools, Bools, Bools]:
+    def memory(self) -> tuple[PairState, Bools, Bools]:
         """What the next step begins with, the displacement aside."""
-        return self.committed, self.reserved, self.redundant, self.barred
+        return self.committed, self.reserved, self.redundant
 
-    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
         """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
-        self.committed, self.reserved, self.redundant, self.barred = memory
+        self.committed, self.reserved, self.redundant = memory
         if self.tie is not None:
             # what has been tied since then stays so
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
@@ -440,8 +438,8 @@ class Interface(Told):
         """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
         if self.tie is not None:
             self.tie.from_checkpoint(kept, self._past_end)
-        reserved, redundant, barred = (np.array(kept[name]) for name in ("reserved", "redundant", "barred"))
-        self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant, barred))
+        reserved, redundant = (np.array(kept[name]) for name in ("reserved", "redundant"))
+        self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant))
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:

@@ -55,9 +55,7 @@ class JoinedInterface(Interface):
         facets, surface = nodal.target.facets, nodal.surface_of
         parts = [renumbered(p.committed, lambda f, s=s: facets.here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
         self.trial = self.committed = joined(parts)
-        self.reserved, self.redundant, self.barred = (
-            np.concatenate([getattr(pair, name) for pair in own]) for name in ("reserved", "redundant", "barred")
-        )
+        self.reserved, self.redundant = (np.concatenate([getattr(p, k) for p in own]) for k in ("reserved", "redundant"))
         self._reserved, self._redundant = self.reserved, self.redundant
 
     @property
@@ -113,7 +111,7 @@ class JoinedInterface(Interface):
         if far.any():
             self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
 
-    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
         """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
         self.discretisation.far = False
         super().remember(memory)
@@ -128,7 +126,7 @@ class JoinedInterface(Interface):
             pair.trial = self.state_of(k, self.trial)
         return self.own
 
-    def memory_of(self, k: int, memory: tuple[PairState, Bools, Bools, Bools]) -> tuple[PairState, Bools, Bools, Bools]:
+    def memory_of(self, k: int, memory: tuple[PairState, Bools, Bools]) -> tuple[PairState, Bools, Bools]:
         """A contact's part of what ``memory`` returned."""
-        reserved, redundant, barred = (a[self.rows_of[k]] for a in memory[1:])
-        return self.state_of(k, memory[0]), reserved, redundant, barred
+        reserved, redundant = (a[self.rows_of[k]] for a in memory[1:])
+        return self.state_of(k, memory[0]), reserved, redundant

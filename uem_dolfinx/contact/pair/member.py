@@ -79,7 +79,6 @@ class Member(Interface):
     #: As of ``Interface``, each its rows of the whole's ``(n,)``.
     reserved = _rows_of("reserved")
     redundant = _rows_of("redundant")
-    barred = _rows_of("barred")
     _reserved = _rows_of("_reserved")
     _redundant = _rows_of("_redundant")
 
@@ -162,7 +161,7 @@ class Member(Interface):
 
     # -- what is set between steps ---------------------------------------------------------------------------------------
 
-    def remember(self, memory: tuple[PairState, Bools, Bools, Bools]) -> None:
+    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
         """Go on from a memory, to be followed by ``project`` where bodies and target were then."""
         self.far = False
         super().remember(memory)

@@ -36,7 +36,6 @@ class Told:
     committed: PairState
     reserved: Bools
     redundant: Bools
-    barred: Bools
     kinematics: Kinematics
     discretisation: Discretisation
 
@@ -127,7 +126,7 @@ class Told:
 
     @property
     def _past_end(self) -> Bools:
-        return self.kinematics.off(self.trial) | self.barred
+        return self.kinematics.ends.past(self.trial) | self.trial.barred
 
     @property
     def movable(self) -> Bools:
@@ -217,6 +216,6 @@ class Told:
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
-        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant, "barred": self.barred}
+        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
         kept |= self.committed.to_checkpoint(self.target.keys_of)
         return kept if self.tie is None else kept | self.tie.to_checkpoint()

@@ -144,18 +144,6 @@ def exchange(state: PairState, violated: Violations) -> PairState:
     return replace(state, active=active, passed=state.passed & ~active)
 
 
-def slide_off(state: PairState, off: Bools) -> PairState:
-    """The state in which active contactors past the target's end have been let go.
-
-    Args:
-        state: of the contactors.
-        off: those past the end ``(n,)``.
-    """
-    gone = state.active & off
-    active = state.active & ~off
-    return replace(state, active=active, at_end=state.at_end | gone, passed=(state.passed | gone) & ~active)
-
-
 class Rule:
     """Which of the wrong contactors are exchanged, from fast to sure."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 from mpi4py import MPI
@@ -10,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.seam.ends import past_end
+from uem_dolfinx.contact.seam.ends import Ends
 from uem_dolfinx.contact.seam.placement import Constraints, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -166,13 +167,10 @@ class PlacedOnTarget:
         """There is no bend to follow contactors across."""
         return self, state, False
 
-    def off(self, state: PairState) -> Bools:
-        """Past an open end of the target in a direction in which contactors can move, or round it behind a thin target."""
-        return past_end(self.projection, state, self.of.thickness)
-
-    def at_end(self, state: PairState) -> Bools:
-        """No end holds contactors."""
-        return np.zeros(len(self.points), dtype=bool)
+    @cached_property
+    def ends(self) -> Ends:
+        """They hold no contactors."""
+        return Ends(self.projection, self.of.thickness)
 
     def forces(self: Kinematics, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
         """Forces of the rows at both bodies, where contactors follow each other too (collective)."""

@@ -23,6 +23,7 @@ from uem_dolfinx.geometry.projection import Projection, Target
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.seam.corners import Corners
+    from uem_dolfinx.contact.seam.ends import Ends
     from uem_dolfinx.contact.seam.relative_motion import Ties
 
 #: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
@@ -228,11 +229,9 @@ class Kinematics(Protocol):
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
-    def off(self, state: PairState) -> Bools:
-        """Contactors that have slid past an end of the target ``(n,)``."""
-
-    def at_end(self, state: PairState) -> Bools:
-        """Contactors that an end of the target holds in the next step ``(n,)``."""
+    @property
+    def ends(self) -> Ends:
+        """Where contactors stand relative to open ends of the target; made once."""
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

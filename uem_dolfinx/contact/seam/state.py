@@ -79,6 +79,7 @@ class PairState:
         passed: has been past the target's end since it was last in front of it ``(n,)``.
         at_end: came to the target, or was drawn, at its end, which has held it since, or has slid off it in this step: released there
             and pushed back it would go to and fro for ever ``(n,)``.
+        barred: came back into the target from past its end with a blow, and has not been in front of it since ``(n,)``.
         cover: which of its facets a rigid target covers, or where a mesh leaves it a dual function, one bit each in an order that no
             partition changes ``(n,)``; mortar alone.
         friction: what friction remembers; None without friction.
@@ -96,6 +97,7 @@ class PairState:
     changes: Ints
     passed: Bools
     at_end: Bools
+    barred: Bools
     cover: Ints
     friction: FrictionState | None = None
     bond: Array | None = None
@@ -119,6 +121,7 @@ class PairState:
             changes=np.zeros(n, np.int64),
             passed=np.zeros(n, bool),
             at_end=np.zeros(n, bool),
+            barred=np.zeros(n, bool),
             cover=np.zeros(n, np.int64),
         )
 

@@ -17,7 +17,7 @@ from dolfinx import fem
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar.discretisation import Mortar
-from uem_dolfinx.contact.seam.ends import past_end
+from uem_dolfinx.contact.seam.ends import Ends
 from uem_dolfinx.contact.seam.placement import Constraints, Discretisation, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.ties.tied_rows import TiedRows, to_facets, to_means, to_surface
@@ -163,7 +163,7 @@ class Tie:
         p = self.target.project(self._points)
         reach = p.facet_size if self.target.n_nodes else self.max_penetration
         near = np.abs(p.gap) <= (reach if self._reach is None else self._reach)
-        return np.asarray(near if self.means else near & ~past_end(p, state, np.inf))
+        return np.asarray(near if self.means else near & ~Ends(p, np.inf).past(state))
 
     def _make(self, which: Bools, off: Bools) -> None:
         """Rows of contactors ``which (n,)`` where they were at the displacement ``at``, or are on a rigid target (collective)."""

@@ -105,7 +105,7 @@ class FarApart:
         more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
         # what touches, or has slid past an end, is looked at
         for place, p in zip(self._places, self._wholes):
-            used = p.trial.active | p.trial.passed | p.barred
+            used = p.trial.active | p.trial.passed | p.trial.barred
             more[1, place[p.label[used]]] = 1.0
         self._boxes, (offset, used) = self._look(self._config.x, more)
         self._near = self._reach + offset

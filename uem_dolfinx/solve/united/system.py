@@ -429,7 +429,7 @@ class BodySystem:
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
         if near is None:
-            some = None if self.floating.neutral or self.far_apart.any else [pair.nodes for pair in self.pairs]
+            some = None if self.floating.neutral or (self.pairs and self.far_apart.any) else [p.nodes for p in self.pairs]
             dq = self.solver.complete(dq, some)
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 
