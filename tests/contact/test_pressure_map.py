@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from gauss_points import gauss_points
+from gauss_points import GaussPoints
 from helpers import arch, blocks, clamp, highest, modulus, run, st_venant
 
 import uem_dolfinx as uem
@@ -24,16 +24,15 @@ CASES = [
     ("quadrilateral", 1, "mortar", 0.3),
     ("tetrahedron", 1, "mortar", 0.0),
     ("triangle", 2, "mortar", 0.3),
-    ("tetrahedron", 1, "gauss points", 0.0),
+    ("tetrahedron", 1, GaussPoints, 0.0),
 ]
 
 
-def over_an_arch(cell, degree, coupling, friction, height=0.3, **how):
+def over_an_arch(cell, degree, coupling, friction, height=0.3):
     """A block over an arch, in part beyond its end, all contactors active, with a wavy displacement."""
     n = (5, 4) if cell in ("triangle", "quadrilateral") else (3, 2)
     b = blocks(COMM, cell, *n, gap=0.1, overhang=-0.15, degree=degree, pose=arch(height, 0.45))
-    how["coupling"] = gauss_points(b.high) if coupling == "gauss points" else coupling
-    contact = uem.Contact(b.high, b.low, max_penetration=0.5, friction=friction, **how)
+    contact = uem.Contact(b.high, b.low, max_penetration=0.5, friction=friction, coupling=coupling)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top)]
     problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact])
     problem.config.displacement[:] = 0.01 * np.sin(3 * problem.config.X[:, ::-1])

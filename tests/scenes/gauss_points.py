@@ -28,27 +28,26 @@ from uem_dolfinx.parallel import Exchange
 ROUNDING = 1e-12
 
 
-def gauss_points(tag, degree=3):
-    """The discretisation of a contactor, for ``coupling=``, with a quadrature rule of this degree."""
-
-    def coupling(config, nodes, target, *, chords, **how):
-        return GaussPoints(config, nodes, target, surface=TargetFacets(config, tag, "contactor"), degree=degree, **how)
-
-    return coupling
+def gauss_points(degree):
+    """The discretisation, for ``coupling=``, with a quadrature rule of this degree."""
+    return type("GaussPoints", (GaussPoints,), {"degree": degree})
 
 
 class GaussPoints(OnTarget):
     """Implements ``Discretisation`` for contactors of degree 1 and finite sliding."""
 
     chained, two_pass, pointwise, at_feet = True, False, False, False
+    #: Of polynomials that the quadrature rule integrates exactly.
+    degree = 3
 
-    def __init__(self, config, nodes, target, *, surface, degree, **how):
+    def __init__(self, config, nodes, target, *, chords, **how):
         super().__init__(config, nodes, target, **how)
         assert config.degree == 1 and self.sliding == "finite"
-        self.surface, (m, nc) = surface, surface.dofs.shape
+        self.surface = surface = TargetFacets(config, self.contactor, "contactor")
+        m, nc = surface.dofs.shape
         self.place_of = np.full(config.n_owned, -1)
         self.place_of[nodes] = np.arange(len(nodes))
-        xi, w = forms.quadrature_rule(surface.shape.cell, degree)
+        xi, w = forms.quadrature_rule(surface.shape.cell, self.degree)
         tab = surface.shape.tabulate(np.tile(xi, (m, 1)))
         #: Shape functions at all points ``(q, nc)``, and the facets of these.
         self.phi, self.facet = tab.N, np.repeat(np.arange(m), len(w))

@@ -383,7 +383,7 @@ class Contact(WatchedContact, given.Sealed):
 
         kind = Bernstein if config.degree == 2 else NodeToSurface
         own = self.coupling if callable(self.coupling) else kind
-        return own(config, nodes, target, chords=self.chords and config.degree == 2, **how), None
+        return own(config, nodes, target, chords=self.chords and config.degree == 2, contactor=self.contactor, **how), None
 
     @property
     def _wears(self) -> bool:

@@ -118,17 +118,12 @@ class ControlGaps:
     def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
-        return self.basis.scale * control, control - self.sums.of(control)
+        return self.basis.scale * control, control - self.family.sums(self.shared).of(control)
 
     @cached_property
     def basis(self) -> Basis:
         """Functions that control forces are integrals with."""
         return self.family.basis(self.shared)
-
-    @cached_property
-    def sums(self) -> Sums:
-        """Of children at their parents, what control forces are more than nodal forces."""
-        return self.family.sums(self.shared)
 
     def extend(self, equations: UnitingEquations) -> UnitingEquations:
         """Add the terms of the parents to the equations of all contactors."""
@@ -203,7 +198,8 @@ class ControlKinematics(NodalKinematics):
 
     def nodal_friction(self, tau: Array) -> Array:
         """Handed on from the control points to the nodes; what targets get that are contactors themselves is not theirs (collective)."""
-        return np.column_stack([along - self.control.sums.of(along) for along in tau.T])
+        sums = self.control.family.sums(self.control.shared)
+        return np.column_stack([along - sums.of(along) for along in tau.T])
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Of control forces, integrals with Bernstein's basis."""

@@ -16,6 +16,7 @@ from uem_dolfinx.contact.seam.placement import Constraints, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
 
 
@@ -29,6 +30,7 @@ class OnTarget:
         free: components without Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
         sliding: ``"finite"`` projects at every placement, ``"small"`` once per step, ``"fixed"`` once.
         thickness: of the target's body, a length: what has passed its end and is deeper than this lies behind it.
+        contactor: facets of the contactors, for discretisations that integrate over them.
 
     Attributes:
         free: components without Dirichlet condition of the contactors ``(n, gdim)``.
@@ -44,10 +46,11 @@ class OnTarget:
     ordered_by = -1
 
     def __init__(
-        self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf
-    ):
+        self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf,
+        contactor: Tag | None = None,
+    ):  # fmt: skip
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
-        self.frictional = False
+        self.contactor, self.frictional = contactor, False
         self.hold(free)
         self.anchor: Projection | None = None
         self.offset: Array | None = None
