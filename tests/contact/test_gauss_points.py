@@ -25,6 +25,7 @@ from helpers import (
     linear,
     modulus,
     raised,
+    refused,
     run,
     st_venant,
     tangent_by_differences,
@@ -136,3 +137,10 @@ def test_gradients_of_its_pressures(rigid):
     """The seam is enough for derivatives of pressures, by all but the shape, with which weights over areas as drawn change."""
     s = pressed("triangle", 1, GaussPoints, rigid)
     assert min(orders(s, s.of_pressures, "E", "load", "top", "field", "sides").values()) >= 1.95
+
+
+def test_gradients_by_the_shape_are_refused():
+    """How rows change with the drawing is not part of the seam."""
+    s = pressed("triangle", 1, GaussPoints, False)
+    problem = s.solve()
+    refused(uem.InputError, "a discretisation of one's own", lambda: uem.gradient(problem, s.J, s.X))

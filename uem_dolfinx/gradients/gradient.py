@@ -358,6 +358,12 @@ def _check_shape(problem: UnitedProblem) -> None:
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )
+    for contact in problem.contacts:
+        if callable(contact.coupling):
+            raise InputError(
+                f"contact '{contact.name}': there is no gradient by the shape with a discretisation of one's own, whose rows may change "
+                "with the shape in ways that are not known: take differences of runs"
+            )
     if config.gdim == 3 and config.mesh.topology.cell_name() == "hexahedron":
         for contact in problem.contacts:
             if contact.coupling == "mortar":
